@@ -1,0 +1,199 @@
+"""Generations: written whole, made durable before they count, in the background when asked."""
+
+import logging
+import os
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import store.generations
+import store.store
+from store import DamageError, Store, StoreError
+
+ONE = {"x": np.arange(10)}
+
+
+@pytest.fixture
+def opened(tmp_path):
+    with Store.open(tmp_path / "s", identity={}) as fresh:
+        yield fresh
+
+
+def folders(opened):
+    return sorted(entry.name for entry in (opened.path / "generations").iterdir())
+
+
+class Gate:
+    """Holds writers of generations at the door and counts them."""
+
+    def __init__(self, monkeypatch):
+        self.open, self.reached, self.uptos = threading.Event(), threading.Event(), []
+        self.write = store.store.write_generation
+        monkeypatch.setattr(store.store, "write_generation", self)
+
+    def __call__(self, parent, number, upto, *rest):
+        self.uptos.append(upto)
+        self.reached.set()
+        assert self.open.wait(10)
+        return self.write(parent, number, upto, *rest)
+
+
+def test_the_current_and_the_one_before_it_are_kept(opened):
+    assert [opened.commit(ONE, upto=0) for _ in range(4)] == [1, 2, 3, 4]
+    assert folders(opened) == ["00000003", "00000004"]
+
+
+def test_committing_later_gives_what_committing_gives(opened):
+    opened.append("a", "b", b"")
+    opened.commit_later(ONE, upto=1, attributes={"a": [1]})
+    opened.flush()
+    found = opened.latest()
+    assert (found.number, found.upto, found.attributes) == (1, 1, {"a": [1]})
+    assert found.arrays["x"].tobytes() == ONE["x"].tobytes()
+
+
+def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
+    gate = Gate(monkeypatch)
+    opened.append("a", "b", b"")
+    opened.commit_later(ONE, upto=0)
+    assert gate.reached.wait(10)
+    for upto in (1, 2, 3):
+        opened.append("a", "b", b"")
+        opened.commit_later(ONE, upto=upto)
+    assert opened.last == 4
+    assert opened.latest() is None
+    assert [thread.name for thread in threading.enumerate()].count("store commit s") == 1
+    gate.open.set()
+    opened.flush()
+    assert gate.uptos == [0, 3]
+    assert opened.latest().upto == 3
+
+
+def test_a_commit_waits_for_the_one_in_the_background(opened, monkeypatch):
+    gate = Gate(monkeypatch)
+    opened.commit_later(ONE, upto=0)
+    assert gate.reached.wait(10)
+    threading.Timer(0.05, gate.open.set).start()
+    assert opened.commit(ONE, upto=0) == 2
+
+
+def test_closing_finishes_what_was_handed_over(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.commit_later(ONE, upto=0)
+    with Store.open(tmp_path) as opened:
+        assert opened.latest().number == 1
+    assert "store commit" not in " ".join(thread.name for thread in threading.enumerate())
+
+
+def fail(*_):
+    raise OSError(5, "the disk says no")
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        lambda opened: opened.flush(),
+        lambda opened: opened.commit(ONE, upto=0),
+        lambda opened: opened.commit_later(ONE, upto=0),
+        lambda opened: opened.close(),
+    ],
+    ids=["flush", "commit", "commit_later", "close"],
+)
+def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
+    with monkeypatch.context() as broken:
+        broken.setattr(store.generations, "sync_tree", fail)
+        opened.commit_later(ONE, upto=0)
+        opened._background.wait()
+    with pytest.raises(StoreError, match="the disk says no"):
+        surface(opened)
+    assert [record.levelno for record in caplog.records] == [logging.ERROR]
+    if surface.__code__.co_names != ("close",):
+        opened.flush()
+        assert folders(opened) == []
+        assert opened.commit(ONE, upto=0) == 1
+
+
+def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
+    monkeypatch.setattr(store.store, "write_generation", fail)
+    with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
+        opened.commit_later(ONE, upto=0)
+        raise KeyError
+
+
+def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
+    opened = Store.open(tmp_path, identity={})
+    with monkeypatch.context() as broken:
+        broken.setattr(store.store, "write_generation", fail)
+        opened.commit_later(ONE, upto=0)
+        with pytest.raises(StoreError, match="background commit failed"):
+            opened.close()
+    Store.open(tmp_path).close()
+
+
+def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
+    opened.commit(ONE, upto=0)
+    for name in ("sync_tree", "_write_group", "sync_folder"):
+        with monkeypatch.context() as broken:
+            broken.setattr(store.generations, name, fail)
+            with pytest.raises(StoreError, match="the disk says no"):
+                opened.commit({"x": np.arange(3)}, upto=0)
+        assert folders(opened) == ["00000001"]
+        assert opened.latest().arrays["x"].tobytes() == ONE["x"].tobytes()
+
+
+def test_what_an_interrupted_commit_left_is_removed_by_the_next_writer(opened):
+    opened.commit(ONE, upto=0)
+    opened.close()
+    parent = opened.path / "generations"
+    for name in ("00000002", "00000003.partial"):
+        (parent / name / "x").mkdir(parents=True)
+        (parent / name / "x" / "zarr.json").write_text("{}")
+    (parent / "notes").mkdir()
+    with Store.open(opened.path, mode="read") as reader:
+        assert reader.latest().number == 1
+    assert folders(opened) == ["00000001", "00000002", "00000003.partial", "notes"]
+    with Store.open(opened.path) as again:
+        assert folders(again) == ["00000001", "notes"]
+        assert again.commit(ONE, upto=0) == 2
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
+def test_every_file_and_folder_is_durable_before_the_generation_counts(opened, monkeypatch):
+    events = []
+
+    def noted(owner, attribute, name):
+        real = getattr(owner, attribute)
+
+        def call(*args, **options):
+            events.append((attribute, name(*args)))
+            return real(*args, **options)
+
+        monkeypatch.setattr(owner, attribute, call)
+
+    noted(os, "fsync", lambda file: str(Path(f"/proc/self/fd/{file}").readlink()))
+    noted(os, "rename", lambda old, new: str(new))
+    noted(opened._journal, "make_current", lambda row: "")
+    opened.commit({"x": np.arange(10), "y": np.array(1.5)}, upto=0)
+    parent = opened.path / "generations"
+    final = parent / "00000001"
+    at = events.index(("rename", str(final)))
+    written = {final, *final.rglob("*")}
+    draft = f"{final}.partial"
+    assert {name.replace(draft, str(final)) for kind, name in events[:at] if kind == "fsync"} >= set(
+        map(str, written)
+    )
+    assert events[at + 1 :] == [("fsync", str(parent)), ("make_current", "")]
+
+
+def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
+    opened.commit(ONE, upto=0)
+
+    def starve(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(store.generations, "_read_array", starve)
+    with pytest.raises(StoreError) as caught:
+        opened.latest()
+    assert not isinstance(caught.value, DamageError)

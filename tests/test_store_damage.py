@@ -1,0 +1,204 @@
+"""Bytes that changed on the disk are found, named, and gone around."""
+
+import logging
+import shutil
+import sqlite3
+from contextlib import closing
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from store import DamageError, NotAStoreError, Store, StoreError
+
+ROWS = 6
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A closed store of six rows and two generations, up to rows 2 and 4."""
+    with Store.open(tmp_path / "s", identity={"for": "damage"}) as opened:
+        for number in range(1, ROWS + 1):
+            opened.append(
+                "a", f"the label of row {number}", bytes([number] * 8), arrays={"x": np.arange(number)}
+            )
+            if number in (2, 4):
+                opened.commit({"x": np.arange(1000) + number, "y": np.array(number)}, upto=number)
+    return tmp_path / "s"
+
+
+def flip(path, place, bit=0):
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1 << bit
+    path.write_bytes(data)
+
+
+def change(path, statement):
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+        connection.execute(statement)
+
+
+@pytest.mark.parametrize(
+    ("row", "covered"), [(1, "generation 2 (up to row 4)"), (4, "generation 2"), (5, "no generation")]
+)
+def test_a_flipped_bit_in_a_row_is_named_and_gone_around(path, row, covered):
+    journal = path / "journal.sqlite"
+    flip(journal, journal.read_bytes().index(f"label of row {row}".encode()))
+    with Store.open(path) as opened:
+        rows = opened.records()
+        for expected in range(1, row):
+            assert next(rows).sequence == expected
+        with pytest.raises(DamageError, match=f"row {row} fails") as caught:
+            next(rows)
+        assert covered in str(caught.value)
+        assert (caught.value.path, caught.value.sequence) == (journal, row)
+        assert [found.sequence for found in opened.records(row)] == list(range(row + 1, ROWS + 1))
+        assert opened.append("a", "b", b"").sequence == ROWS + 1
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    [
+        "kind = 'z'",
+        "label = 'z'",
+        "label = CAST(x'ff' AS TEXT)",
+        "key = x'00'",
+        "time = time + 1",
+        "attributes = '{\"a\":1}'",
+        "attributes = ''",
+        "payload = x''",
+        "payload = substr(payload, 1, 20)",
+        "checksum = x''",
+    ],
+)
+def test_every_column_is_under_the_checksum(path, assignment):
+    change(path, f"UPDATE record SET {assignment} WHERE sequence = 3")
+    with Store.open(path, mode="read") as opened:
+        assert [row.sequence for row in islice(opened.records(), 2)] == [1, 2]
+        with pytest.raises(DamageError, match="row 3"):
+            list(opened.records())
+
+
+def test_exchanged_rows_are_found(path):
+    change(path, "UPDATE record SET sequence = 30 WHERE sequence = 3")
+    change(path, "UPDATE record SET sequence = 3 WHERE sequence = 2")
+    change(path, "UPDATE record SET sequence = 2 WHERE sequence = 30")
+    with Store.open(path) as opened, pytest.raises(DamageError, match="row 2"):
+        list(opened.records())
+
+
+def test_missing_rows_are_named_and_their_numbers_not_given_again(path):
+    change(path, "DELETE FROM record WHERE sequence IN (2, 3)")
+    with Store.open(path) as opened:
+        with pytest.raises(DamageError, match="rows 2 to 3 are missing") as caught:
+            list(opened.records())
+        assert [row.sequence for row in opened.records(caught.value.sequence)] == [4, 5, 6]
+    change(path, "DELETE FROM record WHERE sequence > 1")
+    with Store.open(path) as opened:
+        assert opened.last == 4
+        with pytest.raises(DamageError, match="rows 2 to 4 are missing"):
+            list(opened.records())
+        assert opened.append("a", "b", b"").sequence == 5
+
+
+def chunk_of(folder):
+    return folder / "x" / "c" / "0"
+
+
+SPOIL = {
+    "a bit of a chunk": lambda folder: flip(chunk_of(folder), -5),
+    "a bit of its header": lambda folder: flip(chunk_of(folder), 4),
+    "a chunk cut short": lambda folder: chunk_of(folder).write_bytes(chunk_of(folder).read_bytes()[:20]),
+    "an empty chunk": lambda folder: chunk_of(folder).write_bytes(b""),
+    "no chunk": lambda folder: chunk_of(folder).unlink(),
+    "no array": lambda folder: shutil.rmtree(folder / "x"),
+    "an array's description": lambda folder: (folder / "x" / "zarr.json").write_text("{}"),
+    "an array's shape": lambda folder: (folder / "x" / "zarr.json").write_text(
+        (folder / "x" / "zarr.json").read_text().replace("1000", "1001")
+    ),
+    "no group": lambda folder: (folder / "zarr.json").unlink(),
+    "the group's format": lambda folder: (folder / "zarr.json").write_text(
+        (folder / "zarr.json").read_text().replace('"format": 1', '"format": 9')
+    ),
+    "nothing left": shutil.rmtree,
+}
+
+
+@pytest.mark.parametrize("spoil", SPOIL.values(), ids=SPOIL.keys())
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_a_spoilt_generation_is_named_and_the_one_before_it_taken(path, spoil, mode, caplog):
+    folder = path / "generations" / "00000002"
+    spoil(folder)
+    with Store.open(path, mode=mode) as opened, caplog.at_level(logging.WARNING):
+        found = opened.latest()
+    assert (found.number, found.upto) == (1, 2)
+    assert found.arrays["x"].tobytes() == (np.arange(1000) + 2).tobytes()
+    (warning,) = caplog.messages
+    assert "generation 2" in warning
+    assert str(folder) in warning
+
+
+def test_without_any_generation_that_verifies_there_is_none(path, caplog):
+    for number in (1, 2):
+        flip(chunk_of(path / "generations" / f"{number:08d}"), -5)
+    with Store.open(path) as opened:
+        assert opened.latest() is None
+        assert len(list(opened.records())) == ROWS
+    assert len(caplog.messages) == 2
+    assert "array 'x' of generation 1" in caplog.messages[1]
+
+
+def test_a_spoilt_row_of_a_generation_is_passed_over(path, caplog):
+    change(path, "UPDATE generation SET upto = 6 WHERE number = 2")
+    with Store.open(path) as opened:
+        assert opened.latest().number == 1
+    assert "row of generation 2" in caplog.text
+
+
+def test_a_spoilt_generation_does_not_push_out_the_good_one(path, caplog):
+    flip(chunk_of(path / "generations" / "00000002"), -5)
+    with Store.open(path) as opened:
+        assert opened.latest().number == 1
+        assert opened.commit({"x": np.arange(7)}, upto=6) == 3
+        assert sorted(folder.name for folder in (path / "generations").iterdir()) == ["00000001", "00000003"]
+        flip(chunk_of(path / "generations" / "00000003"), -5)
+        assert opened.latest().number == 1
+    assert "falling back" in caplog.text
+
+
+def test_a_spoilt_identity_is_found(path):
+    change(path, "UPDATE meta SET value = '{}' WHERE key = 'identity'")
+    with pytest.raises(DamageError, match="identity"):
+        Store.open(path)
+
+
+@pytest.mark.parametrize("spoil", [lambda data: b"", lambda data: b"x" + data[1:], lambda data: data[:50]])
+def test_a_journal_that_is_no_longer_sqlite_is_damage_where_generations_are(path, spoil):
+    journal = path / "journal.sqlite"
+    journal.write_bytes(spoil(journal.read_bytes()))
+    with pytest.raises(DamageError, match=str(journal)):
+        Store.open(path)
+    shutil.rmtree(path / "generations")
+    with pytest.raises(NotAStoreError):
+        Store.open(path)
+
+
+def test_any_flipped_bit_in_the_journal_is_found_or_harmless(path):
+    """Every page of the file in turn: the rows come back as they were, or an error of ours says why not."""
+    journal = path / "journal.sqlite"
+    with Store.open(path) as opened:
+        whole = [(row.sequence, row.label, row.key, row.arrays["x"].tobytes()) for row in opened.records()]
+    data = journal.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(data), 250):
+        flip(journal, place, int(place) % 8)
+        found = []
+        try:
+            with Store.open(path, mode="read") as opened:
+                for row in opened.records():
+                    found.append((row.sequence, row.label, row.key, row.arrays["x"].tobytes()))
+        except StoreError:
+            assert found == whole[: len(found)]
+        else:
+            assert found == whole
+        journal.write_bytes(data)

@@ -1,0 +1,337 @@
+"""Who may open what: one writer, any readers, and nothing that is not a store of ours."""
+
+import json
+import multiprocessing
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import store.store
+from store import (
+    DamageError,
+    LockedError,
+    NotAStoreError,
+    ReadOnlyError,
+    Store,
+    StoreClosedError,
+    StoreError,
+    StoreFullError,
+    VersionError,
+)
+
+ROOT = Path(store.__file__).parents[1]
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_path):
+    path = tmp_path / "deep" / "er"
+    with Store.open(path, identity={"for": ["this", 1]}) as made:
+        assert (made.identity, made.last, made.latest(), list(made.records())) == (
+            {"for": ["this", 1]},
+            0,
+            None,
+            [],
+        )
+    with Store.open(path, identity={"for": "that"}) as again:
+        assert again.identity == {"for": ["this", 1]}
+    with Store.open(str(path), mode="read") as reader:
+        assert reader.identity == {"for": ["this", 1]}
+        assert (reader.path, reader.mode) == (path, "read")
+
+
+def test_a_second_writer_in_this_process_is_told_who_holds_it(tmp_path):
+    with Store.open(tmp_path, identity={}) as first:
+        with pytest.raises(LockedError, match=rf"process {os.getpid()} on .* since 20.*mode=\"read\""):
+            Store.open(tmp_path)
+        assert first.append("a", "b", b"").sequence == 1
+    Store.open(tmp_path).close()
+
+
+SECOND = """
+import sys, store
+try:
+    store.Store.open(sys.argv[1])
+except store.LockedError as error:
+    print(error)
+"""
+
+
+def test_a_second_writer_in_another_process_is_told_who_holds_it(tmp_path):
+    with Store.open(tmp_path, identity={}):
+        told = subprocess.run(
+            [sys.executable, "-c", SECOND, tmp_path], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+    assert f"process {os.getpid()} on " in told.stdout
+
+
+def test_a_dead_holders_note_is_no_obstacle(tmp_path):
+    Store.open(tmp_path, identity={}).close()
+    (tmp_path / "holder.json").write_text('{"pid": 1, "host": "gone", "since": "2001-01-01"}')
+    with Store.open(tmp_path):
+        assert json.loads((tmp_path / "holder.json").read_text())["pid"] == os.getpid()
+    assert not (tmp_path / "holder.json").exists()
+
+
+@pytest.mark.parametrize("note", ["", "[]", "{}", "not json"])
+def test_a_spoilt_note_still_gives_a_clear_refusal(tmp_path, note):
+    with Store.open(tmp_path, identity={}):
+        (tmp_path / "holder.json").write_text(note)
+        with pytest.raises(LockedError, match="left no note"):
+            Store.open(tmp_path)
+
+
+def test_readers_follow_a_writer_and_take_no_lock(tmp_path):
+    with Store.open(tmp_path, identity={}) as writer, Store.open(tmp_path, mode="read") as reader:
+        rows = reader.records()
+        for number in range(1, 4):
+            writer.append("a", "b", b"", arrays={"x": np.array(number)})
+            writer.commit({"x": np.array(number)}, upto=number)
+            assert (reader.last, reader.latest().upto, reader.latest().arrays["x"]) == (
+                number,
+                number,
+                number,
+            )
+        assert list(rows) == []  # up to the last when it was asked for
+        assert [row.sequence for row in reader.records(1)] == [2, 3]
+    with Store.open(tmp_path, mode="read") as first, Store.open(tmp_path, mode="read") as second:
+        assert first.last == second.last == 3
+
+
+def test_readers_never_meet_a_half_replaced_generation(tmp_path, caplog):
+    with Store.open(tmp_path, identity={}) as writer, Store.open(tmp_path, mode="read") as reader:
+        writer.commit({"a": np.full(5, 0), "b": np.full(5, 0)}, upto=0)
+
+        def replace():
+            for value in range(1, 25):
+                writer.commit({"a": np.full(5, value), "b": np.full(5, value)}, upto=0)
+
+        thread = threading.Thread(target=replace)
+        thread.start()
+        while thread.is_alive():
+            found = reader.latest().arrays
+            assert found["a"].tolist() == found["b"].tolist()
+        thread.join()
+        assert reader.latest().arrays["a"][0] == 24
+    assert caplog.records == []
+
+
+def test_a_reader_may_do_nothing_that_writes(tmp_path):
+    Store.open(tmp_path, identity={}).close()
+    with Store.open(tmp_path, mode="read") as reader:
+        for call in (
+            lambda: reader.append("a", "b", b""),
+            lambda: reader.commit({}, upto=0),
+            lambda: reader.commit_later({}, upto=0),
+        ):
+            with pytest.raises(ReadOnlyError):
+                call()
+
+
+def test_closing_is_final_and_may_be_repeated(tmp_path):
+    opened = Store.open(tmp_path, identity={})
+    opened.append("a", "b", b"")
+    rows = opened.records()
+    opened.close()
+    opened.close()
+    for call in (
+        lambda: opened.append("a", "b", b""),
+        lambda: opened.last,
+        opened.records,
+        lambda: next(rows),
+        opened.latest,
+        lambda: opened.commit({}, upto=0),
+        lambda: opened.commit_later({}, upto=0),
+        opened.flush,
+        opened.size,
+        opened.__enter__,
+    ):
+        with pytest.raises(StoreClosedError):
+            call()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_fork_may_not_use_its_parents_store(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.append("a", "b", b"")
+        context = multiprocessing.get_context("fork")
+        answer = context.SimpleQueue()
+
+        def child():
+            try:
+                opened.append("a", "c", b"")
+            except StoreClosedError as error:
+                answer.put(str(error))
+            opened.close()
+
+        process = context.Process(target=child)
+        process.start()
+        process.join()
+        assert "fork" in answer.get()
+        with pytest.raises(LockedError):  # the child's close did not free the parent's lock
+            Store.open(tmp_path)
+        assert opened.append("a", "d", b"").sequence == 2
+        answer.close()
+        process.close()
+
+
+def test_threads_may_append_and_read_together(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+
+        def work(name):
+            for _ in range(25):
+                row = opened.append("a", name, b"", arrays={"x": np.arange(3)})
+                assert next(opened.records(row.sequence - 1)).label == name
+
+        threads = [threading.Thread(target=work, args=(name,)) for name in "abcd"]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [row.sequence for row in opened.records()] == list(range(1, 101))
+        assert sorted(row.label for row in opened.records()) == sorted("abcd" * 25)
+
+
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_where_there_is_no_store_nothing_is_made_without_an_identity(tmp_path, mode):
+    with pytest.raises(NotAStoreError):
+        Store.open(tmp_path / "new", mode=mode)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_other_things_are_left_alone(tmp_path, mode):
+    (tmp_path / "file").write_text("mine")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("mine")
+    database = tmp_path / "database"
+    database.mkdir()
+    with closing(sqlite3.connect(database / "journal.sqlite")) as connection:
+        connection.execute("CREATE TABLE mine (x)")
+    text = tmp_path / "text"
+    text.mkdir()
+    (text / "journal.sqlite").write_text("dear diary" * 50)
+    for path in (tmp_path / "file", tmp_path / "file" / "below", folder, database, text):
+        before = contents(path) if path.is_dir() else None
+        with pytest.raises(StoreError if path.name == "below" else NotAStoreError, match=str(path)):
+            Store.open(path, identity={}, mode=mode)
+        assert before == (contents(path) if path.is_dir() else None)
+
+
+def test_a_mode_is_read_or_write(tmp_path):
+    with pytest.raises(ValueError, match="append"):
+        Store.open(tmp_path, identity={}, mode="append")
+
+
+def test_a_future_format_is_refused_and_not_touched(tmp_path):
+    Store.open(tmp_path, identity={}).close()
+    with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as connection:
+        connection.execute("PRAGMA user_version = 7")
+    before = contents(tmp_path)
+    for mode in ("read", "write"):
+        with pytest.raises(VersionError, match=r"format 7; .* up to format 1: upgrade"):
+            Store.open(tmp_path, mode=mode)
+    assert contents(tmp_path) == before
+
+
+def test_an_interrupted_creation_is_finished_by_the_next(tmp_path):
+    (tmp_path / "lock").touch()
+    (tmp_path / "generations").mkdir()
+    (tmp_path / "journal.sqlite.new").write_bytes(b"SQLite for")
+    with pytest.raises(NotAStoreError):
+        Store.open(tmp_path, mode="read")
+    with Store.open(tmp_path, identity={"a": 1}) as opened:
+        assert opened.append("a", "b", b"").sequence == 1
+    assert not (tmp_path / "journal.sqlite.new").exists()
+
+
+def test_generations_without_a_journal_are_not_taken_for_an_empty_folder(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.commit({"x": np.arange(3)}, upto=0)
+    (tmp_path / "journal.sqlite").unlink()
+    with pytest.raises(DamageError, match="generations but no"):
+        Store.open(tmp_path, identity={})
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of one megabyte, which only root may mount."""
+    mount = tmp_path / "disk"
+    mount.mkdir()
+    command = shutil.which("mount")
+    arguments = [command, "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount]
+    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
+        pytest.skip("no small file system can be mounted here")
+    yield mount
+    subprocess.run(["umount", mount], check=True)
+
+
+def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):
+    noise = np.random.default_rng(0)
+    with Store.open(small_disk / "s", identity={}) as opened:
+        ballast = small_disk / "ballast"
+        ballast.write_bytes(bytes(400_000))
+        opened.commit({"x": np.arange(3)}, upto=0)
+        sent = []
+        with pytest.raises(StoreFullError, match="free some space"):
+            while True:
+                sent.append(noise.integers(0, 2**60, 2000))
+                opened.append("a", "b", b"", arrays={"x": sent[-1]})
+        durable = len(sent) - 1
+        assert opened.last == durable > 1
+        with pytest.raises(StoreFullError):
+            opened.commit({"x": noise.integers(0, 2**60, 200_000)}, upto=1)
+        assert len(list((small_disk / "s" / "generations").iterdir())) == 1
+        ballast.unlink()
+        assert opened.append("a", "b", b"", arrays={"x": sent[-1]}).sequence == durable + 1
+        assert opened.commit({"x": np.arange(4)}, upto=durable + 1)
+    with Store.open(small_disk / "s") as opened:
+        assert [row.arrays["x"].tobytes() for row in opened.records()] == [array.tobytes() for array in sent]
+        assert opened.latest().upto == durable + 1
+
+
+def test_a_disk_that_may_not_be_written_can_be_read(small_disk):
+    path = small_disk / "s"
+    with Store.open(path, identity={}) as opened:
+        opened.append("a", "b", b"")
+        opened.commit({"x": np.arange(3)}, upto=1)
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with Store.open(path, mode="read") as reader:
+        assert (reader.last, reader.latest().upto, len(list(reader.records()))) == (1, 1, 1)
+    for folder in (path, small_disk / "new"):
+        with pytest.raises(ReadOnlyError):
+            Store.open(folder, identity={})
+
+
+def test_a_database_that_may_not_grow_is_full(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.append("a", "b", b"")
+        with opened._journal._using("limiting its size") as connection:
+            connection.execute("PRAGMA max_page_count = 12")
+            with pytest.raises(StoreFullError):
+                opened.append("a", "b", b"", arrays={"x": np.random.default_rng(0).integers(0, 2**60, 9000)})
+            connection.execute("PRAGMA max_page_count = 100000")
+        assert opened.append("a", "c", b"").sequence == 2
+        assert [row.label for row in opened.records()] == ["b", "c"]
+
+
+def test_sizes_are_those_on_the_disk(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        assert opened.size()["generations"] == 0
+        opened.append("a", "b", b"")
+        opened.commit({"x": np.arange(100)}, upto=1)
+        found = opened.size()
+        assert found["journal"] == sum(path.stat().st_size for path in tmp_path.glob("journal.sqlite*"))
+        files = [path for path in (tmp_path / "generations").rglob("*") if path.is_file()]
+        assert found["generations"] == sum(path.stat().st_size for path in files) > 0

@@ -1,0 +1,204 @@
+"""What goes into the store comes back with the same bytes; what could not is refused."""
+
+import json
+import string
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import store
+from store import Record, RecordError, Store
+
+DTYPES = ["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U1", "<U7"]
+arrays = st.dictionaries(
+    st.text(string.ascii_lowercase + "_0.", min_size=1, max_size=6).filter(
+        lambda name: not name.startswith(("__", ".")) and not name.endswith(".")
+    ),
+    st.sampled_from(DTYPES).flatmap(
+        lambda dtype: hnp.arrays(dtype, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5))
+    ),
+    max_size=3,
+)
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=6,
+)
+attributes = st.dictionaries(texts, values, max_size=3)
+several = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def same(found, given):
+    assert list(found) == list(given)
+    for name, array in given.items():
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+        assert found[name].tobytes() == array.tobytes()
+        assert found[name].flags.writeable
+    return True
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    with Store.open(tmp_path_factory.mktemp("kept") / "s", identity={}) as opened:
+        yield opened
+
+
+@several
+@given(
+    texts, texts, st.binary(max_size=64), st.floats(allow_nan=False, allow_infinity=False), attributes, arrays
+)
+def test_a_record_comes_back_with_the_same_bytes(kept, kind, label, key, time, attributes, arrays):
+    before = kept.last
+    given = kept.append(kind, label, key, time=time, attributes=attributes, arrays=arrays)
+    with Store.open(kept.path, mode="read") as reader:
+        (found,) = reader.records(before)
+    for record in (given, found):
+        assert isinstance(record, Record)
+        assert record.sequence == before + 1
+        assert (record.kind, record.label, record.key) == (kind, label, key)
+        assert np.float64(record.time).tobytes() == np.float64(time).tobytes()
+        assert json.dumps(record.attributes, sort_keys=True) == json.dumps(attributes, sort_keys=True)
+        assert same(record.arrays, arrays)
+
+
+@several
+@given(attributes, arrays)
+def test_a_generation_comes_back_with_the_same_bytes(kept, attributes, arrays):
+    number = kept.commit(arrays, upto=kept.last, attributes=attributes)
+    found = kept.latest()
+    assert (found.number, found.upto, found.attributes) == (number, kept.last, attributes)
+    assert same(found.arrays, arrays)
+
+
+SPECIAL = {
+    "signed_zeros": np.array([-0.0, 0.0]),
+    "nan_payload": np.array([0x7FF8DEADBEEF0001, 0xFFF0000000000000], "<u8").view("<f8"),
+    "scalar": np.array(7, "<i2"),
+    "no_rows": np.empty((0, 4), "<f4"),
+    "no_letters": np.array(["", ""], "<U0"),
+    "words": np.array([["wool", ""], ["\U0001f9f6", "a\0b"]], "<U7"),
+    "transposed": np.arange(6).reshape(2, 3).T,
+    "strided": np.arange(20)[::3],
+    "frozen": np.frombuffer(b"abcdefgh", "<i4"),
+    "truths": np.array([True, False]),
+}
+
+
+def test_awkward_arrays_come_back_in_both_places(kept):
+    record = kept.append("a", "b", b"", arrays=SPECIAL)
+    kept.commit(SPECIAL, upto=record.sequence)
+    assert same(record.arrays, SPECIAL)
+    assert same(kept.latest().arrays, SPECIAL)
+
+
+def test_large_arrays_are_chunked_along_the_first_axis(kept):
+    rows = np.arange(3 * 700_000).reshape(3, 700_000)
+    kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, upto=0)
+    assert same(kept.latest().arrays, {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)})
+    chunks = kept.path / "generations" / f"{kept.latest().number:08d}" / "rows" / "c"
+    assert sorted(chunk.name for chunk in chunks.iterdir()) == ["0", "1", "2"]
+
+
+def test_what_is_returned_is_the_callers_own(kept):
+    given = np.arange(5)
+    record = kept.append("a", "b", b"", arrays={"x": given})
+    given[:] = 0
+    record.arrays["x"][:] += 1
+    (found,) = kept.records(record.sequence - 1)
+    assert found.arrays["x"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_few_distinct_values_come_out_small(tmp_path):
+    signs = np.random.default_rng(0).integers(-1, 2, 12_500)
+    with Store.open(tmp_path, identity={}) as opened:
+        empty = opened.size()["journal"]
+        for _ in range(20):
+            opened.append("a", "b", b"", arrays={"x": signs})
+    with Store.open(tmp_path) as opened:
+        assert opened.size()["journal"] - empty < 20 * signs.nbytes / 8
+
+
+REFUSED = {
+    "label with NUL": {"label": "a\0b"},
+    "lone surrogate": {"label": "a\ud800"},
+    "label not text": {"label": 3},
+    "kind with NUL": {"kind": "\0"},
+    "key too long": {"key": bytes(65)},
+    "key not bytes": {"key": "text"},
+    "time not a number": {"time": float("nan")},
+    "time infinite": {"time": float("inf")},
+    "attribute NaN": {"attributes": {"a": {"b": [float("nan")]}}},
+    "attribute of NumPy": {"attributes": {"a": np.int64(1)}},
+    "attribute key": {"attributes": {"a": {1: 2}}},
+    "attribute surrogate": {"attributes": {"a": "\udc00"}},
+    "attributes not a mapping": {"attributes": [1]},
+    "objects": {"arrays": {"x": np.array([None, 1])}},
+    "structured": {"arrays": {"x": np.zeros(2, [("a", "<i4")])}},
+    "big-endian": {"arrays": {"x": np.zeros(2, ">i4")}},
+    "dates": {"arrays": {"x": np.zeros(2, "<M8[s]")}},
+    "masked": {"arrays": {"x": np.ma.masked_array([1, 2], [True, False])}},
+    "a list": {"arrays": {"x": [1, 2]}},
+    "a name that climbs": {"arrays": {"../x": np.zeros(2)}},
+    "a name of zarr's": {"arrays": {"__x": np.zeros(2)}},
+    "a file of zarr's": {"arrays": {"zarr.json": np.zeros(2)}},
+    "an empty name": {"arrays": {"": np.zeros(2)}},
+    "names that fold together": {"arrays": {"A": np.zeros(2), "a": np.zeros(2)}},
+}
+
+
+@pytest.mark.parametrize("wrong", REFUSED.values(), ids=REFUSED.keys())
+def test_what_cannot_be_kept_is_refused_and_nothing_changes(kept, wrong):
+    before = kept.last
+    with pytest.raises(RecordError):
+        kept.append(**({"kind": "a", "label": "b", "key": b""} | wrong))
+    if "arrays" in wrong or "attributes" in wrong:
+        for commit in (kept.commit, kept.commit_later):
+            with pytest.raises(RecordError):
+                commit(**({"arrays": {}, "upto": 0} | wrong))
+    assert kept.last == before
+    kept.flush()
+
+
+@pytest.mark.parametrize("upto", [-1, 10**9, True, 1.0])
+def test_a_generation_may_not_claim_rows_that_are_not_there(kept, upto):
+    with pytest.raises(RecordError, match="upto"):
+        kept.commit({}, upto=upto)
+
+
+def test_a_message_names_the_place_in_the_attributes(kept):
+    with pytest.raises(RecordError, match=r"attributes\['a'\]\[1\] is nan"):
+        kept.append("a", "b", b"", attributes={"a": [1, float("nan")]})
+
+
+def test_the_public_names_are_sorted_and_none_leaks():
+    assert sorted(store.__all__, key=lambda name: (not name.isupper(), name)) == store.__all__
+    modules = {path.stem for path in Path(store.__file__).parent.glob("*.py")}
+    assert {name for name in vars(store) if not name.startswith("_")} - modules == set(store.__all__)
+
+
+def test_the_exception_tree_is_the_one_in_the_docstring():
+    lines = store.errors.__doc__.splitlines()
+    drawn = {line.split("── ")[1].split()[0] for line in lines if "── " in line}
+    assert drawn == set(store.errors.__all__)
+    for name in drawn - {"StoreError"}:
+        bases = getattr(store, name).__bases__
+        assert bases == ((store.StoreError, ValueError) if name == "RecordError" else (store.StoreError,))
+    assert store.StoreError.__bases__ == (Exception,)
+
+
+def test_importing_is_light():
+    code = "import sys, store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))"
+    where = Path(store.__file__).parents[1]
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.strip() == "set()"

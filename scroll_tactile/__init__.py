@@ -1,0 +1,1 @@
+"""A robot's memory of how things feel."""

@@ -1,0 +1,160 @@
+"""BioTac-20 and RoboSkin-20: the same twenty materials under two sensors, 50 touches each.
+
+Published as github.com/dexrob/BioTac_slide_20_50 (R. Gao et al., Supervised Autoencoder Joint Learning on
+Heterogeneous Tactile Sensory Data, IROS 2020), in this layout::
+
+    raw_data/mat{1..20}/mat{m}_{1..50}.pt      BioTac: int tensors (≥ 400, 44) at 100 Hz; the last 19 columns
+                                               are the electrodes
+    compiled_data/icub_{val_0..3,test}.npy     RoboSkin: five folds of float (200, 6, 10, 75) at 50 Hz
+    compiled_data/labels_{val_0..3,test}.npy   their labels: l is material l + 1
+
+The publisher names the materials mat1 to mat20, and so do we. No file says which touch of a material a
+RoboSkin stream is, nor when it was made.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.datasets.recordings import Recordings
+from scroll_tactile.errors import DatasetError, InputError, StreamError
+from scroll_tactile.sensors import BIOTAC, ROBOSKIN, Sensor
+from scroll_tactile.streams import Stream, validate
+
+__all__ = ["MATERIALS", "load"]
+
+FOLDER = "biotac_slide_20_50"
+MATERIALS = tuple(f"mat{number}" for number in range(1, 21))
+"""The twenty materials, named as their publisher does, for both sensors."""
+
+_REPETITIONS = 50
+_FOLDS = 5
+_COLUMNS = 44  # of a raw BioTac recording: tdc, tac, pdc, pac1..22, ele1..19
+_ROBOSKIN_FILES = ("val_0", "val_1", "val_2", "val_3", "test")  # icub_test_4.npy overlaps these: left out
+_ROBOSKIN_SHAPE = (200, 6, 10, 75)
+
+
+def load(root: str | Path, sensor: Literal["biotac", "roboskin"], seed: int = 0) -> Recordings:
+    """Read one sensor's 1000 streams: (400, 19) for "biotac", (75, 60) for "roboskin", both in counts.
+
+    root: the folder of the data set, or the folder it lies in.
+    seed: deals BioTac's repetitions into five folds of ten for each material. RoboSkin's five folds are its
+        publisher's files, whatever the seed.
+
+    Every BioTac recording is cropped to 400 readings: those of some materials are shorter than all others, so
+    that their length would tell what they are. Electrodes' glitches are clipped, as `validate` does.
+
+    Raises DatasetError if a file is missing or not as published, InputError for another sensor or a negative
+    seed.
+    """
+    if sensor not in ("biotac", "roboskin"):
+        raise InputError(f"expected sensor 'biotac' or 'roboskin'; came {sensor!r}")
+    if seed < 0:
+        raise InputError(f"expected a seed of 0 or more; came {seed}")
+    folder = _find(Path(root).expanduser())
+    return _load_biotac(folder / "raw_data", seed) if sensor == "biotac" else _load_roboskin(folder)
+
+
+def _find(root: Path) -> Path:
+    for folder in (root, root / FOLDER):
+        if (folder / "raw_data").is_dir() or (folder / "compiled_data").is_dir():
+            return folder
+    raise DatasetError(
+        f"expected {root} to be the folder {FOLDER}, with raw_data/ and compiled_data/ in it, or to hold it; "
+        + ("it is and does not" if root.is_dir() else "there is no such folder")
+        + f". Get it from github.com/dexrob/{FOLDER}"
+    )
+
+
+def _load_biotac(folder: Path, seed: int) -> Recordings:
+    streams, folds = [], []
+    for number, material in enumerate(MATERIALS):
+        for file in range(1, _REPETITIONS + 1):
+            streams.append(_read_biotac(folder / material / f"{material}_{file}.pt"))
+        dealt = np.arange(_REPETITIONS) % _FOLDS
+        folds.append(np.random.default_rng([seed, number]).permutation(dealt))
+    return Recordings(
+        name="BioTac-20",
+        sensor=BIOTAC,
+        streams=streams,
+        materials=[material for material in MATERIALS for _ in range(_REPETITIONS)],
+        repetition=np.tile(np.arange(_REPETITIONS), len(MATERIALS)),
+        fold=np.concatenate(folds),
+        ordered=True,
+    )
+
+
+def _read_biotac(path: Path) -> Stream:
+    import torch  # a second or more: not for those who read RoboSkin only
+
+    wanted = f"a tensor of shape (≥ {BIOTAC.readings}, {_COLUMNS})"
+    tensor = _read(path, lambda file: torch.load(file, weights_only=True), wanted)
+    if not isinstance(tensor, torch.Tensor):
+        raise DatasetError(f"expected {path} to hold {wanted}; it holds a {type(tensor).__name__}")
+    if tensor.ndim != 2 or len(tensor) < BIOTAC.readings or tensor.shape[1] != _COLUMNS:
+        raise DatasetError(f"expected {path} to hold {wanted}; its shape is {tuple(tensor.shape)}")
+    return _stream(tensor[: BIOTAC.readings, -BIOTAC.channels :].numpy(), BIOTAC, path)
+
+
+def _load_roboskin(folder: Path) -> Recordings:
+    streams: list[Stream] = []
+    materials: list[str] = []
+    repetitions = []
+    for name in _ROBOSKIN_FILES:
+        source = folder / "compiled_data" / f"icub_{name}.npy"
+        readings = _read_array(source, _ROBOSKIN_SHAPE)
+        path = folder / "compiled_data" / f"labels_{name}.npy"
+        labels = _read_array(path, _ROBOSKIN_SHAPE[:1])
+        if not np.isin(labels, np.arange(len(MATERIALS))).all():
+            raise DatasetError(f"expected {path} to hold labels 0 to 19; it holds {np.unique(labels)}")
+        labels = labels.astype(np.int64)
+        streams += [_stream(touch.reshape(ROBOSKIN.channels, -1).T, ROBOSKIN, source) for touch in readings]
+        materials += [MATERIALS[label] for label in labels]
+        repetitions.append(_count_before(labels))
+    return Recordings(
+        name="RoboSkin-20",
+        sensor=ROBOSKIN,
+        streams=streams,
+        materials=materials,
+        repetition=np.concatenate(repetitions),
+        fold=np.repeat(np.arange(len(_ROBOSKIN_FILES)), _ROBOSKIN_SHAPE[0]),
+        ordered=False,
+    )
+
+
+def _stream(readings: npt.NDArray[Any], sensor: Sensor, path: Path) -> Stream:
+    try:
+        return validate(readings, sensor)
+    except StreamError as error:
+        raise DatasetError(f"{path} holds no sound readings: {error}") from error
+
+
+def _count_before(labels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """For each label, how many equal ones come before it."""
+    return np.array([np.count_nonzero(labels[:at] == label) for at, label in enumerate(labels)])
+
+
+def _read_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    wanted = f"an array of shape {shape}"
+    array = _read(path, lambda file: np.load(file, allow_pickle=False), wanted)
+    if not isinstance(array, np.ndarray) or array.shape != shape:
+        came = getattr(array, "shape", type(array).__name__)
+        raise DatasetError(f"expected {path} to hold {wanted}; it holds {came}")
+    return array
+
+
+def _read(path: Path, reader: Callable[[Path], Any], wanted: str) -> Any:
+    try:
+        return reader(path)
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"expected {wanted} in {path}; there is no such file. The layout is that of "
+            f"github.com/dexrob/{FOLDER}"
+        ) from error
+    except Exception as error:  # damaged bytes make the parsers fail in any way: IndexError, SyntaxError, …
+        raise DatasetError(
+            f"expected {wanted} in {path}; it cannot be read, and may be damaged or half copied: {error}"
+        ) from error

@@ -1,0 +1,86 @@
+"""The errors that scroll-tactile raises on purpose, grouped by what the one who catches them does.
+
+::
+
+    ScrollTactileError (Exception)
+    ├── InputError (ValueError)              what was passed in is wrong: correct it and call again
+    │   ├── StreamError                      the readings cannot be made into a stream
+    │   │   ├── EmptyStreamError             there are none: the sensor sent nothing
+    │   │   ├── StreamTooShortError          touch for longer
+    │   │   ├── ChannelCountError            they are not laid out as (time, channel) for this sensor
+    │   │   ├── NotFiniteError               NaN or infinity: leave the touch out, or repair the readings
+    │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
+    │   ├── MaterialError                    a material's name is not usable
+    │   └── UnknownMaterialError (KeyError)  a material that was never felt is asked for
+    ├── MismatchError                        two things that do not belong together: open the right one
+    │   ├── SensorMismatchError              another sensor's stream or memory
+    │   └── EmbeddingMismatchError           a memory made with another embedding
+    ├── DatasetError                         a data set's folder is not laid out as its publisher does
+    └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
+
+A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
+"""
+
+
+class ScrollTactileError(Exception):
+    """Every error that scroll-tactile raises on purpose; catch it to catch them all."""
+
+
+class InputError(ScrollTactileError, ValueError):
+    """What was passed in is wrong and nothing has changed: correct it and call again."""
+
+
+class StreamError(InputError):
+    """The readings cannot be made into a stream."""
+
+
+class EmptyStreamError(StreamError):
+    """There are no readings: the sensor sent nothing."""
+
+
+class StreamTooShortError(StreamError):
+    """There are too few readings to feel anything in: touch for longer."""
+
+
+class ChannelCountError(StreamError):
+    """The readings are not laid out as (time, channel) with the channels of this sensor."""
+
+
+class NotFiniteError(StreamError):
+    """Some values are NaN, infinite or masked."""
+
+
+class ReadingsTypeError(StreamError, TypeError):
+    """The readings are not real numbers."""
+
+
+class MaterialError(InputError):
+    """A material's name is not usable: no string, empty, too long, or with characters that do not print."""
+
+
+class UnknownMaterialError(InputError, KeyError):
+    """A material that was never felt is asked for."""
+
+    def __str__(self) -> str:
+        # KeyError would show the message as a quoted repr.
+        return Exception.__str__(self)
+
+
+class MismatchError(ScrollTactileError):
+    """Two things were brought together that do not belong together."""
+
+
+class SensorMismatchError(MismatchError):
+    """A stream, or a memory, comes from another sensor."""
+
+
+class EmbeddingMismatchError(MismatchError):
+    """A memory was made with another embedding."""
+
+
+class DatasetError(ScrollTactileError):
+    """A data set's folder is not laid out as its publisher does, or a file in it cannot be read."""
+
+
+class CapacityError(ScrollTactileError, OverflowError):
+    """An exact sum would not fit its integers any more."""

@@ -1,0 +1,140 @@
+"""What is known about a tactile sensor: its channels, rate and range of values.
+
+Four sensors come with the project; one's own is one more, made in one line:
+
+>>> from scroll_tactile.sensors import Sensor
+>>> skin = Sensor(name="my-skin", channels=39, rate=50.0, low=0.0, high=1.0, unit="counts", duration=5.0)
+>>> skin.readings
+250
+"""
+
+import math
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+__all__ = ["BIOTAC", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
+
+_Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+class Sensor(BaseModel):
+    """A tactile sensor, or one kind of it; frozen, and equal to another where all its fields are equal.
+
+    name: what streams of this sensor are known by, non-empty.
+    channels: how many values a reading has, n ≥ 1.
+    rate: readings per second, in Hz.
+    low, high: the range of a valid value, in `unit`; what lies outside is clipped to it.
+    unit: the unit of the values, such as "counts" or "N".
+    duration: how long a touch usually lasts, in seconds. Streams may be shorter or longer.
+    layout: how the channels lie on the sensor, such as (6, 10) patches × taxels; its product is `channels`.
+    camera: whether a reading is a picture; then layout is (height, width, 3).
+
+    Raises pydantic.ValidationError, which is a ValueError, for fields that do not fit together.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1)]
+    channels: Annotated[int, Field(ge=1)]
+    rate: _Positive
+    low: FiniteFloat
+    high: FiniteFloat
+    unit: str
+    duration: _Positive
+    layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
+    camera: bool = False
+
+    @model_validator(mode="after")
+    def _range_fits_float32(self) -> Self:
+        # Readings are kept, compared and scaled in float32, so the range has to survive there too.
+        if not self.low < self.high:
+            raise ValueError(f"low must lie below high; they are {self.low:g} and {self.high:g}")
+        largest = float(np.finfo(np.float32).max)
+        if max(abs(self.low), abs(self.high), self.high - self.low) > largest:
+            raise ValueError(f"the range {self.low:g} to {self.high:g} is too wide for float32 readings")
+        if not np.float32(self.low) < np.float32(self.high):
+            raise ValueError(
+                f"{self.low!r} and {self.high!r} are the same number in float32: rescale the readings"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _layout_fits_channels(self) -> Self:
+        if self.layout is not None and math.prod(self.layout) != self.channels:
+            raise ValueError(
+                f"layout {self.layout} holds {math.prod(self.layout)} values, but channels is {self.channels}"
+            )
+        if self.camera and (self.layout is None or len(self.layout) != 3 or self.layout[2] != 3):
+            raise ValueError(f"a camera needs layout=(height, width, 3); it is {self.layout}")
+        return self
+
+    @model_validator(mode="after")
+    def _touch_holds_a_reading(self) -> Self:
+        if self.readings < 1:
+            raise ValueError(f"{self.duration:g} s at {self.rate:g} Hz holds no reading")
+        return self
+
+    @property
+    def readings(self) -> int:
+        """The number of readings in a touch of the usual duration."""
+        return round(self.rate * self.duration)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of one reading: (n,), or (height, width, 3) for a camera."""
+        return self.layout if self.camera and self.layout is not None else (self.channels,)
+
+
+BIOTAC = Sensor(
+    name="biotac",
+    channels=19,
+    rate=100.0,
+    low=0.0,
+    high=255.0,  # valid electrodes lie below about 250; recordings hold rare glitches of over 3000
+    unit="counts",
+    duration=4.0,
+)
+"""The 19 electrodes of a SynTouch BioTac."""
+
+ROBOSKIN = Sensor(
+    name="roboskin",
+    channels=60,
+    rate=50.0,
+    low=0.0,
+    high=255.0,  # 8-bit taxels; the published recordings reach 192
+    unit="counts",
+    duration=1.5,
+    layout=(6, 10),
+)
+"""The six patches of ten taxels on the forearm of an iCub."""
+
+CONTACTILE = Sensor(
+    name="contactile",
+    channels=27,
+    rate=100.0,
+    low=-10.0,  # not from a data sheet: ±10 N on each axis of a pillar is wider than a fabric's touch needs
+    high=10.0,
+    unit="N",
+    duration=5.99,  # 599 readings
+)
+"""The nine pillars of a Contactile PapillArray, three axes of force each."""
+
+GELSIGHT = Sensor(
+    name="gelsight",
+    channels=480 * 640 * 3,
+    rate=25.0,
+    low=0.0,
+    high=255.0,
+    unit="counts",
+    duration=1.0,
+    layout=(480, 640, 3),
+    camera=True,
+)
+"""The camera behind the gel of a GelSight, red, green and blue."""
+
+
+def known() -> dict[str, Sensor]:
+    """The sensors that come with the project, by name."""
+    return {sensor.name: sensor for sensor in (BIOTAC, ROBOSKIN, CONTACTILE, GELSIGHT)}

@@ -1,0 +1,304 @@
+"""Streams: readings in time order, made sound once at the door, so that nothing behind it looks again."""
+
+import math
+import numbers
+import sys
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import (
+    ChannelCountError,
+    EmptyStreamError,
+    InputError,
+    NotFiniteError,
+    ReadingsTypeError,
+    SensorMismatchError,
+    StreamTooShortError,
+)
+from scroll_tactile.sensors import Sensor
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["Stream", "fewest_readings", "validate"]
+
+_Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Readings in time order with the sensor they came from; made by `validate`, which guarantees this:
+
+    sensor: the sensor.
+    readings: float32 of shape (T, n), or (T, height, width, 3) for a camera, in the sensor's unit and within
+        its range; C-contiguous, read-only, and nobody else's memory.
+    clipped: how many values lay outside the sensor's range before they were clipped to it.
+
+    Two streams are equal where their sensors and their readings are.
+    """
+
+    sensor: Sensor
+    readings: npt.NDArray[np.float32]
+    clipped: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """The stream's length in seconds: T readings last T / rate."""
+        return len(self) / self.sensor.rate
+
+    @cached_property
+    def key(self) -> bytes:
+        """32 bytes that name the content: a hash of the sensor's name, the shape and the readings.
+
+        The same on every machine, and whatever type the readings had when they came in. Computed when first
+        asked.
+        """
+        name = self.sensor.name.encode()
+        sizes = [len(name), self.readings.ndim, *self.readings.shape]
+        digest = blake2b(np.array(sizes, dtype="<i8").tobytes() + name, digest_size=32)
+        digest.update(self.readings.astype("<f4", copy=False).data.cast("B"))
+        return digest.digest()
+
+    def first(self, seconds: float) -> "Stream":
+        """The stream of the first `seconds`, or the whole stream if it is no longer; memory is shared.
+
+        `clipped` stays an upper bound: which values were clipped is not kept.
+
+        Raises InputError if seconds is not a number, StreamTooShortError if it asks for less than 0.1 s.
+        """
+        if math.isnan(seconds):
+            raise InputError("first() needs a number of seconds; came NaN")
+        # min() first: infinity and 1e300 s have no number of readings.
+        count = round(min(max(seconds, 0.0), self.seconds) * self.sensor.rate)
+        _require_length(count, self.sensor)
+        if count >= len(self):
+            return self
+        part = self.readings[:count]
+        return Stream(self.sensor, part, min(self.clipped, part.size))
+
+    def __len__(self) -> int:
+        return len(self.readings)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Stream):
+            return NotImplemented
+        if self is other:
+            return True
+        return self.sensor == other.sensor and np.array_equal(self.readings, other.readings)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __repr__(self) -> str:
+        shape = self.readings.shape
+        return f"Stream({self.sensor.name}, {shape}, {self.seconds:g} s, clipped={self.clipped})"
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Pickling and copying drop the read-only flag.
+        self.__dict__.update(state)
+        self.readings.setflags(write=False)
+
+
+def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor: Sensor) -> Stream:
+    """Make a stream of whatever holds readings: the one way in.
+
+    readings: of shape (T, n), or (T, height, width, 3) for a camera, in the sensor's unit. A numpy array or
+        torch tensor of any real type, nested lists, anything with `__array__`, an iterable of readings, or a
+        stream. It is neither changed nor kept. Values outside the sensor's range are clipped and counted.
+
+    Raises EmptyStreamError, StreamTooShortError (less than 0.1 s; one frame is enough for a camera),
+    ChannelCountError (shape), NotFiniteError, ReadingsTypeError, all of them StreamErrors;
+    SensorMismatchError for another sensor's stream; and whatever an iterable raises while it is read.
+    """
+    if isinstance(readings, Stream):
+        if readings.sensor is not sensor and readings.sensor != sensor:
+            same_name = readings.sensor.name == sensor.name
+            raise SensorMismatchError(
+                f"expected a stream of sensor {sensor.name!r}; came one of {readings.sensor.name!r}"
+                + (", which has the same name but other fields" if same_name else "")
+            )
+        return readings
+    array = _as_array(readings, "the readings", sensor)
+    if array.size == 0:
+        raise EmptyStreamError(
+            f"expected readings of sensor {sensor.name!r}, shape {_expected(sensor)}; came none: an array of "
+            f"shape {array.shape}. Is the sensor connected and recording?"
+        )
+    array = _real(array)
+    _require_shape(array.shape, sensor)
+    _require_length(len(array), sensor)
+    return _clip(array, sensor)
+
+
+def fewest_readings(sensor: Sensor) -> int:
+    """The fewest readings that make a stream: 0.1 s of them, or one frame of a camera."""
+    # Dividing by 10 rounds once; multiplying by 0.1, which is a little more than a tenth, could give one too
+    # many.
+    return 1 if sensor.camera else math.ceil(sensor.rate / 10)
+
+
+def _clip(array: _Array, sensor: Sensor) -> Stream:
+    low, high = np.float32(sensor.low), np.float32(sensor.high)
+    with np.errstate(all="ignore"):  # values beyond float32 become infinite here, and are clipped below
+        values = np.array(array, dtype=np.float32, order="C", copy=True, subok=False)
+        least, most = values.min(), values.max()  # NaN if any value is
+    if not (math.isfinite(least) and math.isfinite(most)):
+        _require_finite(array, sensor)
+    clipped = 0
+    if least < low or most > high:
+        clipped = int(np.count_nonzero(values < low)) + int(np.count_nonzero(values > high))
+        np.clip(values, low, high, out=values)
+    values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
+    values.setflags(write=False)
+    return Stream(sensor, values, clipped)
+
+
+def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:
+    """`readings` as an array, sharing memory where it can; `what` names them in messages."""
+    if isinstance(readings, np.ma.MaskedArray):
+        # numpy would show the values under the mask as if they were readings.
+        masked = np.ma.is_masked(readings)
+        return np.ma.filled(readings.astype(np.float64), np.nan) if masked else readings.data
+    if isinstance(readings, np.ndarray):
+        return readings
+    torch = sys.modules.get("torch")  # whoever passes a tensor has imported torch
+    if torch is not None and isinstance(readings, torch.Tensor):
+        return _from_torch(readings)
+    if isinstance(readings, numbers.Number | memoryview) or hasattr(readings, "__array__"):
+        return np.asarray(readings)
+    if isinstance(readings, str | bytes | bytearray | Mapping | Set) or not isinstance(readings, Iterable):
+        raise ReadingsTypeError(
+            f"expected {what} of sensor {sensor.name!r} as numbers in an array, tensor, list or iterable; "
+            f"came {_article(type(readings).__name__)}"
+        )
+    return _stack(list(readings), sensor)
+
+
+def _from_torch(tensor: "torch.Tensor") -> _Array:
+    if tensor.is_floating_point() and tensor.element_size() < 4:
+        tensor = tensor.float()  # numpy knows no bfloat16 and no 8-bit floats
+    try:
+        array: _Array = tensor.numpy(force=True)
+    except (TypeError, RuntimeError, NotImplementedError) as error:
+        raise ReadingsTypeError(
+            f"expected a dense tensor of real numbers; came one of {tensor.dtype}, layout {tensor.layout}, "
+            f"on {tensor.device}, which cannot be turned into an array: {error}"
+        ) from error
+    return array
+
+
+def _stack(items: list[Any], sensor: Sensor) -> _Array:
+    plain = (list, tuple, numbers.Number)  # np.asarray reads nested lists fastest when it gets them whole
+    rows = [
+        item if isinstance(item, plain) else _as_array(item, f"reading {at}", sensor)
+        for at, item in enumerate(items)
+    ]
+    try:
+        return np.asarray(rows)
+    except ValueError:
+        _raise_ragged(rows, sensor)
+        raise
+
+
+def _raise_ragged(rows: list[Any], sensor: Sensor) -> None:
+    for at, row in enumerate(rows):
+        try:
+            shape = np.shape(row)
+        except ValueError:  # ragged within one reading
+            raise ChannelCountError(
+                f"expected {sensor.channels} numbers in each reading of sensor {sensor.name!r}; reading {at} "
+                f"of {len(rows)} holds sequences of different lengths"
+            ) from None
+        if shape != sensor.shape:
+            raise ChannelCountError(
+                f"expected each reading of sensor {sensor.name!r} to have shape {sensor.shape}; reading {at} "
+                f"of {len(rows)} has {shape}. Were values lost on the way from the sensor?"
+            ) from None
+
+
+def _real(array: _Array) -> _Array:
+    if array.dtype.kind in "fiub":
+        return array
+    if array.dtype.kind != "O":
+        raise ReadingsTypeError(
+            f"expected real numbers; came an array of {array.dtype} of shape {array.shape}. "
+            + ("Take .real or np.abs() of it" if array.dtype.kind == "c" else "Convert it to numbers")
+        )
+    flat = array.reshape(-1)
+    values = np.empty(flat.shape)
+    for at, item in enumerate(flat):
+        real = isinstance(item, numbers.Real | np.bool)
+        if not real:
+            index = np.unravel_index(at, array.shape)
+            raise ReadingsTypeError(
+                f"expected real numbers; {_place(index)} is {item!r:.60}, {_article(type(item).__name__)}"
+            )
+        try:
+            values[at] = float(item)
+        except OverflowError:  # an int beyond float64: as far outside the range as can be said
+            values[at] = sys.float_info.max if item > 0 else -sys.float_info.max
+    return values.reshape(array.shape)
+
+
+def _require_shape(shape: tuple[int, ...], sensor: Sensor) -> None:
+    if len(shape) > 1 and shape[1:] == sensor.shape:
+        return
+    came = f"came {shape}" if shape else "came a single number"
+    raise ChannelCountError(
+        f"expected readings of sensor {sensor.name!r} of shape {_expected(sensor)}; "
+        f"{came}{_advice(shape, sensor)}"
+    )
+
+
+def _advice(shape: tuple[int, ...], sensor: Sensor) -> str:
+    each = sensor.shape
+    if shape == each:
+        noun = "frame" if sensor.camera else "reading"
+        return f": one {noun}. A stream of it alone is .reshape{(1, *each)}"
+    if each == (1,) and len(shape) == 1:
+        return f". With one channel use .reshape({shape[0]}, 1)"
+    if len(shape) == 2 and shape[0] == sensor.channels:
+        return ", which looks like (channels, time): use .T"
+    if len(shape) > 1 and math.prod(shape[1:]) == sensor.channels:
+        return f". Its values fit: use .reshape{(shape[0], *each)}"
+    return ". Is it this sensor, and time the first axis?"
+
+
+def _require_length(count: int, sensor: Sensor) -> None:
+    needed = fewest_readings(sensor)
+    if count < needed:
+        raise StreamTooShortError(
+            f"expected at least {needed} readings of sensor {sensor.name!r} (0.1 s at {sensor.rate:g} Hz); "
+            f"came {count}, which is {count / sensor.rate:.3g} s. Touch for longer"
+        )
+
+
+def _require_finite(array: _Array, sensor: Sensor) -> None:
+    bad = ~np.isfinite(array)
+    count = int(np.count_nonzero(bad))
+    if not count:
+        return
+    index = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    raise NotFiniteError(
+        f"expected finite readings of sensor {sensor.name!r}; {_place(index)} is {float(array[index])}, the "
+        f"first of {count} not finite among {array.size} values. Leave this touch out, or repair the readings"
+    )
+
+
+def _place(index: tuple[Any, ...]) -> str:
+    channel = ", ".join(str(int(at)) for at in index[1:])
+    return f"reading {int(index[0])}, channel {channel}" if len(index) > 1 else f"item {int(index[0])}"
+
+
+def _expected(sensor: Sensor) -> str:
+    return f"(T, {', '.join(map(str, sensor.shape))})"
+
+
+def _article(noun: str) -> str:
+    return f"{'an' if noun[0] in 'aeiouAEIOU' else 'a'} {noun}"

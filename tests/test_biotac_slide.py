@@ -1,0 +1,194 @@
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.biotac_slide import MATERIALS, load
+from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.sensors import BIOTAC, ROBOSKIN
+
+
+@pytest.fixture(scope="module")
+def biotac(real_data):
+    return load(real_data, "biotac")
+
+
+@pytest.fixture(scope="module")
+def roboskin(real_data):
+    return load(real_data.parent, "roboskin")  # the parent does too
+
+
+def counts(recordings, folds):
+    """Streams of each material in each fold."""
+    materials = np.array(recordings.materials)
+    return {(m, f): np.count_nonzero((materials == m) & (folds == f)) for m in MATERIALS for f in range(5)}
+
+
+def test_biotac_is_a_thousand_streams_of_four_seconds(biotac):
+    assert (biotac.name, biotac.sensor, len(biotac)) == ("BioTac-20", BIOTAC, 1000)
+    assert {stream.readings.shape for stream in biotac.streams} == {(400, 19)}
+    assert len({stream.key for stream in biotac.streams}) == 1000
+    assert biotac.materials == [material for material in MATERIALS for _ in range(50)]
+    assert biotac.repetition.tolist() == list(range(50)) * 20
+
+
+def test_biotac_reads_the_last_nineteen_columns(biotac, real_data):
+    raw = torch.load(real_data / "raw_data" / "mat3" / "mat3_8.pt", weights_only=True)
+    at = biotac.materials.index("mat3") + 7
+    assert biotac.repetition[at] == 7
+    assert np.array_equal(biotac.streams[at].readings, raw[:400, 25:].numpy())
+
+
+def test_the_glitches_of_two_biotac_recordings_are_clipped(biotac):
+    glitches = {
+        (biotac.materials[at], int(biotac.repetition[at])): stream.clipped
+        for at, stream in enumerate(biotac.streams)
+        if stream.clipped
+    }
+    assert glitches == {("mat2", 8): 4, ("mat2", 10): 14}
+
+
+def test_biotac_folds_are_stratified_and_seeded(biotac, real_data):
+    assert set(counts(biotac, biotac.fold).values()) == {10}
+    assert np.array_equal(load(real_data, "biotac").fold, biotac.fold)
+    other = load(real_data, "biotac", seed=1)
+    assert set(counts(other, other.fold).values()) == {10}
+    assert not np.array_equal(other.fold, biotac.fold)
+    assert not np.array_equal(biotac.fold[:50], biotac.fold[50:100])  # not one permutation for all materials
+
+
+def test_biotac_blocks_test_on_the_last_ten_repetitions(biotac):
+    blocks = biotac.blocked()
+    assert set(biotac.repetition[blocks == 4]) == set(range(40, 50))
+    assert set(counts(biotac, blocks).values()) == {10}
+
+
+def test_roboskin_is_the_publishers_five_files(roboskin, real_data):
+    assert (roboskin.name, roboskin.sensor, len(roboskin)) == ("RoboSkin-20", ROBOSKIN, 1000)
+    assert {stream.readings.shape for stream in roboskin.streams} == {(75, 60)}
+    assert len({stream.key for stream in roboskin.streams}) == 1000
+    assert sum(stream.clipped for stream in roboskin.streams) == 0
+    assert set(counts(roboskin, roboskin.fold).values()) == {10}
+    raw = np.load(real_data / "compiled_data" / "icub_val_2.npy")
+    labels = np.load(real_data / "compiled_data" / "labels_val_2.npy")
+    stream = roboskin.streams[400 + 17]
+    assert roboskin.fold[400 + 17] == 2
+    assert roboskin.materials[400 + 17] == f"mat{labels[17] + 1}"
+    assert stream.readings[40, 3 * 10 + 6] == raw[17, 3, 6, 40]
+
+
+def test_roboskin_repetitions_count_within_material_and_fold(roboskin):
+    seen = {
+        (material, fold, repetition)
+        for material, fold, repetition in zip(
+            roboskin.materials, roboskin.fold.tolist(), roboskin.repetition.tolist(), strict=True
+        )
+    }
+    assert len(seen) == 1000
+    assert set(roboskin.repetition) == set(range(10))
+
+
+def test_roboskin_has_no_blocks(roboskin):
+    with pytest.raises(DatasetError, match=r"RoboSkin-20 .* without its order of recording"):
+        roboskin.blocked()
+
+
+def test_both_sensors_name_the_same_materials(biotac, roboskin):
+    assert set(biotac.materials) == set(roboskin.materials) == set(MATERIALS)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A small imitation of the layout: enough to fail in."""
+    folder = tmp_path / "biotac_slide_20_50"
+    (folder / "raw_data" / "mat1").mkdir(parents=True)
+    (folder / "compiled_data").mkdir()
+    torch.save(torch.zeros(400, 44, dtype=torch.int64), folder / "raw_data" / "mat1" / "mat1_1.pt")
+    np.save(folder / "compiled_data" / "icub_val_0.npy", np.zeros((200, 6, 10, 75), np.float32))
+    np.save(folder / "compiled_data" / "labels_val_0.npy", np.repeat(np.arange(20), 10))
+    return folder
+
+
+def test_a_folder_of_something_else_is_named(tmp_path):
+    with pytest.raises(
+        DatasetError, match=rf"expected {re.escape(str(tmp_path))} to be .*raw_data.* it is and does not"
+    ):
+        load(tmp_path, "biotac")
+    with pytest.raises(DatasetError, match=r"there is no such folder. Get it from github.com/dexrob"):
+        load(tmp_path / "none", "roboskin")
+
+
+def test_a_missing_file_is_named_with_what_it_should_hold(folder):
+    with pytest.raises(
+        DatasetError, match=r"expected a tensor of shape \(≥ 400, 44\) in .*mat1_2.pt; there is no such"
+    ):
+        load(folder, "biotac")
+    with pytest.raises(
+        DatasetError, match=r"expected an array of shape \(200, 6, 10, 75\) in .*icub_val_1.npy"
+    ):
+        load(folder.parent, "roboskin")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (torch.zeros(399, 44), r"its shape is \(399, 44\)"),
+        (torch.zeros(400, 19), r"its shape is \(400, 19\)"),
+        (torch.zeros(400), r"its shape is \(400,\)"),
+        ([1, 2], "it holds a list"),
+        (torch.full((400, 44), torch.nan), "holds no sound readings: .*reading 0, channel 0 is nan"),
+        (b"not a tensor at all", "cannot be read, and may be damaged"),
+        (b"", "cannot be read, and may be damaged"),
+    ],
+)
+def test_a_biotac_file_that_is_not_as_published_is_named(folder, content, message):
+    path = folder / "raw_data" / "mat1" / "mat1_1.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    with pytest.raises(DatasetError, match=rf"(?s){re.escape(str(path))}.*{message}"):
+        load(folder, "biotac")
+
+
+class Planted:
+    def __reduce__(self):
+        return print, ("a pickle ran code",)
+
+
+def test_a_file_that_would_run_code_is_refused(folder, capsys):
+    torch.save(Planted(), folder / "raw_data" / "mat1" / "mat1_1.pt")
+    with pytest.raises(DatasetError, match="cannot be read"):
+        load(folder, "biotac")
+    assert "ran code" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("icub_val_0", np.zeros((200, 60, 75)), r"it holds \(200, 60, 75\)"),
+        ("labels_val_0", np.arange(200), "labels 0 to 19"),
+        ("labels_val_0", np.full(200, 0.5), "labels 0 to 19"),
+        ("labels_val_0", np.zeros((200, 1), int), r"it holds \(200, 1\)"),
+        ("icub_val_0", np.full((200, 6, 10, 75), np.nan), "holds no sound readings"),
+        ("icub_val_0", np.array([None]), "cannot be read"),
+    ],
+)
+def test_a_roboskin_file_that_is_not_as_published_is_named(folder, file, content, message):
+    np.save(folder / "compiled_data" / f"{file}.npy", content)
+    with pytest.raises(DatasetError, match=f"{file}.npy.*{message}"):
+        load(folder, "roboskin")
+
+
+def test_other_sensors_and_seeds_are_refused(folder):
+    with pytest.raises(InputError, match="expected sensor 'biotac' or 'roboskin'; came 'gelsight'"):
+        load(folder, "gelsight")
+    with pytest.raises(InputError, match="seed of 0 or more; came -1"):
+        load(folder, "biotac", seed=-1)
+
+
+def test_recordings_of_unequal_lengths_are_refused():
+    with pytest.raises(InputError, match="came 0, 1, 2, 2"):
+        Recordings("x", BIOTAC, [], ["a"], np.arange(2), np.arange(2), ordered=True)

@@ -1,1 +1,25 @@
-"""A robot's memory of how things feel."""
+"""A robot's memory of how things feel.
+
+learner = TactileLearner.open("memory", sensor=sensors.BIOTAC)
+learner.observe("felt", stream)          # stream: (T, n) readings
+learner.predict(stream).material         # "felt"; or known=False: never felt this
+"""
+
+from scroll_tactile import errors, sensors
+from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.prediction import Prediction, Receipt
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.streams import Stream
+
+__all__ = [
+    "Embedding",
+    "Kernels",
+    "Prediction",
+    "Receipt",
+    "Sensor",
+    "Stream",
+    "TactileLearner",
+    "errors",
+    "sensors",
+]

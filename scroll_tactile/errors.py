@@ -15,6 +15,7 @@
     ├── MismatchError                        two things that do not belong together: open the right one
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
+    ├── EmbeddingError                       an embedding broke its promise: mend it before it is used
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
@@ -76,6 +77,10 @@ class SensorMismatchError(MismatchError):
 
 class EmbeddingMismatchError(MismatchError):
     """A memory was made with another embedding."""
+
+
+class EmbeddingError(ScrollTactileError):
+    """An embedding gave features that are not finite, not within its bound, or not of its dimension."""
 
 
 class DatasetError(ScrollTactileError):

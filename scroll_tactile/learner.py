@@ -1,0 +1,375 @@
+"""The learner: feels a material once, and knows it from then on."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
+from scroll_tactile.errors import (
+    EmbeddingError,
+    EmbeddingMismatchError,
+    InputError,
+    MaterialError,
+    MismatchError,
+    SensorMismatchError,
+    UnknownMaterialError,
+)
+from scroll_tactile.images import tactile_image
+from scroll_tactile.memory import OBSERVE, Memory, pack_codes
+from scroll_tactile.prediction import Prediction, Receipt
+from scroll_tactile.ridge.calibration import Calibration, calibrate
+from scroll_tactile.ridge.codes import BITS, to_codes
+from scroll_tactile.ridge.readouts import ReadoutName
+from scroll_tactile.ridge.selection import Selection, select
+from scroll_tactile.ridge.statistics import FOLDS
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.streams import Stream, validate
+from scroll_tactile.windows import Extent, extents, scales
+from store import Store
+
+__all__ = ["TactileLearner"]
+
+Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
+
+LONGEST_NAME = 200  # characters
+SNAPSHOT_EVERY = 1024  # observations between generations: replaying so many takes about a second on opening
+
+
+@dataclass(frozen=True)
+class _Model:
+    """All that predictions need of a state of the memory."""
+
+    names: list[str]
+    selections: dict[int, Selection]
+    calibrations: list[Calibration]
+
+
+class TactileLearner:
+    """A memory of how materials feel: exact, durable where it has a path, and honest about what it never felt.
+
+    >>> from scroll_tactile import TactileLearner, sensors
+    >>> from scroll_tactile.datasets.simulator import Scene
+    >>> scene = Scene(sensor=sensors.BIOTAC)
+    >>> learner = TactileLearner(sensor=sensors.BIOTAC)
+    >>> receipts = [learner.observe(name, scene.touch(name, at)) for at in range(4) for name in scene.materials[:3]]
+    >>> learner.predict(scene.touch(scene.materials[1], 9)).material == scene.materials[1]
+    True
+
+    sensor: whose streams it reads. embedding: the frozen features, `Kernels()` unless given.
+    readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
+    false_alarms: the share of touches of known materials that may be called unknown.
+
+    In memory only; `TactileLearner.open` gives one with a path. Methods may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        *,
+        sensor: Sensor,
+        embedding: Embedding | None = None,
+        readout: ReadoutName = "lda",
+        false_alarms: float = 0.05,
+    ) -> None:
+        if readout not in ("lda", "ridge"):
+            raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
+        if not 0 < false_alarms < 1:
+            raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
+        self.sensor = sensor
+        self.embedding: Embedding = Kernels() if embedding is None else embedding
+        self.readout: ReadoutName = readout
+        self.false_alarms = false_alarms
+        self._scales = scales(sensor)
+        self._memory = Memory(self.embedding.dimension, self._scales)
+        self._store: Store | None = None
+        self._saved = 0
+        self._model: _Model | None = None
+        self._lock = threading.RLock()
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        sensor: Sensor | None = None,
+        embedding: Embedding | None = None,
+        readout: ReadoutName = "lda",
+        false_alarms: float = 0.05,
+        mode: Literal["write", "read"] = "write",
+    ) -> TactileLearner:
+        """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
+
+        sensor: may be left out for a memory that is there. mode: "read" for one that another process writes;
+        it shows what was committed when it was opened.
+
+        Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
+        new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
+        """
+        chosen: Embedding = Kernels() if embedding is None else embedding
+        identity = None if sensor is None else _identity(sensor, chosen)
+        store = Store.open(path, identity=identity, mode=mode)
+        try:
+            kept = Sensor.model_validate(store.identity["sensor"])
+            _require_same(store, kept, sensor, chosen)
+            learner = cls(sensor=kept, embedding=chosen, readout=readout, false_alarms=false_alarms)
+            learner._memory = Memory.load(store, chosen.dimension, learner._scales)
+        except BaseException:
+            store.close()
+            raise
+        learner._store = store
+        learner._saved = learner._memory.sequence
+        return learner
+
+    def __repr__(self) -> str:
+        where = "in memory" if self._store is None else str(self._store.path)
+        return f"<TactileLearner {where}, {self.sensor.name}, {len(self.materials)} materials>"
+
+    @property
+    def materials(self) -> dict[str, int]:
+        """Material → number of observations, in alphabetical order."""
+        with self._lock:
+            return self._memory.statistics.materials
+
+    def observe(self, material: str, stream: Readings) -> Receipt:
+        """Learn that this stream is how the material feels; it is durable when this returns.
+
+        material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
+        unit, T of at least 0.1 s: an array, a tensor, lists, or an iterable of readings.
+
+        Raises StreamError, MaterialError (nothing was kept), CapacityError, or StoreError.
+        """
+        _require_name(material)
+        felt = validate(stream, self.sensor)
+        stages, codes = self._read(felt)
+        with self._lock:
+            if self._store is None:
+                sequence = self._memory.sequence + 1
+            else:
+                attributes = {"stages": [{str(w): s for w, s in stage.items()} for stage in stages]}
+                arrays = pack_codes(codes)
+                record = self._store.append(OBSERVE, material, felt.key, attributes=attributes, arrays=arrays)
+                sequence = record.sequence
+            self._memory.add(material, felt.key, stages, codes, sequence)
+            self._model = None
+            if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
+                self._snapshot(later=True)
+        return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, self._store is not None)
+
+    def predict(self, stream: Readings, *, scene: Sequence[str] | None = None) -> Prediction:
+        """Say what a stream feels like; the memory stays as it is.
+
+        stream: as for `observe`. scene: the materials that can be here; all that were felt where it is None.
+
+        Raises StreamError, UnknownMaterialError for a scene that names a material never felt, InputError for an
+        empty one. Before anything was felt the answer is material None, known False.
+        """
+        felt = validate(stream, self.sensor)
+        with self._lock:
+            model = self._current()
+        chosen = model.names if scene is None else _candidates(scene, model.names)
+        if not model.names:
+            return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
+        stages, codes = self._read(felt)
+        means = [codes[width].mean(axis=0) for width in sorted(stages[-1])]
+        probability, novelty, threshold = self._judge(model, chosen, means)
+        ranking = sorted(
+            zip(chosen, probability.tolist(), strict=True), key=lambda entry: (-entry[1], entry[0])
+        )
+        best, chance = ranking[0]
+        return Prediction(best, chance, tuple(ranking), novelty, bool(novelty <= threshold), felt.seconds)
+
+    def _read(self, felt: Stream) -> tuple[list[Extent], dict[int, npt.NDArray[np.int32]]]:
+        image = tactile_image(felt)
+        stages = extents(image.shape[1], self._scales)
+        windows = stages[-1]
+        shortest = self._scales[0]
+        if image.shape[1] < shortest:
+            # One window of the touch's own length stands for one of the shortest scale.
+            embedded = {shortest: embed_windows(self.embedding, image, {image.shape[1]: [0]})[image.shape[1]]}
+        else:
+            embedded = embed_windows(self.embedding, image, windows)
+        for width, features in embedded.items():
+            expected = (len(windows[width]), self.embedding.dimension)
+            if features.shape != expected:
+                raise EmbeddingError(
+                    f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
+                )
+        return stages, {
+            width: to_codes(features, self.embedding.bound) for width, features in embedded.items()
+        }
+
+    def _current(self) -> _Model:
+        if self._model is None:
+            statistics = self._memory.statistics
+            selections = {
+                scale: chosen
+                for scale in self._scales
+                if (chosen := select(statistics, scale, self.readout)) is not None
+            }
+            names = list(statistics.materials)
+            calibrations = (
+                calibrate(self._memory.pool, self._scales, selections, self.readout) if names else []
+            )
+            self._model = _Model(names, selections, calibrations)
+        return self._model
+
+    def _judge(
+        self, model: _Model, chosen: Sequence[str], means: list[npt.NDArray[np.float64]]
+    ) -> tuple[npt.NDArray[np.float64], float, float]:
+        """Probability of each chosen material, novelty, and its threshold.
+
+        Materials that were felt at fewer scales are weighed against all others at the scales they share; what
+        those leave over is shared out among the others at the finer stages.
+        """
+        stages = min(len(means), len(model.calibrations))
+        projected = []
+        for scale, mean in zip(self._scales[:stages], means, strict=False):
+            projected.append(model.selections[scale].readout.project(mean))
+        probability = np.ones(len(chosen))
+        everyone = np.arange(len(chosen))
+        members = everyone
+        last = 0
+        for stage in range(stages):
+            felt = set(model.selections[self._scales[stage]].names)
+            remaining = members[[chosen[at] in felt for at in members]] if stage else members
+            if len(remaining) == 0:
+                break
+            shares = self._shares(model, stage, projected, [chosen[at] for at in remaining])
+            probability[remaining] = shares * (probability[remaining].sum() if stage else 1.0)
+            members, last = remaining, stage
+        best = chosen[int(np.argmax(probability))]
+        stage = last if best in {chosen[at] for at in members} else 0
+        calibration = model.calibrations[stage]
+        distances = []
+        for at in range(stage + 1):
+            selection = model.selections[self._scales[at]]
+            places = np.array([selection.names.index(name) for name in chosen if name in selection.names])
+            distances.append(float(selection.readout.novelty(projected[at], places)))
+        novelty = float(calibration.novelty(np.array(distances)))
+        return probability, novelty, calibration.threshold(self.false_alarms)
+
+    def _shares(
+        self, model: _Model, stage: int, projected: list[npt.NDArray[np.float64]], names: list[str]
+    ) -> npt.NDArray[np.float64]:
+        logits = np.zeros(len(names))
+        for at, weight in enumerate(model.calibrations[stage].weights):
+            selection = model.selections[self._scales[at]]
+            places = {name: place for place, name in enumerate(selection.names)}
+            scores = selection.readout.scores(projected[at], self.readout)
+            logits += weight * scores[[places[name] for name in names]]
+        chances = np.exp(logits - logits.max())
+        shares: npt.NDArray[np.float64] = chances / chances.sum()
+        return shares
+
+    def digest(self) -> str:
+        """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
+        with self._lock:
+            return self._memory.statistics.digest()
+
+    def _snapshot(self, *, later: bool) -> None:
+        assert self._store is not None
+        arrays, attributes = self._memory.to_arrays()
+        commit = self._store.commit_later if later else self._store.commit
+        commit(arrays, upto=self._memory.sequence, attributes=attributes)
+        self._saved = self._memory.sequence
+
+    def close(self) -> None:
+        """Write what opening again would have to replay, and let go of the files; a second call does nothing.
+
+        Nothing is lost without it: what `observe` acknowledged is in the journal.
+        """
+        with self._lock:
+            store, self._store = self._store, None
+            if store is None:
+                return
+            self._store = store
+            try:
+                if store.mode == "write" and self._memory.sequence > self._saved:
+                    self._snapshot(later=False)
+            finally:
+                self._store = None
+                store.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _identity(sensor: Sensor, embedding: Embedding) -> dict[str, Any]:
+    return {
+        "sensor": sensor.model_dump(mode="json"),
+        "embedding": {
+            "name": embedding.name,
+            "dimension": embedding.dimension,
+            "bound": embedding.bound,
+            "fingerprint": embedding.fingerprint,
+        },
+        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(scales(sensor))},
+    }
+
+
+def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: Embedding) -> None:
+    """Compare what a memory was made with to what it is opened with."""
+    if sensor is not None and sensor != kept:
+        differing = [
+            f"{name} {getattr(kept, name)!r} there, {getattr(sensor, name)!r} here"
+            for name in Sensor.model_fields
+            if getattr(kept, name) != getattr(sensor, name)
+        ]
+        raise SensorMismatchError(
+            f"{store.path} holds the memory of sensor {kept.name!r}; it was opened for {sensor.name!r} "
+            f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
+        )
+    mine = _identity(kept, embedding)
+    if (theirs := store.identity["embedding"]) != mine["embedding"]:
+        ours = mine["embedding"]
+        raise EmbeddingMismatchError(
+            f"{store.path} was made with embedding {theirs['name']!r} ({theirs['dimension']} features, fingerprint "
+            f"{theirs['fingerprint'][:12]}); it was opened with {ours['name']!r} ({ours['dimension']} features, "
+            f"fingerprint {ours['fingerprint'][:12]}). Features of one mean nothing to the other: open it with the "
+            "embedding that made it, or take another path"
+        )
+    if store.identity["grid"] != mine["grid"]:
+        raise MismatchError(
+            f"{store.path} was made with {store.identity['grid']}; this version works with {mine['grid']}"
+        )
+
+
+def _require_name(material: str) -> None:
+    if not isinstance(material, str):
+        raise MaterialError(
+            f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}"
+        )
+    if not material or len(material) > LONGEST_NAME:
+        raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
+    if not material.isprintable():
+        raise MaterialError(f"expected a name of printable characters; came {material!r}")
+
+
+def _candidates(scene: Sequence[str], names: list[str]) -> list[str]:
+    if isinstance(scene, str):
+        raise InputError(
+            f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]"
+        )
+    wanted = list(dict.fromkeys(scene))
+    if not wanted:
+        raise InputError(
+            "expected at least one material in the scene; came none. Leave scene out for all of them"
+        )
+    missing = [name for name in wanted if name not in set(names)]
+    if missing:
+        raise UnknownMaterialError(
+            f"the scene names {missing}, which were never felt; felt were {names if len(names) <= 30 else len(names)}"
+        )
+    return sorted(wanted)

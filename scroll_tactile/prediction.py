@@ -1,0 +1,47 @@
+"""What `observe` and `predict` give back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Prediction", "Receipt"]
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """Word that an observation is kept, given when it is durable.
+
+    sequence: its place in the memory's journal, from 1; in a memory without a store, the count of observations.
+    material: what it was said to be. key: hash of the stream's content, 32 bytes.
+    seconds: the stream's length. clipped: values that lay outside the sensor's range.
+    durable: whether it is on disk; False only in a memory without a store.
+    """
+
+    sequence: int
+    material: str
+    key: bytes
+    seconds: float
+    clipped: int
+    durable: bool
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a stream feels like.
+
+    material: the likeliest of the materials that were candidates; None where nothing was ever felt.
+    probability: that of `material`, given that it is one of the candidates; calibrated on touches held out.
+    ranking: every candidate with its probability, likeliest first; equal ones in alphabetical order.
+    novelty: how unlike anything felt: in standard deviations above what known materials give when held out; more
+        is newer. Infinite where nothing was ever felt.
+    known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
+        then `material` is only what comes nearest.
+    seconds: how much touch the answer rests on.
+    """
+
+    material: str | None
+    probability: float
+    ranking: tuple[tuple[str, float], ...]
+    novelty: float
+    known: bool
+    seconds: float

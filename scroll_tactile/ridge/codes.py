@@ -1,0 +1,28 @@
+"""Codes: features rounded to a fixed grid, so that their sums are exact integers."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import EmbeddingError
+
+__all__ = ["BITS", "to_codes"]
+
+BITS = 20  # the grid: bound · 2⁻²⁰. 2²⁰ · 2²⁰ · 8192 rows is 2⁵³, the last integer that float64 counts to
+
+
+def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np.int32]:
+    """Round features to integers of magnitude at most 2²⁰, in units of bound · 2⁻²⁰; same shape.
+
+    Raises EmbeddingError for features that are not finite or exceed the bound.
+    """
+    scaled = np.multiply(features, 2.0**BITS / bound, dtype=np.float64)
+    largest = np.abs(scaled).max(initial=0.0)
+    if not largest <= 2.0**BITS:
+        bad = np.argwhere(~(np.abs(scaled) <= 2.0**BITS))[0]
+        raise EmbeddingError(
+            f"expected finite features of magnitude at most {bound}; feature {bad.tolist()} is "
+            f"{features[tuple(bad)]}. The embedding's bound is wrong, or it divides by zero"
+        )
+    return np.rint(scaled).astype(np.int32)

@@ -1,0 +1,150 @@
+"""The exact second moment of codes, and the scatter within classes formed from it without cancellation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg.blas import dsyrk
+from threadpoolctl import ThreadpoolController
+
+from scroll_tactile.errors import CapacityError
+from scroll_tactile.ridge.codes import BITS
+
+__all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "within_scatter"]
+
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float64]
+
+MOST_ROWS = 2 ** (63 - 2 * BITS)  # the rows after which an entry could pass int64: 8 388 608
+BLOCK = 256  # rows that wait; below 2¹³ their product is exact in float64, and 256 already cost no more each
+LIMB = 22  # bits
+
+
+@lru_cache(maxsize=1)
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run BLAS on one thread: on busy cores two made a 2 ms Cholesky take up to 439 ms."""
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
+
+
+@lru_cache(maxsize=4)
+def _lower(dimension: int) -> npt.NDArray[np.int64]:
+    return np.flatnonzero(np.tri(dimension, dtype=bool))
+
+
+class SecondMoment:
+    """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
+
+    Rows wait in a block of at most 256, whose product is formed by BLAS in float64: products of integers below
+    2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads.
+    """
+
+    def __init__(self, dimension: int) -> None:
+        self.dimension = dimension
+        self.rows = 0
+        self._packed: IntArray | None = None
+        self._waiting: npt.NDArray[np.int32] | None = None
+        self._count = 0
+
+    def add(self, codes: npt.NDArray[np.int32]) -> None:
+        """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
+        if self.rows + len(codes) > MOST_ROWS:
+            raise CapacityError(
+                f"int64 sums of {BITS}-bit codes are exact for {MOST_ROWS} rows; there are {self.rows} and "
+                f"{len(codes)} came. Start a new memory"
+            )
+        for first in range(0, len(codes), BLOCK):
+            self._wait(codes[first : first + BLOCK])
+        self.rows += len(codes)
+
+    def _wait(self, codes: npt.NDArray[np.int32]) -> None:
+        if self._count + len(codes) > BLOCK:
+            self._flush()
+        if self._waiting is None:
+            self._waiting = np.empty((BLOCK, self.dimension), dtype=np.int32)
+        self._waiting[self._count : self._count + len(codes)] = codes
+        self._count += len(codes)
+
+    def remove(self, codes: npt.NDArray[np.int32]) -> None:
+        """Take rows out again that were added, shape (rows, d): as if they had never been."""
+        packed = self.packed()
+        for first in range(0, len(codes), BLOCK):
+            packed -= _product(codes[first : first + BLOCK])
+        self.rows -= len(codes)
+
+    def _flush(self) -> None:
+        if self._count:
+            assert self._waiting is not None
+            product = _product(self._waiting[: self._count])
+            self._packed = (
+                product if self._packed is None else np.add(self._packed, product, out=self._packed)
+            )
+            self._count = 0
+
+    def packed(self) -> IntArray:
+        """The lower triangle of A, row after row, shape (d·(d+1)/2,): the memory itself, not a copy."""
+        self._flush()
+        if self._packed is None:
+            self._packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
+        return self._packed
+
+    @property
+    def empty(self) -> bool:
+        """Whether no row was ever added; then `packed` would only make zeros."""
+        return self._packed is None and not self._count
+
+    @classmethod
+    def of(cls, packed: IntArray, rows: int, dimension: int) -> SecondMoment:
+        """A second moment of a given lower triangle, which it takes over, and number of rows."""
+        moment = cls(dimension)
+        moment._packed, moment.rows = packed, rows
+        return moment
+
+
+def _product(codes: npt.NDArray[np.int32]) -> IntArray:
+    """The lower triangle of codesᵀ · codes, exact."""
+    with one_thread():
+        # The transposed view is Fortran's order, and its upper triangle our lower one.
+        upper = dsyrk(1.0, codes.astype(np.float64).T, lower=0)
+    flat: FloatArray = upper.T.reshape(-1)
+    return flat[_lower(codes.shape[1])].astype(np.int64)
+
+
+def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+    """S_w = A − Σ_y c_y c_yᵀ / n_y, shape (d, d), upper triangle in Fortran's order, in units of codes².
+
+    packed: A as in SecondMoment; counts: n_y, shape (C,); sums: c_y, shape (C, d). With m_y the integer next to
+    c_y / n_y and r_y = c_y − n_y m_y, c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ + r_y r_yᵀ / n_y. The first two are
+    integers and leave A exactly; what is rounded is the scatter itself, whatever the distance of the means
+    from zero. Classes of no rows are left out.
+    """
+    felt = counts > 0
+    counts, sums = counts[felt], sums[felt]
+    dimension = sums.shape[1]
+    means = (2 * sums + counts[:, None]) // (2 * counts[:, None])
+    rests = sums - counts[:, None] * means
+    centred = packed.copy()
+    lower = _lower(dimension)
+    for first in range(0, len(counts), 1024):  # so many products of two limbs stay below 2⁵³
+        some = slice(first, first + 1024)
+        high = sums[some] >> LIMB
+        low = sums[some] - (high << LIMB)
+        mean, rest = means[some].astype(np.float64), rests[some].astype(np.float64)
+        with one_thread():
+            centred -= (high.astype(np.float64).T @ mean).reshape(-1)[lower].astype(np.int64) << LIMB
+            centred -= (low.astype(np.float64).T @ mean + mean.T @ rest).reshape(-1)[lower].astype(np.int64)
+    scatter = np.zeros((dimension, dimension))
+    scatter.reshape(-1)[lower] = centred
+    with one_thread():
+        scaled = rests / np.sqrt(np.maximum(counts, 1))[:, None]
+        scatter -= np.tril(scaled.T @ scaled)
+    return scatter.T

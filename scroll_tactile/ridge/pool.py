@@ -1,0 +1,122 @@
+"""The pool: a bounded sample of touches on which the readouts of the other folds are tried.
+
+Which touches are in it depends only on what was felt, never on the order: each material's touches are ranked by
+content hash, and the pool holds the smallest by (rank, hash), so that materials share it evenly.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["CAPACITY", "Pool", "Touch"]
+
+CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Sums of the codes of a touch's windows, for each stage reached and each scale up to it.
+
+    sums: int32 of shape (pairs, d) (64 windows of codes below 2²¹ fit), pairs in the order (0, 0), (1, 0), (1, 1), (2, 0) … of (stage, scale).
+    windows: how many windows each sum is of, shape (pairs,).
+    """
+
+    sums: npt.NDArray[np.int32]
+    windows: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]
+    ) -> Touch:
+        """The touch whose windows have these codes, in the order of the last stage's extent."""
+        places = {scale: {start: at for at, start in enumerate(begin)} for scale, begin in stages[-1].items()}
+        sums, windows = [], []
+        for stage in stages:
+            for scale, begin in stage.items():
+                chosen = [places[scale][start] for start in begin if start in places[scale]]
+                sums.append(codes[scale][chosen].sum(axis=0, dtype=np.int32))
+                windows.append(len(chosen))
+        return cls(np.stack(sums), np.array(windows))
+
+    @property
+    def stages(self) -> int:
+        """The number of stages reached: with s of them there are s·(s+1)/2 pairs."""
+        return int((np.sqrt(8 * len(self.windows) + 1) - 1) / 2)
+
+    def mean(self, stage: int, scale: int) -> npt.NDArray[np.float64]:
+        """Mean codes of the windows of a scale (by place, from 0) in a stage, shape (d,)."""
+        pair = stage * (stage + 1) // 2 + scale
+        mean: npt.NDArray[np.float64] = self.sums[pair] / self.windows[pair]
+        return mean
+
+
+class Pool:
+    """At most `capacity` touches of all materials, a function of the set of touches felt."""
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        self.capacity = capacity
+        self._keys: dict[str, list[bytes]] = {}
+        self._touches: dict[tuple[str, bytes], Touch] = {}
+
+    def __len__(self) -> int:
+        return len(self._touches)
+
+    def __iter__(self) -> Iterator[tuple[str, bytes, Touch]]:
+        """(material, key, touch), by material and key."""
+        for material in sorted(self._keys):
+            for key in self._keys[material]:
+                yield material, key, self._touches[material, key]
+
+    def wants(self, material: str, key: bytes) -> bool:
+        """Whether a touch would be kept; one that is there already is not wanted again."""
+        keys = self._keys.get(material, [])
+        rank = bisect_left(keys, key)
+        if rank < len(keys) and keys[rank] == key:
+            return False
+        return len(self) < self.capacity or (rank, key) < self._last()[:2]
+
+    def add(self, material: str, key: bytes, touch: Touch) -> None:
+        """Add a touch where it belongs in, and drop the one that falls out."""
+        if not self.wants(material, key):
+            return
+        insort(self._keys.setdefault(material, []), key)
+        self._touches[material, key] = touch
+        if len(self) > self.capacity:
+            _, dropped, of = self._last()
+            self._keys[of].pop()
+            del self._touches[of, dropped]
+
+    def _last(self) -> tuple[int, bytes, str]:
+        return max((len(keys) - 1, keys[-1], material) for material, keys in self._keys.items() if keys)
+
+    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
+        """What a store keeps: arrays by name, and the material of each touch."""
+        entries = list(self)
+        return {
+            "pool-keys": np.array([list(key) for _, key, _ in entries], dtype=np.uint8).reshape(
+                len(entries), -1
+            ),
+            "pool-pairs": np.array([len(touch.windows) for *_, touch in entries], dtype=np.int64),
+            "pool-windows": np.concatenate([t.windows for *_, t in entries])
+            if entries
+            else np.zeros(0, np.int64),
+            "pool-sums": np.concatenate([t.sums for *_, t in entries])
+            if entries
+            else np.zeros((0, 0), np.int32),
+        }, [material for material, *_ in entries]
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> Pool:
+        """The pool that `to_arrays` described."""
+        pool = cls()
+        edges = np.cumsum(arrays["pool-pairs"])[:-1]
+        sums, windows = np.split(arrays["pool-sums"], edges), np.split(arrays["pool-windows"], edges)
+        for at, material in enumerate(materials):
+            pool.add(material, arrays["pool-keys"][at].tobytes(), Touch(sums[at], windows[at]))
+        return pool

@@ -1,0 +1,138 @@
+"""λ by cross-validation on the statistics alone: each fold's touches are tried on a readout of the others'.
+
+A fold's statistics say exactly how a readout's projections z = Wᵀ x of the held-out rows are spread: their class
+means and their scatter within classes. What follows from these is a function of the statistics, so the choice
+does not depend on the order in which anything was felt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import log_ndtr, logsumexp
+
+from scroll_tactile.ridge.moments import within_scatter
+from scroll_tactile.ridge.readouts import Readout, ReadoutName, Task, fit_readout
+from scroll_tactile.ridge.statistics import FOLDS, Statistics
+
+__all__ = ["PENALTIES", "Selection", "select"]
+
+FloatArray = npt.NDArray[np.float64]
+
+# As shares of a scaled feature's variance. Below 1e-3 nothing was gained on either sensor; above 0.3 accuracy falls.
+PENALTIES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)
+DEFAULT = 1e-2  # where nothing can be held out: a first touch, or every touch in one fold
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The readout of a scale and how it was chosen.
+
+    names: the materials, in the order of the readout's classes.
+    readout: of all the statistics, at the chosen λ.
+    held_out: fold → (places of the materials that the other folds know, the readout of these folds).
+    losses: λ → held-out loss; empty where nothing could be held out.
+    """
+
+    names: list[str]
+    readout: Readout
+    held_out: dict[int, tuple[npt.NDArray[np.intp], Readout]]
+    losses: dict[float, float]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """One fold: the others' task, and the fold's own rows of the materials that the others know."""
+
+    known: npt.NDArray[np.intp]
+    task: Task
+    counts: npt.NDArray[np.int64]
+    means: FloatArray  # held-out class means, about the task's center, in codes
+    scatter: FloatArray  # held-out scatter within classes, full, in codes²
+
+
+def select(statistics: Statistics, scale: int, kind: ReadoutName) -> Selection | None:
+    """Choose λ and fit the readout of a scale; None where nothing was felt at it."""
+    names = statistics.names(scale)
+    if not names:
+        return None
+    counts, sums = statistics.counts(scale, names), statistics.sums(scale, names)
+    total = statistics.total_second(scale)
+    trials = {
+        fold: trial
+        for fold in range(FOLDS)
+        if (trial := _trial(statistics, scale, fold, counts, sums, total))
+    }
+    losses: dict[float, float] = {}
+    fitted: dict[float, dict[int, Readout]] = {}
+    if trials:
+        for penalty in PENALTIES:
+            fitted[penalty] = {fold: fit_readout(trial.task, penalty) for fold, trial in trials.items()}
+            losses[penalty] = sum(
+                _loss(trials[fold], readout, kind) for fold, readout in fitted[penalty].items()
+            )
+    # Ties go to the larger λ, the tamer readout.
+    chosen = min(reversed(PENALTIES), key=losses.__getitem__) if losses else DEFAULT
+    scatter = within_scatter(total, counts.sum(axis=1), sums.sum(axis=1))
+    readout = fit_readout(Task.of(scatter, counts.sum(axis=1), sums.sum(axis=1)), chosen)
+    held_out = {fold: (trial.known, fitted[chosen][fold]) for fold, trial in trials.items()}
+    return Selection(names, readout, held_out, losses)
+
+
+def _trial(
+    statistics: Statistics,
+    scale: int,
+    fold: int,
+    counts: npt.NDArray[np.int64],
+    sums: npt.NDArray[np.int64],
+    total: npt.NDArray[np.int64],
+) -> _Trial | None:
+    theirs = counts.sum(axis=1) - counts[:, fold]
+    known = np.flatnonzero(theirs)
+    own = known[counts[known, fold] > 0]
+    if len(known) < 2 or not len(own):
+        return None
+    held = statistics.second(scale, fold).packed()
+    other_sums = sums.sum(axis=1) - sums[:, fold]
+    task = Task.of(within_scatter(total - held, theirs, other_sums), theirs[known], other_sums[known])
+    scatter = within_scatter(held, counts[:, fold], sums[:, fold])
+    scatter += np.triu(scatter, 1).T
+    in_fold = counts[known, fold]
+    means = sums[known, fold] / np.maximum(in_fold, 1)[:, None] - task.center
+    return _Trial(known, task, in_fold, means, scatter)
+
+
+def _loss(trial: _Trial, readout: Readout, kind: ReadoutName) -> float:
+    spread = readout.weights.T @ trial.scatter @ readout.weights
+    at = trial.means @ readout.weights
+    if kind == "ridge":
+        return _squared_error(trial, readout, at, spread)
+    return _pairwise_error(trial, readout, at, spread)
+
+
+def _squared_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+    """Σ over held-out rows of ‖t − s(x)‖², exactly: that of the class means, and the spread about them."""
+    missed = np.eye(len(at)) - readout.scores(at, "ridge")
+    return float(
+        trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge)
+    )
+
+
+def _pairwise_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+    """Log of the held-out rows' mean error, class against class, with scores spread as a normal distribution.
+
+    Class y loses to k with probability Φ(−Δ/σ), Δ the difference of its scores' held-out mean and σ² the held-out
+    variance of that difference.
+    """
+    felt = np.flatnonzero(trial.counts)
+    scores = readout.scores(at, "lda")[felt]
+    margins = scores[np.arange(len(felt)), felt][:, None] - scores
+    spread = spread / trial.counts.sum()
+    diagonal = np.diagonal(spread)
+    variance = diagonal[felt][:, None] + diagonal - 2 * spread[felt]
+    chances = log_ndtr(-margins / np.sqrt(np.maximum(variance, 1e-300)))
+    chances[np.arange(len(felt)), felt] = -np.inf
+    weights = np.log(trial.counts[felt] / trial.counts.sum())
+    return float(logsumexp(chances + weights[:, None]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -24,15 +23,14 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.images import tactile_image
 from scroll_tactile.memory import OBSERVE, Memory, pack_codes
+from scroll_tactile.model import Model
 from scroll_tactile.prediction import Prediction, Receipt
-from scroll_tactile.ridge.calibration import Calibration, calibrate
 from scroll_tactile.ridge.codes import BITS, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
-from scroll_tactile.ridge.selection import Selection, select
 from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
-from scroll_tactile.windows import Extent, extents, scales
+from scroll_tactile.windows import extent, scales, scored, stages
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -41,15 +39,6 @@ Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 
 LONGEST_NAME = 200  # characters
 SNAPSHOT_EVERY = 1024  # observations between generations: replaying so many takes about a second on opening
-
-
-@dataclass(frozen=True)
-class _Model:
-    """All that predictions need of a state of the memory."""
-
-    names: list[str]
-    selections: dict[int, Selection]
-    calibrations: list[Calibration]
 
 
 class TactileLearner:
@@ -90,7 +79,7 @@ class TactileLearner:
         self._memory = Memory(self.embedding.dimension, self._scales)
         self._store: Store | None = None
         self._saved = 0
-        self._model: _Model | None = None
+        self._model: Model | None = None
         self._lock = threading.RLock()
 
     @classmethod
@@ -147,16 +136,16 @@ class TactileLearner:
         """
         _require_name(material)
         felt = validate(stream, self.sensor)
-        stages, codes = self._read(felt)
+        columns, codes = self._read(felt)
         with self._lock:
             if self._store is None:
                 sequence = self._memory.sequence + 1
             else:
-                attributes = {"stages": [{str(w): s for w, s in stage.items()} for stage in stages]}
+                attributes = {"columns": columns}
                 arrays = pack_codes(codes)
                 record = self._store.append(OBSERVE, material, felt.key, attributes=attributes, arrays=arrays)
                 sequence = record.sequence
-            self._memory.add(material, felt.key, stages, codes, sequence)
+            self._memory.add(material, felt.key, columns, codes, sequence)
             self._model = None
             if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
                 self._snapshot(later=True)
@@ -172,101 +161,41 @@ class TactileLearner:
         """
         felt = validate(stream, self.sensor)
         with self._lock:
-            model = self._current()
-        chosen = model.names if scene is None else _candidates(scene, model.names)
-        if not model.names:
+            if self._model is None:
+                self._model = Model.of(self._memory, self.readout)
+            model = self._model
+        candidates = model.names if scene is None else _candidates(scene, model.names)
+        if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
-        stages, codes = self._read(felt)
-        means = [codes[width].mean(axis=0) for width in sorted(stages[-1])]
-        probability, novelty, threshold = self._judge(model, chosen, means)
+        columns, codes = self._read(felt)
+        places = scored(extent(columns, self._scales), columns)
+        means = [codes[width][chosen].mean(axis=0) for width, chosen in places.items()]
+        judgement = model.judge(candidates, means, len(stages(columns, self._scales)))
         ranking = sorted(
-            zip(chosen, probability.tolist(), strict=True), key=lambda entry: (-entry[1], entry[0])
+            zip(candidates, judgement.probability.tolist(), strict=True),
+            key=lambda entry: (-entry[1], entry[0]),
         )
-        best, chance = ranking[0]
-        return Prediction(best, chance, tuple(ranking), novelty, bool(novelty <= threshold), felt.seconds)
+        known = bool(judgement.novelty <= judgement.calibration.threshold(self.false_alarms))
+        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds)
 
-    def _read(self, felt: Stream) -> tuple[list[Extent], dict[int, npt.NDArray[np.int32]]]:
+    def _read(self, felt: Stream) -> tuple[int, dict[int, npt.NDArray[np.int32]]]:
+        """The columns of a touch's tactile image, and the codes of its windows by scale."""
         image = tactile_image(felt)
-        stages = extents(image.shape[1], self._scales)
-        windows = stages[-1]
-        shortest = self._scales[0]
-        if image.shape[1] < shortest:
-            # One window of the touch's own length stands for one of the shortest scale.
-            embedded = {shortest: embed_windows(self.embedding, image, {image.shape[1]: [0]})[image.shape[1]]}
-        else:
-            embedded = embed_windows(self.embedding, image, windows)
-        for width, features in embedded.items():
-            expected = (len(windows[width]), self.embedding.dimension)
+        columns = image.shape[1]
+        windows = extent(columns, self._scales)
+        # A touch shorter than the shortest scale is one window of its own length.
+        cut = {min(width, columns): begin for width, begin in windows.items()}
+        read = embed_windows(self.embedding, image, cut)
+        codes = {}
+        for width, begin in windows.items():
+            features = read[min(width, columns)]
+            expected = (len(begin), self.embedding.dimension)
             if features.shape != expected:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
                 )
-        return stages, {
-            width: to_codes(features, self.embedding.bound) for width, features in embedded.items()
-        }
-
-    def _current(self) -> _Model:
-        if self._model is None:
-            statistics = self._memory.statistics
-            selections = {
-                scale: chosen
-                for scale in self._scales
-                if (chosen := select(statistics, scale, self.readout)) is not None
-            }
-            names = list(statistics.materials)
-            calibrations = (
-                calibrate(self._memory.pool, self._scales, selections, self.readout) if names else []
-            )
-            self._model = _Model(names, selections, calibrations)
-        return self._model
-
-    def _judge(
-        self, model: _Model, chosen: Sequence[str], means: list[npt.NDArray[np.float64]]
-    ) -> tuple[npt.NDArray[np.float64], float, float]:
-        """Probability of each chosen material, novelty, and its threshold.
-
-        Materials that were felt at fewer scales are weighed against all others at the scales they share; what
-        those leave over is shared out among the others at the finer stages.
-        """
-        stages = min(len(means), len(model.calibrations))
-        projected = []
-        for scale, mean in zip(self._scales[:stages], means, strict=False):
-            projected.append(model.selections[scale].readout.project(mean))
-        probability = np.ones(len(chosen))
-        everyone = np.arange(len(chosen))
-        members = everyone
-        last = 0
-        for stage in range(stages):
-            felt = set(model.selections[self._scales[stage]].names)
-            remaining = members[[chosen[at] in felt for at in members]] if stage else members
-            if len(remaining) == 0:
-                break
-            shares = self._shares(model, stage, projected, [chosen[at] for at in remaining])
-            probability[remaining] = shares * (probability[remaining].sum() if stage else 1.0)
-            members, last = remaining, stage
-        best = chosen[int(np.argmax(probability))]
-        stage = last if best in {chosen[at] for at in members} else 0
-        calibration = model.calibrations[stage]
-        distances = []
-        for at in range(stage + 1):
-            selection = model.selections[self._scales[at]]
-            places = np.array([selection.names.index(name) for name in chosen if name in selection.names])
-            distances.append(float(selection.readout.novelty(projected[at], places)))
-        novelty = float(calibration.novelty(np.array(distances)))
-        return probability, novelty, calibration.threshold(self.false_alarms)
-
-    def _shares(
-        self, model: _Model, stage: int, projected: list[npt.NDArray[np.float64]], names: list[str]
-    ) -> npt.NDArray[np.float64]:
-        logits = np.zeros(len(names))
-        for at, weight in enumerate(model.calibrations[stage].weights):
-            selection = model.selections[self._scales[at]]
-            places = {name: place for place, name in enumerate(selection.names)}
-            scores = selection.readout.scores(projected[at], self.readout)
-            logits += weight * scores[[places[name] for name in names]]
-        chances = np.exp(logits - logits.max())
-        shares: npt.NDArray[np.float64] = chances / chances.sum()
-        return shares
+            codes[width] = to_codes(features, self.embedding.bound)
+        return columns, codes
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""

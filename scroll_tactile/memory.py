@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
-from scroll_tactile.windows import Extent
+from scroll_tactile.windows import extent, scored, stages
 from store import Record, Store
 
 __all__ = ["OBSERVE", "Memory", "pack_codes", "unpack_codes"]
@@ -30,20 +30,22 @@ class Memory:
         self.pool = Pool()
         self.sequence = 0
 
-    def add(self, material: str, key: bytes, stages: Sequence[Extent], codes: Codes, sequence: int) -> None:
-        """Add an observation; raises CapacityError before anything is added."""
+    def add(self, material: str, key: bytes, columns: int, codes: Codes, sequence: int) -> None:
+        """Add an observation: a touch of so many columns, its codes by scale.
+
+        Raises CapacityError before anything is added.
+        """
         self.statistics.add(material, fold_of(key), codes)
         if self.pool.wants(material, key):
-            self.pool.add(material, key, Touch.of(stages, codes))
+            read = extent(columns, self.statistics.scales)
+            scored_at = [scored(read, length) for length in stages(columns, self.statistics.scales)]
+            self.pool.add(material, key, Touch.of(scored_at, codes))
         self.sequence = sequence
 
     def replay(self, record: Record) -> None:
         """Add the observation of a journal row, without embedding anything again."""
-        stages = [
-            {int(scale): list(begin) for scale, begin in stage.items()}
-            for stage in record.attributes["stages"]
-        ]
-        self.add(record.label, record.key, stages, unpack_codes(record.arrays), record.sequence)
+        columns = int(record.attributes["columns"])
+        self.add(record.label, record.key, columns, unpack_codes(record.arrays), record.sequence)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """Arrays and attributes of a generation."""

@@ -1,22 +1,24 @@
 """Windows: the stretches of a stream that are embedded, at a few scales.
 
 An embedding of a whole stream is lost when a touch is shorter, longer, faster or slower than those learned from.
-So a stream is read in windows of about 0.3 s, about 1 s and three quarters of the usual duration, and each of
-these scales has statistics of its own. A stream is known from its first 0.3 s on, and better with every reading.
+So a stream is read in windows of 0.3 s and of half the usual duration, and each of these scales has statistics
+of its own. A stream is known from its first 0.3 s on, and better with every reading.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["MOST_WINDOWS", "Extent", "extents", "scales", "starts"]
+__all__ = ["MOST_WINDOWS", "Extent", "extent", "milestones", "scales", "scored", "stages"]
 
 SHORTEST = 0.3  # seconds
-LONGEST = 0.75  # of the usual duration: a touch that ends a little early still has a window of it
+LONGEST = 0.5  # of the usual duration: a touch half as long has a window of it, a longer one several
 FEWEST = 9  # readings in a window, the taps of one kernel
-APART = 4.0  # with more than this between the shortest and the longest there is a scale halfway
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
 FRAMES = 80  # columns of a camera's frame in its tactile image
 
@@ -24,51 +26,74 @@ Extent = dict[int, list[int]]  # width of windows → their first columns
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
-    """The widths of windows in columns of the tactile image, ascending: BioTac (30, 95, 300), RoboSkin (15, 56).
+    """The widths of windows in columns of the tactile image, ascending: BioTac (30, 200), RoboSkin (15, 37).
 
-    A camera has one: a frame.
+    A camera has one: a frame. So has a sensor whose touches are too short for two.
     """
     if sensor.camera:
         return (min(FRAMES, sensor.shape[1]),)
     shortest = max(FEWEST, round(SHORTEST * sensor.rate))
-    longest = round(LONGEST * sensor.readings)
-    if longest < 1.5 * shortest:
-        return (shortest,)
-    if longest <= APART * shortest:
-        return (shortest, longest)
-    return (shortest, round(float(np.sqrt(shortest * longest))), longest)
+    longest = int(LONGEST * sensor.readings)
+    return (shortest, longest) if longest >= 1.5 * shortest else (shortest,)
 
 
-def starts(columns: int, width: int) -> list[int]:
-    """The first columns of the windows of a width: dense where the touch begins, then one after another.
+def extent(columns: int, widths: tuple[int, ...]) -> Extent:
+    """The windows that are read of a touch of so many columns, at every scale that fits.
 
-    Steps grow from a sixth of the width to the width itself, for the beginning of a touch differs from the
-    rest and is what an early decision rests on. There are at most MOST_WINDOWS, evenly thinned out.
+    The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
+    rests on: their steps grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
+    few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A stream shorter than the shortest scale is
+    one window of its own length, of that scale.
     """
-    begin = [0]
-    if columns > 4 * MOST_WINDOWS * width:
-        step = width
-        begin = list(range(0, columns - width + 1, step))
+    if columns < widths[0]:
+        return {widths[0]: [0]}
+    return {width: _starts(columns, width, dense=width == widths[0]) for width in widths if width <= columns}
+
+
+def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
+    room = columns - width
+    if dense:
+        begin = [0]
+        while begin[-1] < min(room, 4 * width):
+            begin.append(begin[-1] + max(1, width // 6, begin[-1] // 3))
+        begin += range(begin[-1] + width, room + 1, width)
     else:
-        while (
-            after := begin[-1] + int(np.clip(begin[-1] // 3, max(1, width // 6), width))
-        ) + width <= columns:
-            begin.append(after)
+        begin = list(range(0, room + 1, max(1, width // 6, min(width // 2, room // 2))))
+    begin = [start for start in begin if start <= room]
     if len(begin) > MOST_WINDOWS:
         begin = [begin[at] for at in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
     return begin
 
 
-def extents(columns: int, widths: tuple[int, ...]) -> list[Extent]:
-    """What can be read of a stream after each of its stages, the last being all of it.
+def scored(extent: Mapping[int, Sequence[int]], length: int) -> dict[int, list[int]]:
+    """Width → places of the windows whose scores are averaged when the first `length` columns have been felt.
 
-    Stage k is reached when a window of scale k fits; before the stream's own last stage it is the stretch of
-    just that length. A stream shorter than the shortest scale is one window of its own length, of that scale.
+    Those that lie within it and begin at least half a width after the one before: otherwise the densely read
+    beginning would count for more than the rest.
     """
-    if columns < widths[0]:
-        return [{widths[0]: [0]}]
-    reached = [width for width in widths if width <= columns]
-    lengths = [*reached[:-1], columns]
-    return [
-        {width: starts(length, width) for width in reached[: at + 1]} for at, length in enumerate(lengths)
-    ]
+    chosen: dict[int, list[int]] = {}
+    for width, begin in sorted(extent.items()):
+        places: list[int] = []
+        for place, start in enumerate(begin):
+            inside = start + width <= length or start == 0
+            if inside and (not places or start >= begin[places[-1]] + width // 2):
+                places.append(place)
+        if width <= length or width == min(extent):
+            chosen[width] = places
+    return chosen
+
+
+def milestones(widths: tuple[int, ...]) -> tuple[int, ...]:
+    """The lengths at which a touch reaches its stages: where a scale first fits, and halfway to the next (geometric).
+
+    How far a scale is to be believed depends on how many of its windows there are, so calibration is measured at
+    each: BioTac 30, 77 and 200 readings.
+    """
+    between = [round(float(np.sqrt(low * high))) for low, high in pairwise(widths)]
+    return tuple(sorted({*widths, *between}))
+
+
+def stages(columns: int, widths: tuple[int, ...]) -> list[int]:
+    """The lengths of a touch's stages: the milestones that it reached, the last replaced by its own length."""
+    reached = [length for length in milestones(widths) if length <= columns]
+    return [*reached[:-1], columns]

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from scroll_tactile.ridge.pool import Pool, Touch
+from scroll_tactile.ridge.pool import Pool
 from scroll_tactile.ridge.readouts import Readout, ReadoutName
 from scroll_tactile.ridge.selection import Selection
 from scroll_tactile.ridge.statistics import fold_of
@@ -28,15 +28,15 @@ PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
 }  # of the scores of all scales together: what both sensors' data come to
-PRIOR_TOUCHES = 2.0  # the prior counts as much as these
+PRIOR_TOUCHES = 0.5  # the prior counts as much as these
 
 
 @dataclass(frozen=True)
 class Calibration:
     """How the scores and distances of one stage are to be read.
 
-    weights: of the scores of the scales up to the stage, shape (stage + 1,), ≥ 0.
-    scale_novelty: mean and spread of each scale's novelty for known materials, shape (stage + 1, 2).
+    weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
+    scale_novelty: mean and spread of each scale's novelty for known materials, shape (S, 2).
     novelties: sorted standardised novelty of known, held-out touches, shape (touches,).
     """
 
@@ -45,7 +45,7 @@ class Calibration:
     novelties: FloatArray
 
     def novelty(self, distances: FloatArray) -> FloatArray:
-        """Standardised novelty, shape (…,), of distances by scale, shape (…, stage + 1)."""
+        """Standardised novelty, shape (…,), of distances by scale, shape (…, S)."""
         mean, spread = self.scale_novelty.T
         standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
         return standard
@@ -65,19 +65,19 @@ UNMEASURED = 5.0  # spreads: where too little could be held out to measure the d
 
 
 def calibrate(
-    pool: Pool, scales: Sequence[int], selections: Mapping[int, Selection], kind: ReadoutName
+    pool: Pool, stages: Sequence[Sequence[int]], selections: Mapping[int, Selection], kind: ReadoutName
 ) -> list[Calibration]:
-    """Calibrate every stage for which all scales have a readout; the first is always there."""
+    """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
     return [
-        _calibrate_stage(stage, pool, [selections[scale] for scale in scales[: stage + 1]], kind)
-        for stage in range(len(scales))
-        if all(scale in selections for scale in scales[: stage + 1])
+        _calibrate_stage(stage, pool, [selections[scale] for scale in scales], kind)
+        for stage, scales in enumerate(stages)
+        if all(scale in selections for scale in scales)
     ]
 
 
 def _calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName) -> Calibration:
     scores, targets, distances = _held_out(stage, pool, selections, kind)
-    prior = np.full(stage + 1, PRIOR_WEIGHT[kind] / (stage + 1))
+    prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
     weights = _fit_weights(scores, targets, prior)
     if len(distances) < FEWEST:
         return Calibration(weights, _assumed(selections), np.zeros(0))
@@ -98,18 +98,17 @@ def _held_out(
     targets: list[int] = []
     distances: list[FloatArray] = []
     for material, key, touch in pool:
-        if touch.stages <= stage:
-            continue
-        judged = _judge(stage, material, fold_of(key), touch, selections, kind)
+        means = touch.means(stage)
+        judged = None if means is None else _judge(means, material, fold_of(key), selections, kind)
         if judged is not None:
             scores.append(judged[0])
             targets.append(judged[1])
             distances.append(judged[2])
-    return scores, targets, np.array(distances).reshape(len(scores), stage + 1)
+    return scores, targets, np.array(distances).reshape(len(scores), len(selections))
 
 
 def _judge(
-    stage: int, material: str, fold: int, touch: Touch, selections: list[Selection], kind: ReadoutName
+    means: list[FloatArray], material: str, fold: int, selections: list[Selection], kind: ReadoutName
 ) -> tuple[FloatArray, int, FloatArray] | None:
     if any(fold not in selection.held_out for selection in selections):
         return None
@@ -120,7 +119,7 @@ def _judge(
     rows, distances = [], []
     for scale, selection in enumerate(selections):
         readout = selection.held_out[fold][1]
-        z = readout.project(touch.mean(stage, scale))
+        z = readout.project(means[scale])
         rows.append(readout.scores(z, kind)[[known[scale].index(name) for name in common]])
         distances.append(float(readout.novelty(z)))
     return np.stack(rows), common.index(material), np.array(distances)

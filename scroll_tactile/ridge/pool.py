@@ -21,39 +21,33 @@ CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of t
 
 @dataclass(frozen=True)
 class Touch:
-    """Sums of the codes of a touch's windows, for each stage reached and each scale up to it.
+    """Sums of the codes of a touch's windows, for each stage it reached and each scale that fits there.
 
-    sums: int32 of shape (pairs, d) (64 windows of codes below 2²¹ fit), pairs in the order (0, 0), (1, 0), (1, 1), (2, 0) … of (stage, scale).
-    windows: how many windows each sum is of, shape (pairs,).
+    sums: int32 of shape (pairs, d) (64 windows of codes below 2²¹ fit); a pair is a stage with a scale, by place.
+    pairs: (stage, scale, windows in the sum) of each, int64 of shape (pairs, 3).
     """
 
     sums: npt.NDArray[np.int32]
-    windows: npt.NDArray[np.int64]
+    pairs: npt.NDArray[np.int64]
 
     @classmethod
     def of(
         cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]
     ) -> Touch:
-        """The touch whose windows have these codes, in the order of the last stage's extent."""
-        places = {scale: {start: at for at, start in enumerate(begin)} for scale, begin in stages[-1].items()}
-        sums, windows = [], []
-        for stage in stages:
-            for scale, begin in stage.items():
-                chosen = [places[scale][start] for start in begin if start in places[scale]]
-                sums.append(codes[scale][chosen].sum(axis=0, dtype=np.int32))
-                windows.append(len(chosen))
-        return cls(np.stack(sums), np.array(windows))
+        """The touch of these codes; stages: for each, width → places of the windows that are scored there."""
+        chosen = [
+            (stage, scale, width, places)
+            for stage, scored in enumerate(stages)
+            for scale, (width, places) in enumerate(sorted(scored.items()))
+        ]
+        sums = [codes[width][places].sum(axis=0, dtype=np.int32) for *_, width, places in chosen]
+        pairs = [(stage, scale, len(places)) for stage, scale, _, places in chosen]
+        return cls(np.stack(sums), np.array(pairs))
 
-    @property
-    def stages(self) -> int:
-        """The number of stages reached: with s of them there are s·(s+1)/2 pairs."""
-        return int((np.sqrt(8 * len(self.windows) + 1) - 1) / 2)
-
-    def mean(self, stage: int, scale: int) -> npt.NDArray[np.float64]:
-        """Mean codes of the windows of a scale (by place, from 0) in a stage, shape (d,)."""
-        pair = stage * (stage + 1) // 2 + scale
-        mean: npt.NDArray[np.float64] = self.sums[pair] / self.windows[pair]
-        return mean
+    def means(self, stage: int) -> list[npt.NDArray[np.float64]] | None:
+        """Mean codes of the windows of each scale at a stage, each of shape (d,); None where it was not reached."""
+        rows = np.flatnonzero(self.pairs[:, 0] == stage)
+        return [self.sums[row] / self.pairs[row, 2] for row in rows] if len(rows) else None
 
 
 class Pool:
@@ -102,10 +96,10 @@ class Pool:
             "pool-keys": np.array([list(key) for _, key, _ in entries], dtype=np.uint8).reshape(
                 len(entries), -1
             ),
-            "pool-pairs": np.array([len(touch.windows) for *_, touch in entries], dtype=np.int64),
-            "pool-windows": np.concatenate([t.windows for *_, t in entries])
+            "pool-sizes": np.array([len(touch.pairs) for *_, touch in entries], dtype=np.int64),
+            "pool-pairs": np.concatenate([t.pairs for *_, t in entries])
             if entries
-            else np.zeros(0, np.int64),
+            else np.zeros((0, 3), np.int64),
             "pool-sums": np.concatenate([t.sums for *_, t in entries])
             if entries
             else np.zeros((0, 0), np.int32),
@@ -115,8 +109,8 @@ class Pool:
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> Pool:
         """The pool that `to_arrays` described."""
         pool = cls()
-        edges = np.cumsum(arrays["pool-pairs"])[:-1]
-        sums, windows = np.split(arrays["pool-sums"], edges), np.split(arrays["pool-windows"], edges)
+        edges = np.cumsum(arrays["pool-sizes"])[:-1]
+        sums, pairs = np.split(arrays["pool-sums"], edges), np.split(arrays["pool-pairs"], edges)
         for at, material in enumerate(materials):
-            pool.add(material, arrays["pool-keys"][at].tobytes(), Touch(sums[at], windows[at]))
+            pool.add(material, arrays["pool-keys"][at].tobytes(), Touch(sums[at], pairs[at]))
         return pool

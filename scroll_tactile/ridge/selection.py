@@ -8,6 +8,7 @@ does not depend on the order in which anything was felt.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +22,9 @@ __all__ = ["PENALTIES", "Selection", "select"]
 
 FloatArray = npt.NDArray[np.float64]
 
-# As shares of a scaled feature's variance. Below 1e-3 nothing was gained on either sensor; above 0.3 accuracy falls.
-PENALTIES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)
+# As shares of a scaled feature's variance. The held-out loss of windows keeps falling to 0.1, where touches are told
+# apart less well than at 0.03 (RoboSkin 97.2 against 97.6 %), so the grid ends there.
+PENALTIES = (1e-3, 3e-3, 1e-2, 3e-2)
 DEFAULT = 1e-2  # where nothing can be held out: a first touch, or every touch in one fold
 
 
@@ -40,6 +42,11 @@ class Selection:
     readout: Readout
     held_out: dict[int, tuple[npt.NDArray[np.intp], Readout]]
     losses: dict[float, float]
+
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Material → its place among the readout's classes."""
+        return {name: place for place, name in enumerate(self.names)}
 
 
 @dataclass(frozen=True)

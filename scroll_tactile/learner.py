@@ -277,9 +277,7 @@ def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: 
 
 def _require_name(material: str) -> None:
     if not isinstance(material, str):
-        raise MaterialError(
-            f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}"
-        )
+        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
     if not material or len(material) > LONGEST_NAME:
         raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
     if not material.isprintable():
@@ -288,14 +286,10 @@ def _require_name(material: str) -> None:
 
 def _candidates(scene: Sequence[str], names: list[str]) -> list[str]:
     if isinstance(scene, str):
-        raise InputError(
-            f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]"
-        )
+        raise InputError(f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]")
     wanted = list(dict.fromkeys(scene))
     if not wanted:
-        raise InputError(
-            "expected at least one material in the scene; came none. Leave scene out for all of them"
-        )
+        raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
     missing = [name for name in wanted if name not in set(names)]
     if missing:
         raise UnknownMaterialError(

@@ -101,8 +101,6 @@ def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
     """The codes that `pack_codes` packed."""
     scales = [int(name.removeprefix("values-")) for name in arrays if name.startswith("values-")]
     return {
-        scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(
-            np.int32, copy=False
-        )
+        scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
         for scale in sorted(scales)
     }

@@ -76,8 +76,7 @@ class Model:
         stage = max(at for at, members in enumerate(groups) if best in members)
         calibration = self.calibrations[stage]
         distances = [
-            self._distance(scale, z, candidates)
-            for scale, z in zip(self.stages[stage], projected, strict=False)
+            self._distance(scale, z, candidates) for scale, z in zip(self.stages[stage], projected, strict=False)
         ]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
 
@@ -88,13 +87,9 @@ class Model:
 
     def _shares(self, stage: int, projected: Sequence[FloatArray], names: Sequence[str]) -> FloatArray:
         logits = np.zeros(len(names))
-        for scale, z, weight in zip(
-            self.stages[stage], projected, self.calibrations[stage].weights, strict=False
-        ):
+        for scale, z, weight in zip(self.stages[stage], projected, self.calibrations[stage].weights, strict=False):
             selection = self.selections[scale]
-            logits += (
-                weight * selection.readout.scores(z, self.kind)[[selection.places[name] for name in names]]
-            )
+            logits += weight * selection.readout.scores(z, self.kind)[[selection.places[name] for name in names]]
         chances = np.exp(logits - logits.max())
         shares: FloatArray = chances / chances.sum()
         return shares

@@ -55,9 +55,7 @@ class Sensor(BaseModel):
         if max(abs(self.low), abs(self.high), self.high - self.low) > largest:
             raise ValueError(f"the range {self.low:g} to {self.high:g} is too wide for float32 readings")
         if not np.float32(self.low) < np.float32(self.high):
-            raise ValueError(
-                f"{self.low!r} and {self.high!r} are the same number in float32: rescale the readings"
-            )
+            raise ValueError(f"{self.low!r} and {self.high!r} are the same number in float32: rescale the readings")
         return self
 
     @model_validator(mode="after")

@@ -196,8 +196,7 @@ def _from_torch(tensor: "torch.Tensor") -> _Array:
 def _stack(items: list[Any], sensor: Sensor) -> _Array:
     plain = (list, tuple, numbers.Number)  # np.asarray reads nested lists fastest when it gets them whole
     rows = [
-        item if isinstance(item, plain) else _as_array(item, f"reading {at}", sensor)
-        for at, item in enumerate(items)
+        item if isinstance(item, plain) else _as_array(item, f"reading {at}", sensor) for at, item in enumerate(items)
     ]
     try:
         return np.asarray(rows)
@@ -251,8 +250,7 @@ def _require_shape(shape: tuple[int, ...], sensor: Sensor) -> None:
         return
     came = f"came {shape}" if shape else "came a single number"
     raise ChannelCountError(
-        f"expected readings of sensor {sensor.name!r} of shape {_expected(sensor)}; "
-        f"{came}{_advice(shape, sensor)}"
+        f"expected readings of sensor {sensor.name!r} of shape {_expected(sensor)}; {came}{_advice(shape, sensor)}"
     )
 
 

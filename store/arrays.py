@@ -99,8 +99,7 @@ def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
     size = sum(array.nbytes for array in arrays.values())
     if size > LARGEST_PAYLOAD:
         raise RecordError(
-            f"the arrays of one record hold {size} bytes, more than {LARGEST_PAYLOAD}: "
-            "keep them in a generation"
+            f"the arrays of one record hold {size} bytes, more than {LARGEST_PAYLOAD}: keep them in a generation"
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")

@@ -54,9 +54,7 @@ class Background:
             try:
                 job()
             except Exception as error:
-                logger.exception(
-                    "%s: a background commit failed; the journal still holds its rows", self._name
-                )
+                logger.exception("%s: a background commit failed; the journal still holds its rows", self._name)
                 with self._changed:
                     self._failure = error
             # Dropped before the wait: the job holds the arrays that were handed over.

@@ -135,8 +135,7 @@ def read_generation(path: Path, number: int, content: Mapping[str, Any]) -> dict
             raise _unreadable(error, f"array {name!r} of generation {number} in {folder}", folder) from error
         if array is None or array_digest(array) != description["sha256"]:
             raise DamageError(
-                f"array {name!r} of generation {number} in {folder} is not what was written: "
-                "its sha256 differs",
+                f"array {name!r} of generation {number} in {folder} is not what was written: its sha256 differs",
                 path=folder,
             )
         arrays[name] = array
@@ -154,9 +153,7 @@ def _opened(path: Path, number: int, version: int) -> zarr.Group:
     except Exception as error:
         raise _unreadable(error, f"generation {number} in {header}", header) from error
     if found != version:
-        raise DamageError(
-            f"generation {number} in {header} claims format {found!r}, not {version}", path=header
-        )
+        raise DamageError(f"generation {number} in {header} claims format {found!r}, not {version}", path=header)
     return group
 
 

@@ -39,9 +39,7 @@ class GenerationRow:
     checksum: bytes
 
     @classmethod
-    def of(
-        cls, number: int, upto: int, time: float, attributes: str, content: dict[str, Any]
-    ) -> GenerationRow:
+    def of(cls, number: int, upto: int, time: float, attributes: str, content: dict[str, Any]) -> GenerationRow:
         """Return the row with its checksum."""
         texts = attributes.encode(), json.dumps(content, separators=(",", ":")).encode()
         return cls(number, upto, time, *texts, checksum("generation", number, upto, time, *texts))
@@ -49,17 +47,13 @@ class GenerationRow:
     def verified(self, journal: Path) -> tuple[dict[str, JSON], dict[str, Any]]:
         """Return the attributes and the content; raise DamageError if they are not as written."""
         try:
-            expected = checksum(
-                "generation", self.number, self.upto, self.time, self.attributes, self.content
-            )
+            expected = checksum("generation", self.number, self.upto, self.time, self.attributes, self.content)
             if expected == self.checksum:
                 return from_json(self.attributes.decode()), dict(from_json(self.content.decode()))
         except (TypeError, ValueError, AttributeError):
             # A flipped bit can also change a value's type.
             pass
-        raise DamageError(
-            f"the row of generation {self.number} in {journal} fails its checksum", path=journal
-        )
+        raise DamageError(f"the row of generation {self.number} in {journal} fails its checksum", path=journal)
 
 
 class Journal:
@@ -92,9 +86,7 @@ class Journal:
             meta = {key: value for key, value, check in rows if checksum("meta", key, value) == check}
             return from_json(meta[b"identity"].decode())
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DamageError(
-                f"the identity in {self.path}, table meta, fails its checksum", path=self.path
-            ) from error
+            raise DamageError(f"the identity in {self.path}, table meta, fails its checksum", path=self.path) from error
 
     def last(self) -> int:
         """Return the sequence of the last row, or the last that a generation contains, if later; or 0."""
@@ -172,9 +164,7 @@ class Journal:
         with self._using(f"making generation {row.number} current") as connection:
             try:
                 connection.execute("BEGIN IMMEDIATE")
-                connection.execute(
-                    f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?)", values
-                )
+                connection.execute(f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?)", values)
                 connection.executemany("DELETE FROM generation WHERE number = ?", [(old,) for old in forget])
                 connection.execute("COMMIT")
             except BaseException:

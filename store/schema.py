@@ -169,7 +169,4 @@ def _meta_rows(identity: str) -> list[tuple[str, str, bytes]]:
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "identity": identity,
     }
-    return [
-        (key, value, checksum("meta", key.encode("utf-8"), value.encode("utf-8")))
-        for key, value in values.items()
-    ]
+    return [(key, value, checksum("meta", key.encode("utf-8"), value.encode("utf-8"))) for key, value in values.items()]

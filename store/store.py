@@ -131,8 +131,7 @@ class Store:
     def _check_open(self, *, write: bool = False) -> None:
         if os.getpid() != self._process:
             raise StoreClosedError(
-                f"{self.path} was opened by process {self._process}, of which this is a fork: "
-                "open it here again"
+                f"{self.path} was opened by process {self._process}, of which this is a fork: open it here again"
             )
         if self._closed:
             raise StoreClosedError(f"the store in {self.path} is closed")
@@ -250,9 +249,7 @@ class Store:
     ) -> tuple[dict[str, np.ndarray], str]:
         self._check_open(write=True)
         if isinstance(upto, bool) or not isinstance(upto, int) or not 0 <= upto <= self._journal.last():
-            raise RecordError(
-                f"upto must be a sequence from 0 to the last, {self._journal.last()}, not {upto!r}"
-            )
+            raise RecordError(f"upto must be a sequence from 0 to the last, {self._journal.last()}, not {upto!r}")
         return check_arrays(arrays), to_json("attributes", attributes)
 
     def _commit(self, arrays: dict[str, np.ndarray], upto: int, attributes: str) -> int:

@@ -125,9 +125,7 @@ def test_a_missing_file_is_named_with_what_it_should_hold(folder):
         DatasetError, match=r"expected a tensor of shape \(≥ 400, 44\) in .*mat1_2.pt; there is no such"
     ):
         load(folder, "biotac")
-    with pytest.raises(
-        DatasetError, match=r"expected an array of shape \(200, 6, 10, 75\) in .*icub_val_1.npy"
-    ):
+    with pytest.raises(DatasetError, match=r"expected an array of shape \(200, 6, 10, 75\) in .*icub_val_1.npy"):
         load(folder.parent, "roboskin")
 
 

@@ -81,9 +81,7 @@ def test_seconds_speed_and_force_do_what_they_say():
 
 
 def test_channels_farther_along_feel_the_surface_earlier():
-    line = Sensor(
-        name="line", channels=3, rate=500, low=0, high=4095, unit="counts", duration=4, layout=(1, 3)
-    )
+    line = Sensor(name="line", channels=3, rate=500, low=0, high=4095, unit="counts", duration=4, layout=(1, 3))
     readings = Scene(sensor=line).touch("nylon", 0, speed=20.0).readings[500:].astype(float)
     readings -= readings.mean(axis=0)
     near, far = readings[:, 1], readings[:, 2]  # 14/3 mm apart: 0.233 s at 20 mm/s, 117 readings
@@ -101,9 +99,7 @@ def test_materials_can_be_told_apart_by_spectrum_but_hardly_by_mean(sensor):
     readings = np.stack([stream.readings for stream in streams])
     settled = readings[:, readings.shape[1] // 6 :]
     window = np.hanning(settled.shape[1])[:, None]
-    spectra = np.abs(np.fft.rfft((settled - settled.mean(axis=1, keepdims=True)) * window, axis=1)).mean(
-        axis=2
-    )
+    spectra = np.abs(np.fft.rfft((settled - settled.mean(axis=1, keepdims=True)) * window, axis=1)).mean(axis=2)
     mean = make_pipeline(StandardScaler(), NearestCentroid())
     lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
     assert 0.15 < cross_val_score(mean, readings.mean(axis=1), labels).mean() < 0.7
@@ -125,9 +121,7 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason():
         Scene(sensor=GELSIGHT)
     with pytest.raises(InputError, match="seed of 0 or more; came -1"):
         Scene(sensor=BIOTAC, seed=-1)
-    with pytest.raises(
-        UnknownMaterialError, match=r"expected one of the scene's materials, bark, .*; came 'jelly'"
-    ):
+    with pytest.raises(UnknownMaterialError, match=r"expected one of the scene's materials, bark, .*; came 'jelly'"):
         SCENE.touch("jelly", 0)
     with pytest.raises(InputError, match="repetition of 0 or more; came -1"):
         SCENE.touch("bark", -1)

@@ -181,9 +181,7 @@ def test_every_file_and_folder_is_durable_before_the_generation_counts(opened, m
     at = events.index(("rename", str(final)))
     written = {final, *final.rglob("*")}
     draft = f"{final}.partial"
-    assert {name.replace(draft, str(final)) for kind, name in events[:at] if kind == "fsync"} >= set(
-        map(str, written)
-    )
+    assert {name.replace(draft, str(final)) for kind, name in events[:at] if kind == "fsync"} >= set(map(str, written))
     assert events[at + 1 :] == [("fsync", str(parent)), ("make_current", "")]
 
 

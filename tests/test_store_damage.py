@@ -19,9 +19,7 @@ def path(tmp_path):
     """A closed store of six rows and two generations, up to rows 2 and 4."""
     with Store.open(tmp_path / "s", identity={"for": "damage"}) as opened:
         for number in range(1, ROWS + 1):
-            opened.append(
-                "a", f"the label of row {number}", bytes([number] * 8), arrays={"x": np.arange(number)}
-            )
+            opened.append("a", f"the label of row {number}", bytes([number] * 8), arrays={"x": np.arange(number)})
             if number in (2, 4):
                 opened.commit({"x": np.arange(1000) + number, "y": np.array(number)}, upto=number)
     return tmp_path / "s"

@@ -32,9 +32,7 @@ values = st.recursive(
     max_leaves=6,
 )
 attributes = st.dictionaries(texts, values, max_size=3)
-several = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+several = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def same(found, given):
@@ -53,9 +51,7 @@ def kept(tmp_path_factory):
 
 
 @several
-@given(
-    texts, texts, st.binary(max_size=64), st.floats(allow_nan=False, allow_infinity=False), attributes, arrays
-)
+@given(texts, texts, st.binary(max_size=64), st.floats(allow_nan=False, allow_infinity=False), attributes, arrays)
 def test_a_record_comes_back_with_the_same_bytes(kept, kind, label, key, time, attributes, arrays):
     before = kept.last
     given = kept.append(kind, label, key, time=time, attributes=attributes, arrays=arrays)
@@ -198,7 +194,5 @@ def test_the_exception_tree_is_the_one_in_the_docstring():
 def test_importing_is_light():
     code = "import sys, store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))"
     where = Path(store.__file__).parents[1]
-    found = subprocess.run(
-        [sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=True
-    )
+    found = subprocess.run([sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"

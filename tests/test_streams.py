@@ -150,13 +150,9 @@ def test_a_stream_passes_unchanged_but_not_to_another_sensor():
     stream = validate(VALUES, SKIN)
     assert validate(stream, SKIN) is stream
     assert validate(stream, SKIN.model_copy()) is stream
-    with pytest.raises(
-        SensorMismatchError, match=r"expected a stream of sensor 'biotac'; came one of 'skin'$"
-    ):
+    with pytest.raises(SensorMismatchError, match=r"expected a stream of sensor 'biotac'; came one of 'skin'$"):
         validate(stream, BIOTAC)
-    with pytest.raises(
-        SensorMismatchError, match="came one of 'skin', which has the same name but other fields"
-    ):
+    with pytest.raises(SensorMismatchError, match="came one of 'skin', which has the same name but other fields"):
         validate(stream, SKIN.model_copy(update={"high": 5.0}))
 
 
@@ -262,9 +258,7 @@ def test_what_is_no_stream_is_refused_with_the_reason(readings, error, message):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize(
-    "kind", [np.float16, np.float32, np.float64, np.longdouble, list, torch.tensor, object]
-)
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, np.longdouble, list, torch.tensor, object])
 def test_the_first_value_that_is_not_finite_is_named(value, kind):
     values = VALUES.astype(np.float64)
     values[2, 1] = values[3, 0] = value
@@ -296,9 +290,7 @@ def test_camera_frames_keep_their_shape_and_one_is_enough():
     assert np.array_equal(stream.readings, frames)
     assert len(validate(frames[:1], CAMERA)) == fewest_readings(CAMERA) == 1
     assert validate(list(frames), CAMERA) == stream
-    with pytest.raises(
-        ChannelCountError, match=r"\(T, 2, 4, 3\); came \(2, 4, 3\): one frame.*reshape\(1, 2, 4, 3\)"
-    ):
+    with pytest.raises(ChannelCountError, match=r"\(T, 2, 4, 3\); came \(2, 4, 3\): one frame.*reshape\(1, 2, 4, 3\)"):
         validate(frames[0], CAMERA)
     with pytest.raises(ChannelCountError, match=r"use .reshape\(2, 2, 4, 3\)"):
         validate(frames.reshape(2, 24), CAMERA)

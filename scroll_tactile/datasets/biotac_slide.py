@@ -151,8 +151,7 @@ def _read(path: Path, reader: Callable[[Path], Any], wanted: str) -> Any:
         return reader(path)
     except FileNotFoundError as error:
         raise DatasetError(
-            f"expected {wanted} in {path}; there is no such file. The layout is that of "
-            f"github.com/dexrob/{FOLDER}"
+            f"expected {wanted} in {path}; there is no such file. The layout is that of github.com/dexrob/{FOLDER}"
         ) from error
     except Exception as error:  # damaged bytes make the parsers fail in any way: IndexError, SyntaxError, …
         raise DatasetError(

@@ -42,8 +42,7 @@ class Recordings:
         lengths = [len(self.streams), len(self.materials), len(self.repetition), len(self.fold)]
         if len(set(lengths)) != 1:
             raise InputError(
-                "expected as many streams, materials, repetitions and folds; came "
-                + ", ".join(map(str, lengths))
+                "expected as many streams, materials, repetitions and folds; came " + ", ".join(map(str, lengths))
             )
 
     def __len__(self) -> int:

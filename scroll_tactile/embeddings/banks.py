@@ -86,14 +86,10 @@ def _taps(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
     return shapes[order[:count]]
 
 
-def _thresholds(
-    rng: np.random.Generator, weights: torch.Tensor, channels: int, dilation: int
-) -> torch.Tensor:
+def _thresholds(rng: np.random.Generator, weights: torch.Tensor, channels: int, dilation: int) -> torch.Tensor:
     streams = _simulated(channels, (TAPS - 1) * dilation + 128)
     count = len(weights)
-    responses = np.stack(
-        [respond(weights, torch.from_numpy(one), dilation).numpy() for one in streams], axis=1
-    )
+    responses = np.stack([respond(weights, torch.from_numpy(one), dilation).numpy() for one in streams], axis=1)
     responses.sort(axis=-1)
     # Quantiles in a golden-ratio sequence: any number of a kernel's thresholds, from the first on, is well spread.
     quantiles = (rng.random(count) + np.arange(THRESHOLDS)[:, None] * GOLDEN) % 1

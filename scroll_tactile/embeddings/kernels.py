@@ -94,16 +94,12 @@ class Kernels:
         for width, starts in windows.items():
             if width < SHORTEST:
                 mirrored = [_mirrored(levels[:, start : start + width]) for start in starts]
-                features[width] = np.stack(
-                    [self._read(one, {SHORTEST: (0,)})[SHORTEST][0] for one in mirrored]
-                )
+                features[width] = np.stack([self._read(one, {SHORTEST: (0,)})[SHORTEST][0] for one in mirrored])
         if asked:
             features |= self._read(levels, {width: tuple(starts) for width, starts in asked.items()})
         return features
 
-    def _one_by_one(
-        self, image: npt.NDArray[np.float32], width: int, starts: Sequence[int]
-    ) -> npt.NDArray[np.float32]:
+    def _one_by_one(self, image: npt.NDArray[np.float32], width: int, starts: Sequence[int]) -> npt.NDArray[np.float32]:
         parts = (np.ascontiguousarray(image[:, start : start + width]) for start in starts)
         return np.stack([self.embed(part) for part in parts])
 
@@ -118,9 +114,7 @@ class Kernels:
             for dilation in _dilations(max(windows)):
                 uses = {w: p.count for w, plan in plans.items() for p in plan if p.dilation == dilation}
                 where = tuple((width, windows[width]) for width in uses)
-                counts = _counts(
-                    bank(self.seed, channels, dilation), image, max(uses.values()), readings, where
-                )
+                counts = _counts(bank(self.seed, channels, dilation), image, max(uses.values()), readings, where)
                 first = 0
                 for width, count in uses.items():
                     last = first + len(windows[width])
@@ -177,9 +171,7 @@ def _counts(
         size = min(len(kernels.weights), count - first)
         thresholds = kernels.thresholds[at, :size, None]
         torch.gt(responses[:size], thresholds, out=exceeded[first : first + size])
-    counted: npt.NDArray[np.int64] = (
-        (exceeded @ _pooling(readings, kernels.dilation, where)).numpy().astype(np.int64)
-    )
+    counted: npt.NDArray[np.int64] = (exceeded @ _pooling(readings, kernels.dilation, where)).numpy().astype(np.int64)
     return counted
 
 

@@ -63,8 +63,6 @@ def embed_windows(
         embedded: dict[int, FloatArray] = together(image, windows)
         return embedded
     return {
-        width: np.stack(
-            [embedding.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts]
-        )
+        width: np.stack([embedding.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts])
         for width, starts in windows.items()
     }

@@ -56,9 +56,7 @@ class Calibration:
             return UNMEASURED
         # The conformal quantile: of n + 1 exchangeable touches no more than this share lies above it.
         rank = int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
-        return (
-            float(self.novelties[rank - 1]) if rank <= len(self.novelties) else float(2 * self.novelties[-1])
-        )
+        return float(self.novelties[rank - 1]) if rank <= len(self.novelties) else float(2 * self.novelties[-1])
 
 
 UNMEASURED = 5.0  # spreads: where too little could be held out to measure the distances of known touches
@@ -133,9 +131,7 @@ def _fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray
     for at, one in enumerate(scores):
         groups.setdefault(one.shape[1], []).append(at)
     # Scores less the target's, (touches, scales, classes), for each number of classes.
-    gaps = [
-        np.stack([scores[at] - scores[at][:, [targets[at]]] for at in members]) for members in groups.values()
-    ]
+    gaps = [np.stack([scores[at] - scores[at][:, [targets[at]]] for at in members]) for members in groups.values()]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
         value, slope = 0.0, np.zeros_like(weights)

@@ -85,9 +85,7 @@ class SecondMoment:
         if self._count:
             assert self._waiting is not None
             product = _product(self._waiting[: self._count])
-            self._packed = (
-                product if self._packed is None else np.add(self._packed, product, out=self._packed)
-            )
+            self._packed = product if self._packed is None else np.add(self._packed, product, out=self._packed)
             self._count = 0
 
     def packed(self) -> IntArray:

@@ -31,9 +31,7 @@ class Touch:
     pairs: npt.NDArray[np.int64]
 
     @classmethod
-    def of(
-        cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]
-    ) -> Touch:
+    def of(cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]) -> Touch:
         """The touch of these codes; stages: for each, width → places of the windows that are scored there."""
         chosen = [
             (stage, scale, width, places)
@@ -93,16 +91,10 @@ class Pool:
         """What a store keeps: arrays by name, and the material of each touch."""
         entries = list(self)
         return {
-            "pool-keys": np.array([list(key) for _, key, _ in entries], dtype=np.uint8).reshape(
-                len(entries), -1
-            ),
+            "pool-keys": np.array([list(key) for _, key, _ in entries], dtype=np.uint8).reshape(len(entries), -1),
             "pool-sizes": np.array([len(touch.pairs) for *_, touch in entries], dtype=np.int64),
-            "pool-pairs": np.concatenate([t.pairs for *_, t in entries])
-            if entries
-            else np.zeros((0, 3), np.int64),
-            "pool-sums": np.concatenate([t.sums for *_, t in entries])
-            if entries
-            else np.zeros((0, 0), np.int32),
+            "pool-pairs": np.concatenate([t.pairs for *_, t in entries]) if entries else np.zeros((0, 3), np.int64),
+            "pool-sums": np.concatenate([t.sums for *_, t in entries]) if entries else np.zeros((0, 0), np.int32),
         }, [material for material, *_ in entries]
 
     @classmethod

@@ -67,19 +67,13 @@ def select(statistics: Statistics, scale: int, kind: ReadoutName) -> Selection |
         return None
     counts, sums = statistics.counts(scale, names), statistics.sums(scale, names)
     total = statistics.total_second(scale)
-    trials = {
-        fold: trial
-        for fold in range(FOLDS)
-        if (trial := _trial(statistics, scale, fold, counts, sums, total))
-    }
+    trials = {fold: trial for fold in range(FOLDS) if (trial := _trial(statistics, scale, fold, counts, sums, total))}
     losses: dict[float, float] = {}
     fitted: dict[float, dict[int, Readout]] = {}
     if trials:
         for penalty in PENALTIES:
             fitted[penalty] = {fold: fit_readout(trial.task, penalty) for fold, trial in trials.items()}
-            losses[penalty] = sum(
-                _loss(trials[fold], readout, kind) for fold, readout in fitted[penalty].items()
-            )
+            losses[penalty] = sum(_loss(trials[fold], readout, kind) for fold, readout in fitted[penalty].items())
     # Ties go to the larger λ, the tamer readout.
     chosen = min(reversed(PENALTIES), key=losses.__getitem__) if losses else DEFAULT
     scatter = within_scatter(total, counts.sum(axis=1), sums.sum(axis=1))
@@ -122,9 +116,7 @@ def _loss(trial: _Trial, readout: Readout, kind: ReadoutName) -> float:
 def _squared_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
     """Σ over held-out rows of ‖t − s(x)‖², exactly: that of the class means, and the spread about them."""
     missed = np.eye(len(at)) - readout.scores(at, "ridge")
-    return float(
-        trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge)
-    )
+    return float(trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge))
 
 
 def _pairwise_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:

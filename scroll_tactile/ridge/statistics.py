@@ -73,9 +73,7 @@ class Statistics:
         """
         at = self._places.get(material)
         if at is None or not self._observations[at, fold]:
-            raise UnknownMaterialError(
-                f"{material!r} has no observation in fold {fold} that could be taken out"
-            )
+            raise UnknownMaterialError(f"{material!r} has no observation in fold {fold} that could be taken out")
         for scale, rows in codes.items():
             self._seconds[scale][fold].remove(rows)
             self._rows[scale][at, fold] -= len(rows)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, respond, to_levels
+from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
 from scroll_tactile.embeddings.levels import triangle_features, window_statistics
 
 __all__ = ["Kernels"]
@@ -110,7 +111,8 @@ class Kernels:
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         image = torch.from_numpy(np.ascontiguousarray(levels))
         plans = {width: _plan(channels, self._proportions(width), width) for width in windows}
-        with torch.inference_mode():
+        # No autocast, whatever the caller's program does: shortened floats would round our integers.
+        with torch.inference_mode(), torch.autocast("cpu", enabled=False), one_torch_thread():
             for dilation in _dilations(max(windows)):
                 uses = {w: p.count for w, plan in plans.items() for p in plan if p.dilation == dilation}
                 where = tuple((width, windows[width]) for width in uses)
@@ -121,17 +123,35 @@ class Kernels:
                     places = width - (TAPS - 1) * dilation
                     pooled[width].append(_angles(places)[counts[:count, first:last].T])
                     first = last
-        for width, starts in windows.items():
-            if self._proportions(width) == self.dimension:
-                continue
-            cut = np.stack([levels[:, start : start + width] for start in starts])
-            triangle = triangle_features(self.seed, channels, self.dimension - self._proportions(width))
-            pooled[width].append(triangle(window_statistics(cut)))
+            for width, starts in windows.items():
+                if self._proportions(width) == self.dimension:
+                    continue
+                cut = np.stack([levels[:, start : start + width] for start in starts])
+                triangle = triangle_features(self.seed, channels, self.dimension - self._proportions(width))
+                pooled[width].append(triangle(window_statistics(cut)))
         return {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}
 
     def _proportions(self, width: int) -> int:
         """How many of the features are proportions in a window of this width; the rest are of levels."""
         return self.dimension - (round(self.dimension * SHARE_IN_SHORT) if width <= SHORT else 0)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run torch on one thread of its own accord.
+
+    A touch is two milliseconds of small products: a second thread saves a fifth of it on an idle machine, and on a
+    busy one, where threads wait for each other at every product, made it take forty times as long.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _mirrored(levels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -163,12 +183,12 @@ def _counts(
     where: tuple[tuple[int, tuple[int, ...]], ...],
 ) -> npt.NDArray[np.int64]:
     """How often each feature's threshold is exceeded in each window: integers of shape (count, windows)."""
-    rounds = -(-count // len(kernels.weights))
-    responses = respond(kernels.weights[: min(count, len(kernels.weights))], image, kernels.dilation)
-    exceeded = torch.empty((count, responses.shape[1]), dtype=torch.float32)
+    rounds = -(-count // len(kernels))
+    responses = kernels.respond(min(count, len(kernels)), image)
+    exceeded = torch.empty((count, responses.shape[1]), dtype=torch.float32, device="cpu")
     for at in range(rounds):
-        first = at * len(kernels.weights)
-        size = min(len(kernels.weights), count - first)
+        first = at * len(kernels)
+        size = min(len(kernels), count - first)
         thresholds = kernels.thresholds[at, :size, None]
         torch.gt(responses[:size], thresholds, out=exceeded[first : first + size])
     counted: npt.NDArray[np.int64] = (exceeded @ _pooling(readings, kernels.dilation, where)).numpy().astype(np.int64)
@@ -179,8 +199,9 @@ def _counts(
 def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> torch.Tensor:
     """0/1 matrix of shape (positions, windows): which of the convolution's positions lie within a window."""
     span = (TAPS - 1) * dilation
+    place = torch.arange(readings - span, device="cpu")
     columns = [
-        (torch.arange(readings - span) >= start) & (torch.arange(readings - span) < start + width - span)
+        (place >= start) & (place < start + width - span)
         for width, starts in where
         for start in starts
     ]

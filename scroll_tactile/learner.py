@@ -22,7 +22,7 @@ from scroll_tactile.errors import (
     UnknownMaterialError,
 )
 from scroll_tactile.images import tactile_image
-from scroll_tactile.memory import OBSERVE, Memory, pack_codes
+from scroll_tactile.memory import OBSERVE, Memory, give_back_scratch, pack_codes
 from scroll_tactile.model import Model
 from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.ridge.codes import BITS, to_codes
@@ -207,6 +207,8 @@ class TactileLearner:
         arrays, attributes = self._memory.to_arrays()
         commit = self._store.commit_later if later else self._store.commit
         commit(arrays, upto=self._memory.sequence, attributes=attributes)
+        del arrays
+        give_back_scratch()
         self._saved = self._memory.sequence
 
     def close(self) -> None:

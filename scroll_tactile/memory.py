@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +16,7 @@ from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.windows import extent, scored, stages
 from store import Record, Store
 
-__all__ = ["OBSERVE", "Memory", "pack_codes", "unpack_codes"]
+__all__ = ["OBSERVE", "Memory", "give_back_scratch", "pack_codes", "unpack_codes"]
 
 logger = logging.getLogger(__name__)
 
@@ -104,3 +106,10 @@ def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
         scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
         for scale in sorted(scales)
     }
+
+
+def give_back_scratch() -> None:
+    """Return freed memory to the system where the C library can: fitting and saving leave 40 MB of it."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.memory import Memory
+from scroll_tactile.memory import Memory, give_back_scratch
 from scroll_tactile.ridge.calibration import Calibration, calibrate
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.selection import Selection, select
@@ -48,6 +48,7 @@ class Model:
         chosen = {scale: select(statistics, scale, kind) for scale in scales}
         selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
         calibrations = calibrate(memory.pool, stages, selections, kind)
+        give_back_scratch()
         return cls(kind, list(statistics.materials), scales, stages, selections, calibrations)
 
     def judge(self, candidates: Sequence[str], means: Sequence[FloatArray], reached: int) -> Judgement:

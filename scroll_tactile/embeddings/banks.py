@@ -110,13 +110,16 @@ def _taps(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
 def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> torch.Tensor:
     streams = _simulated(channels, (TAPS - 1) * kernels.dilation + 128)
     count = len(kernels)
-    responses = np.stack([kernels.respond(count, torch.from_numpy(one)).numpy() for one in streams], axis=1)
-    responses.sort(axis=-1)
     # Quantiles in a golden-ratio sequence: any number of a kernel's thresholds, from the first on, is well spread.
     quantiles = (rng.random(count) + np.arange(THRESHOLDS)[:, None] * GOLDEN) % 1
-    places = (quantiles * responses.shape[-1]).astype(np.int64)
     chosen = rng.integers(0, len(streams), size=(THRESHOLDS, count))
-    return torch.from_numpy(responses[np.arange(count), chosen, places] + np.float32(0.5))
+    thresholds = np.empty((THRESHOLDS, count), dtype=np.float32)
+    for at, stream in enumerate(streams):  # one by one: the responses to all would fill ten times the memory
+        responses = np.sort(kernels.respond(count, torch.from_numpy(stream)).numpy(), axis=-1)
+        round_, kernel = np.nonzero(chosen == at)
+        place = (quantiles[round_, kernel] * responses.shape[-1]).astype(np.int64)
+        thresholds[round_, kernel] = responses[kernel, place] + np.float32(0.5)
+    return torch.from_numpy(thresholds)
 
 
 @lru_cache(maxsize=4)

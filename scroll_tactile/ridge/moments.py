@@ -14,12 +14,12 @@ from threadpoolctl import ThreadpoolController
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.ridge.codes import BITS
 
-__all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "within_scatter"]
+__all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "require_room", "within_scatter"]
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
 
-MOST_ROWS = 2 ** (63 - 2 * BITS)  # the rows after which an entry could pass int64: 8 388 608
+MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
 BLOCK = 256  # rows that wait; below 2¹³ their product is exact in float64, and 256 already cost no more each
 LIMB = 22  # bits
 
@@ -37,8 +37,17 @@ def one_thread() -> Iterator[None]:
 
 
 @lru_cache(maxsize=4)
-def _lower(dimension: int) -> npt.NDArray[np.int64]:
+def _lower(dimension: int) -> npt.NDArray[np.intp]:
     return np.flatnonzero(np.tri(dimension, dtype=bool))
+
+
+def require_room(rows: int, more: int) -> None:
+    """Raise CapacityError where a sum over `rows` rows and `more` of them might not be exact."""
+    if rows + more > MOST_ROWS:
+        raise CapacityError(
+            f"int64 sums of {BITS}-bit codes are exact for {MOST_ROWS} rows; there are {rows} and {more} came. "
+            "Start a new memory"
+        )
 
 
 class SecondMoment:
@@ -57,11 +66,7 @@ class SecondMoment:
 
     def add(self, codes: npt.NDArray[np.int32]) -> None:
         """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
-        if self.rows + len(codes) > MOST_ROWS:
-            raise CapacityError(
-                f"int64 sums of {BITS}-bit codes are exact for {MOST_ROWS} rows; there are {self.rows} and "
-                f"{len(codes)} came. Start a new memory"
-            )
+        require_room(self.rows, len(codes))
         for first in range(0, len(codes), BLOCK):
             self._wait(codes[first : first + BLOCK])
         self.rows += len(codes)

@@ -71,7 +71,7 @@ class Pool:
         rank = bisect_left(keys, key)
         if rank < len(keys) and keys[rank] == key:
             return False
-        return len(self) < self.capacity or (rank, key) < self._last()[:2]
+        return len(self) < self.capacity or (rank, key, material) < self._last()
 
     def add(self, material: str, key: bytes, touch: Touch) -> None:
         """Add a touch where it belongs in, and drop the one that falls out."""
@@ -91,7 +91,7 @@ class Pool:
         """What a store keeps: arrays by name, and the material of each touch."""
         entries = list(self)
         return {
-            "pool-keys": np.array([list(key) for _, key, _ in entries], dtype=np.uint8).reshape(len(entries), -1),
+            "pool-keys": np.array([list(key) for _, key, _ in entries] or [[]], np.uint8)[: len(entries)],
             "pool-sizes": np.array([len(touch.pairs) for *_, touch in entries], dtype=np.int64),
             "pool-pairs": np.concatenate([t.pairs for *_, t in entries]) if entries else np.zeros((0, 3), np.int64),
             "pool-sums": np.concatenate([t.sums for *_, t in entries]) if entries else np.zeros((0, 0), np.int32),

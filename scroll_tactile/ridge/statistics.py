@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
-from scroll_tactile.ridge.moments import SecondMoment
+from scroll_tactile.ridge.moments import SecondMoment, require_room
 
 __all__ = ["FOLDS", "Statistics", "fold_of"]
 
@@ -59,12 +59,21 @@ class Statistics:
 
         Raises CapacityError, before anything is added, where a sum would not be exact any more.
         """
+        self.require_room(codes)
         at = self._place(material)
         for scale, rows in codes.items():
             self._seconds[scale][fold].add(rows)
             self._rows[scale][at, fold] += len(rows)
             self._sums[scale][at, fold] += rows.sum(axis=0, dtype=np.int64)
         self._observations[at, fold] += 1
+
+    def require_room(self, codes: Codes) -> None:
+        """Raise CapacityError where these codes could not be added: all folds together are summed as well."""
+        for scale, rows in codes.items():
+            require_room(self._total_rows(scale), len(rows))
+
+    def _total_rows(self, scale: int) -> int:
+        return sum(moment.rows for moment in self._seconds[scale])
 
     def remove(self, material: str, fold: int, codes: Codes) -> None:
         """Take out one observation that was added: the memory is as if it had never been.
@@ -159,6 +168,9 @@ class Statistics:
                 f"{other.dimension} at {other.scales}"
             )
         joint = Statistics(self.dimension, self.scales)
+        if sign > 0:
+            for scale in self.scales:
+                require_room(self._total_rows(scale), other._total_rows(scale))
         for part, weight in ((self, 1), (other, sign)):
             for name, at in part._places.items():
                 to = joint._place(name)
@@ -166,15 +178,27 @@ class Statistics:
                 for scale in self.scales:
                     joint._rows[scale][to] += weight * part._rows[scale][at]
                     joint._sums[scale][to] += weight * part._sums[scale][at]
-        if (joint._observations < 0).any() or any((rows < 0).any() for rows in joint._rows.values()):
-            raise InputError("statistics can be taken only out of statistics that contain them")
         for scale in self.scales:
             for fold in range(FOLDS):
                 ours, theirs = self._seconds[scale][fold], other._seconds[scale][fold]
                 packed = ours.packed() + sign * theirs.packed()
                 rows = ours.rows + sign * theirs.rows
                 joint._seconds[scale][fold] = SecondMoment.of(packed, rows, self.dimension)
+        if sign < 0 and not joint._sound():
+            raise InputError("statistics can be taken only out of statistics that contain them")
         return joint
+
+    def _sound(self) -> bool:
+        """Whether no count is negative and nothing is left over where there are no rows."""
+        if (self._observations < 0).any():
+            return False
+        for scale in self.scales:
+            rows = self._rows[scale]
+            if (rows < 0).any() or self._sums[scale][rows == 0].any():
+                return False
+            if any(moment.packed().any() for moment in self._seconds[scale] if not moment.rows):
+                return False
+        return True
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the materials in the order of their first axis."""

@@ -1,0 +1,1 @@
+"""Benchmarks: speed beside error, measured side by side in one run and reported as ratios."""

@@ -1,0 +1,168 @@
+"""`scroll-tactile bench speed`: what a prediction, a statistics update and a large memory cost, as ratios.
+
+Every pair is timed in turns in one run; the error stands beside the time. Streams are simulated: their content
+does not change the cost.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.linalg.blas import dsyrk
+
+from scroll_tactile import sensors
+from scroll_tactile.bench.resnet import resnet18
+from scroll_tactile.bench.timing import Timing, circumstances, take_turns
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.images import tactile_image, three_planes
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.memory import OBSERVE, pack_codes
+from scroll_tactile.ridge.codes import BITS
+from scroll_tactile.ridge.moments import SecondMoment
+from scroll_tactile.windows import extent, scales
+
+__all__ = ["run_speed"]
+
+Record = dict[str, object]
+Note = Callable[[str], None]
+BLOCK = 64  # rows in which the plain update is fed, and ours
+
+
+def run_speed(*, seed: int = 0, observations: int = 100_000, rounds: int = 50, note: Note = lambda _: None) -> Record:
+    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records."""
+    note("a prediction beside a ResNet-18")
+    records = [_predict_and_resnet(seed, rounds)]
+    note("a statistics update beside a plain dsyrk")
+    records.append(_update_and_dsyrk(seed, rounds))
+    note(f"a memory of {observations} observations beside one of 1000")
+    records += _large_and_small(seed, observations, rounds)
+    return {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads(), "records": records}
+
+
+def _record(case: str, ours: Timing, other: Timing, against: str, error: str, bar: str) -> Record:
+    return {
+        "case": case,
+        "milliseconds": ours.least * 1e3,
+        "median_milliseconds": ours.median * 1e3,
+        "against": against,
+        "against_milliseconds": other.least * 1e3,
+        "ratio": ours.least / other.least,
+        "error": error,
+        "bar": bar,
+    }
+
+
+def _taught(seed: int, touches: int) -> tuple[TactileLearner, Scene]:
+    scene = Scene(sensor=sensors.BIOTAC, seed=seed)
+    learner = TactileLearner(sensor=sensors.BIOTAC)
+    for name in scene.materials:
+        for repetition in range(touches):
+            learner.observe(name, scene.touch(name, repetition))
+    return learner, scene
+
+
+def _predict_and_resnet(seed: int, rounds: int) -> Record:
+    learner, scene = _taught(seed, 3)
+    stream = scene.touch(scene.materials[0], 99)
+    readings = np.array(stream.readings)
+    network = resnet18(seed)
+    image = torch.from_numpy(three_planes(tactile_image(stream))[None])
+
+    def forward() -> None:
+        with torch.inference_mode():
+            network(image)
+
+    timings = take_turns({"predict": lambda: learner.predict(readings), "resnet": forward}, rounds)
+    tries = [(name, 50 + at) for name in scene.materials for at in range(3)]
+    wrong = np.mean([learner.predict(scene.touch(*one)).material != one[0] for one in tries])
+    return _record(
+        "predict, 4 s of BioTac, end to end",
+        timings["predict"],
+        timings["resnet"],
+        "ResNet-18 forward of the same image, torch",
+        f"{100 * wrong:.1f} % of simulated touches wrong",
+        "ratio ≤ 0.2",
+    )
+
+
+def _update_and_dsyrk(seed: int, rounds: int) -> Record:
+    rng = np.random.default_rng(seed)
+    dimension, rows = 1008, 16 * BLOCK
+    codes = rng.integers(0, 2**BITS, size=(rows, dimension), dtype=np.int32)
+    blocks = [codes[at : at + BLOCK] for at in range(0, rows, BLOCK)]
+    # Features, as a plain recursion has them: the codes are features on a grid, in units of 2⁻²⁰.
+    plain_blocks = [np.asfortranarray((block * 2.0**-BITS).T) for block in blocks]
+
+    def ours() -> npt.NDArray[np.int64]:
+        moment = SecondMoment(dimension)
+        for block in blocks:
+            moment.add(block)
+        return moment.packed()
+
+    def plain(order: list[int] | None = None) -> npt.NDArray[np.float64]:
+        total = np.zeros((dimension, dimension), order="F")
+        for at in order or range(len(blocks)):
+            total = dsyrk(1.0, plain_blocks[at], beta=1.0, c=total, overwrite_c=1, lower=0)
+        return total
+
+    timings = take_turns({"ours": ours, "plain": plain}, max(3, rounds // 10), warm_up=1)
+    backwards = plain(list(range(len(blocks)))[::-1])
+    differing = float(np.mean(np.triu(plain()) != np.triu(backwards))) * 2
+    return _record(
+        f"statistics update, {rows} rows of {dimension} in blocks of {BLOCK}",
+        timings["ours"],
+        timings["plain"],
+        "plain float64 dsyrk of the same rows",
+        f"exact; plain: {100 * differing:.0f} % of entries differ between two orders",
+        "ratio ≤ 1.5",
+    )
+
+
+def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
+    scene = Scene(sensor=sensors.BIOTAC, seed=seed)
+    stream = np.array(scene.touch(scene.materials[0], 99).readings)
+    with tempfile.TemporaryDirectory() as folder:
+        small, large = (_filled(Path(folder) / str(size), scene, size, seed) for size in (1000, observations))
+        with small, large:
+            calls = {
+                "observe, small": lambda: small.observe("new", stream),
+                "observe, large": lambda: large.observe("new", stream),
+            }
+            observing = take_turns(calls, rounds)
+            calls = {"small": lambda: small.predict(stream), "large": lambda: large.predict(stream)}
+            predicting = take_turns(calls, rounds)
+    pairs = [
+        ("observe", observing["observe, large"], observing["observe, small"]),
+        ("predict", predicting["large"], predicting["small"]),
+    ]
+    return [
+        _record(
+            f"{verb}, memory of {observations} observations", large_, small_, "memory of 1000", "exact", "ratio ≤ 1.2"
+        )
+        for verb, large_, small_ in pairs
+    ]
+
+
+def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLearner:
+    """A learner on disk with so many touches of one window a scale, of made-up codes: only their number matters."""
+    learner = TactileLearner.open(path, sensor=scene.sensor)
+    rng = np.random.default_rng([seed, observations])
+    widths = scales(scene.sensor)
+    one = extent(widths[-1], widths)
+    store, memory = learner._store, learner._memory
+    assert store is not None
+    for at in range(observations):
+        codes = {
+            width: rng.integers(0, 23, size=(1, learner.embedding.dimension), dtype=np.int32) * 2**14 for width in one
+        }
+        key = rng.bytes(32)
+        material = scene.materials[at % len(scene.materials)]
+        columns = widths[0]
+        record = store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=pack_codes(codes))
+        memory.add(material, key, columns, codes, record.sequence)
+    return learner

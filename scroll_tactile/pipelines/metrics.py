@@ -1,0 +1,78 @@
+"""Figures of merit, each with its equation, in numpy alone.
+
+>>> accuracy(["felt", "silk"], ["felt", "wool"])
+0.5
+>>> auroc([0.9, 0.8], [0.1, 0.8])
+0.875
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+
+__all__ = ["accuracy", "auroc", "calibration_error", "mean_and_spread"]
+
+
+def accuracy(truth: Sequence[str | None], said: Sequence[str | None]) -> float:
+    """The share of answers that are right: Σ_i [said_i = truth_i] / N.
+
+    truth, said: N materials each. Raises InputError where N differs or is 0.
+    """
+    _require_pairs(len(truth), len(said))
+    return sum(one == other for one, other in zip(truth, said, strict=True)) / len(truth)
+
+
+def calibration_error(probability: npt.ArrayLike, right: npt.ArrayLike, bins: int = 15) -> float:
+    """Expected calibration error: Σ_b (n_b / N) · |right_b − probability_b|.
+
+    b runs over `bins` intervals of equal width, ((b−1)/bins, b/bins], and the two are means of those that fall in.
+    probability: of the answers given, in [0, 1], shape (N,). right: whether they were, shape (N,).
+    Raises InputError where the shapes differ, N is 0, or a probability is none.
+    """
+    chances = np.asarray(probability, dtype=np.float64)
+    hits = np.asarray(right, dtype=np.float64)
+    _require_pairs(len(chances), len(hits))
+    if not ((chances >= 0) & (chances <= 1)).all():
+        raise InputError("expected probabilities from 0 to 1; came others")
+    place = np.clip(np.ceil(chances * bins).astype(int) - 1, 0, bins - 1)
+    gaps = np.zeros(bins)
+    np.add.at(gaps, place, hits - chances)  # n_b times the difference of the means
+    return float(np.abs(gaps).sum() / len(chances))
+
+
+def auroc(positive: npt.ArrayLike, negative: npt.ArrayLike) -> float:
+    """Area under the ROC curve, the chance that a positive scores above a negative, ties counted half.
+
+    From ranks: (R − P(P+1)/2) / (P·N), R being the sum of the positives' ranks among all, equal scores sharing
+    their mean rank (Mann and Whitney). positive, negative: scores, shapes (P,) and (N,).
+    Raises InputError where either is empty.
+    """
+    above = np.asarray(positive, dtype=np.float64)
+    below = np.asarray(negative, dtype=np.float64)
+    if not len(above) or not len(below):
+        raise InputError(f"expected scores of both kinds; came {len(above)} positive and {len(below)} negative")
+    scores = np.concatenate([above, below])
+    order = np.argsort(scores, kind="stable")
+    ranks = np.empty(len(scores))
+    edges = np.flatnonzero(np.diff(scores[order], prepend=np.nan, append=np.nan) != 0)
+    for begin, end in pairwise(edges):
+        ranks[order[begin:end]] = (begin + end + 1) / 2
+    count = len(above)
+    return float((ranks[:count].sum() - count * (count + 1) / 2) / (count * len(below)))
+
+
+def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
+    """Mean, and standard deviation Σ(x − mean)² / (N − 1) under the root, 0 where N is 1."""
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+    return float(np.mean(values)), spread
+
+
+def _require_pairs(expected: int, came: int) -> None:
+    if expected != came or not expected:
+        raise InputError(f"expected as many answers as truths, and at least one; came {came} and {expected}")

@@ -1,0 +1,121 @@
+"""One pass over labelled streams: what is missing is observed, in order, and can be interrupted at any moment."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.metrics import accuracy
+from scroll_tactile.prediction import Prediction
+from scroll_tactile.streams import Stream
+
+__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all"]
+
+Labelled = tuple[str, Stream]
+"""A material and how it felt."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a learner said to streams of known origin: N materials, and N predictions."""
+
+    truth: list[str]
+    predictions: list[Prediction]
+
+    @property
+    def said(self) -> list[str | None]:
+        """The material of each prediction."""
+        return [prediction.material for prediction in self.predictions]
+
+    @property
+    def accuracy(self) -> float:
+        """The share of right answers."""
+        return accuracy(self.truth, self.said)
+
+    def of(self, material: str) -> Answers:
+        """The answers to streams of one material."""
+        places = [at for at, name in enumerate(self.truth) if name == material]
+        return Answers([material] * len(places), [self.predictions[at] for at in places])
+
+    def confusions(self) -> list[tuple[str, str, int]]:
+        """(truth, said, count) of what was taken for something else, the most frequent first."""
+        pairs = Counter(
+            (truth, said) for truth, said in zip(self.truth, self.said, strict=True) if said and said != truth
+        )
+        return [(*pair, count) for pair, count in sorted(pairs.items(), key=lambda entry: (-entry[1], entry[0]))]
+
+
+def ask(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: float | None = None) -> Answers:
+    """Predict every touch, or its first `seconds` only."""
+    cut = [(name, stream if seconds is None else stream.first(seconds)) for name, stream in touches]
+    return Answers([name for name, _ in cut], [learner.predict(stream) for _, stream in cut])
+
+
+def missing(touches: Sequence[Labelled], felt: Mapping[str, int]) -> list[Labelled]:
+    """Those of `touches` that a memory has still to observe, given how many of each material it has felt.
+
+    A memory that was filled in this very order and interrupted holds the first few of every material.
+
+    Raises InputError where it holds more than these touches: it is another pass's.
+    """
+    planned = Counter(name for name, _ in touches)
+    extra = {name: count for name, count in felt.items() if count > planned[name]}
+    if extra:
+        raise InputError(
+            f"expected a memory that this run began; it holds more than the run would teach it: {extra}. "
+            "Take another folder"
+        )
+    left = dict(felt)
+    remaining = []
+    for name, stream in touches:
+        if left.get(name, 0):
+            left[name] -= 1
+        else:
+            remaining.append((name, stream))
+    return remaining
+
+
+def observe(learner: TactileLearner, material: str, stream: Stream) -> None:
+    """Observe one touch whole: ctrl-C in the middle takes effect when it is done."""
+    with _interrupts_held():
+        learner.observe(material, stream)
+
+
+def observe_all(
+    learner: TactileLearner, touches: Sequence[Labelled], each: Callable[[], object] = lambda: None
+) -> int:
+    """Observe, in order, those that the memory does not hold yet, calling `each` after each; returns how many."""
+    remaining = missing(touches, learner.materials)
+    for _ in range(len(touches) - len(remaining)):
+        each()
+    for name, stream in remaining:
+        observe(learner, name, stream)
+        each()
+    return len(remaining)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    # An exception half way through adding would leave statistics that close() then writes as if they were whole.
+    if threading.current_thread() is not threading.main_thread():  # only there do signals arrive
+        yield
+        return
+    held: list[int] = []
+
+    def hold(number: int, _frame: FrameType | None) -> None:
+        held.append(number)
+
+    before = signal.signal(signal.SIGINT, hold)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt

@@ -1,0 +1,86 @@
+"""A run's own notes beside its memories: what was asked for, and what is finished; so that it can go on."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from scroll_tactile.errors import InputError
+
+__all__ = ["RunFile"]
+
+_FORMAT = 1
+
+
+class RunFile:
+    """Notes of one run, kept in a JSON file that is replaced whole, or nowhere.
+
+    path: the file, or None. plan: what was asked for, in JSON's types; a file of another plan is refused.
+
+    Raises InputError for a file of another run or no notes at all.
+    """
+
+    def __init__(self, path: Path | None, plan: Mapping[str, Any]) -> None:
+        self.path = path
+        self.plan = json.loads(json.dumps(plan))
+        self.notes: dict[str, Any] = {}
+        if path is None:
+            return
+        if path.parent.exists() and not path.parent.is_dir():
+            raise InputError(f"expected a folder for the memory; {path.parent} is a file")
+        if path.exists():
+            self.notes = self._read(path)
+            self.resumed = True
+        elif path.parent.is_dir() and any(path.parent.iterdir()):
+            raise InputError(
+                f"{path.parent} holds other things, and no {path.name}: no run to go on with. Take an empty folder"
+            )
+        else:
+            self._write()
+
+    resumed = False
+    """Whether there were notes to go on from."""
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            plan, notes = kept["plan"], kept["notes"]
+            version = kept["format"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"expected the notes of a run in {path}; they cannot be read: {error!r}") from error
+        if version != _FORMAT:
+            raise InputError(f"{path} was written in format {version}; this version reads {_FORMAT}")
+        differing = [
+            f"{name} {plan.get(name)!r} there, {self.plan.get(name)!r} here"
+            for name in sorted({*plan, *self.plan})
+            if plan.get(name) != self.plan.get(name)
+        ]
+        if differing:
+            raise InputError(
+                f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, or take another folder"
+            )
+        if not isinstance(notes, dict):
+            raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}")
+        return notes
+
+    def note(self, name: str, value: Any) -> None:
+        """Keep a value, in JSON's types, under a name; it is on disk when this returns."""
+        self.notes[name] = value
+        if self.path is not None:
+            self._write()
+
+    def _write(self) -> None:
+        assert self.path is not None
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            draft = self.path.with_name(self.path.name + ".new")
+            with draft.open("w", encoding="utf-8") as file:
+                json.dump({"format": _FORMAT, "plan": self.plan, "notes": self.notes}, file, indent=1)
+                file.flush()
+                os.fsync(file.fileno())
+            draft.replace(self.path)
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be written: {error.strerror}. Take another folder") from error

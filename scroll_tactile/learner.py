@@ -6,7 +6,7 @@ import os
 import threading
 from collections.abc import Iterable, Sequence
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -183,12 +183,9 @@ class TactileLearner:
         image = tactile_image(felt)
         columns = image.shape[1]
         windows = extent(columns, self._scales)
-        # A touch shorter than the shortest scale is one window of its own length.
-        cut = {min(width, columns): begin for width, begin in windows.items()}
-        read = embed_windows(self.embedding, image, cut)
         codes = {}
-        for width, begin in windows.items():
-            features = read[min(width, columns)]
+        for width, features in embed_windows(self.embedding, image, windows).items():
+            begin = windows[width]
             expected = (len(begin), self.embedding.dimension)
             if features.shape != expected:
                 raise EmbeddingError(
@@ -263,7 +260,7 @@ def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: 
             f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
         )
     mine = _identity(kept, embedding)
-    if (theirs := store.identity["embedding"]) != mine["embedding"]:
+    if (theirs := cast(dict[str, Any], store.identity["embedding"])) != mine["embedding"]:
         ours = mine["embedding"]
         raise EmbeddingMismatchError(
             f"{store.path} was made with embedding {theirs['name']!r} ({theirs['dimension']} features, fingerprint "

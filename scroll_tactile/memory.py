@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +46,7 @@ class Memory:
 
     def replay(self, record: Record) -> None:
         """Add the observation of a journal row, without embedding anything again."""
-        columns = int(record.attributes["columns"])
+        columns = cast(int, record.attributes["columns"])
         self.add(record.label, record.key, columns, unpack_codes(record.arrays), record.sequence)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
@@ -67,7 +67,8 @@ class Memory:
         memory = cls(dimension, scales)
         generation = store.latest()
         if generation is not None:
-            names, pool = generation.attributes["materials"], generation.attributes["pool"]
+            names = cast(list[str], generation.attributes["materials"])
+            pool = cast(list[str], generation.attributes["pool"])
             memory.statistics = Statistics.from_arrays(dimension, scales, generation.arrays, names)
             memory.pool = Pool.from_arrays(generation.arrays, pool)
             memory.sequence = generation.upto

@@ -12,7 +12,7 @@ from scroll_tactile.memory import Memory, give_back_scratch
 from scroll_tactile.ridge.calibration import Calibration, calibrate
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.selection import Selection, select
-from scroll_tactile.windows import milestones
+from scroll_tactile.windows import fitting, milestones
 
 __all__ = ["Judgement", "Model"]
 
@@ -44,7 +44,7 @@ class Model:
         """Fit the readouts of a memory and calibrate them."""
         statistics = memory.statistics
         scales = statistics.scales
-        stages = [[width for width in scales if width <= length] for length in milestones(scales)]
+        stages = [fitting(length, scales) for length in milestones(scales)]
         chosen = {scale: select(statistics, scale, kind) for scale in scales}
         selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
         calibrations = calibrate(memory.pool, stages, selections, kind)

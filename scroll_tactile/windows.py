@@ -1,8 +1,8 @@
 """Windows: the stretches of a stream that are embedded, at a few scales.
 
 An embedding of a whole stream is lost when a touch is shorter, longer, faster or slower than those learned from.
-So a stream is read in windows of 0.3 s and of half the usual duration, and each of these scales has statistics
-of its own. A stream is known from its first 0.3 s on, and better with every reading.
+So a stream is read in windows of 0.3 s and of three quarters of the usual duration, and each of these scales has
+statistics of its own. A stream is known from its first 0.3 s on, and better with every reading.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["MOST_WINDOWS", "Extent", "extent", "milestones", "scales", "scored", "stages"]
+__all__ = ["MOST_WINDOWS", "Extent", "extent", "fitting", "milestones", "scales", "scored", "stages"]
 
 SHORTEST = 0.3  # seconds
-LONGEST = 0.5  # of the usual duration: a touch half as long has a window of it, a longer one several
+LONGEST = 0.75  # of the usual duration: a usual touch has several windows of it
+ENOUGH = 0.65  # of a window: a touch half the usual one is read with the kernels of the wide windows as far as it goes
 FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
 FRAMES = 80  # columns of a camera's frame in its tactile image
@@ -26,7 +27,7 @@ Extent = dict[int, list[int]]  # width of windows → their first columns
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
-    """The widths of windows in columns of the tactile image, ascending: BioTac (30, 200), RoboSkin (15, 37).
+    """The widths of windows in columns of the tactile image, ascending: BioTac (30, 300), RoboSkin (15, 56).
 
     A camera has one: a frame. So has a sensor whose touches are too short for two.
     """
@@ -34,7 +35,9 @@ def scales(sensor: Sensor) -> tuple[int, ...]:
         return (min(FRAMES, sensor.shape[1]),)
     shortest = max(FEWEST, round(SHORTEST * sensor.rate))
     longest = int(LONGEST * sensor.readings)
-    return (shortest, longest) if longest >= 1.5 * shortest else (shortest,)
+    # A touch must fit the shortest before it fits the longest: stages are known by their number.
+    two = longest >= 1.5 * shortest and ENOUGH * longest > shortest
+    return (shortest, longest) if two else (shortest,)
 
 
 def extent(columns: int, widths: tuple[int, ...]) -> Extent:
@@ -42,16 +45,19 @@ def extent(columns: int, widths: tuple[int, ...]) -> Extent:
 
     The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
     rests on: their steps grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
-    few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A stream shorter than the shortest scale is
-    one window of its own length, of that scale.
+    few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale, but not
+    much, is one window of it; of the shortest scale every touch is.
     """
-    if columns < widths[0]:
-        return {widths[0]: [0]}
-    return {width: _starts(columns, width, dense=width == widths[0]) for width in widths if width <= columns}
+    return {width: _starts(columns, width, dense=width == widths[0]) for width in fitting(columns, widths)}
+
+
+def fitting(columns: int, widths: tuple[int, ...]) -> list[int]:
+    """The widths of which a touch of so many columns has a window."""
+    return [width for width in widths if width == widths[0] or columns >= ENOUGH * width]
 
 
 def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
-    room = columns - width
+    room = max(0, columns - width)
     if dense:
         begin = [0]
         while begin[-1] < min(room, 4 * width):
@@ -68,18 +74,20 @@ def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
 def scored(extent: Mapping[int, Sequence[int]], length: int) -> dict[int, list[int]]:
     """Width → places of the windows whose scores are averaged when the first `length` columns have been felt.
 
-    Those that lie within it and begin at least half a width after the one before: otherwise the densely read
-    beginning would count for more than the rest.
+    Those that lie within it; of the shortest only such as begin at least half a width after the one before:
+    otherwise the densely read beginning would count for more than the rest.
     """
+    widths = tuple(sorted(extent))
     chosen: dict[int, list[int]] = {}
-    for width, begin in sorted(extent.items()):
+    for width in fitting(length, widths):
+        begin = extent[width]
+        apart = width // 2 if width == widths[0] else 1
         places: list[int] = []
         for place, start in enumerate(begin):
             inside = start + width <= length or start == 0
-            if inside and (not places or start >= begin[places[-1]] + width // 2):
+            if inside and (not places or start >= begin[places[-1]] + apart):
                 places.append(place)
-        if width <= length or width == min(extent):
-            chosen[width] = places
+        chosen[width] = places
     return chosen
 
 
@@ -87,10 +95,11 @@ def milestones(widths: tuple[int, ...]) -> tuple[int, ...]:
     """The lengths at which a touch reaches its stages: where a scale first fits, and halfway to the next (geometric).
 
     How far a scale is to be believed depends on how many of its windows there are, so calibration is measured at
-    each: BioTac 30, 77 and 200 readings.
+    each: BioTac 30, 77 and 195 readings.
     """
-    between = [round(float(np.sqrt(low * high))) for low, high in pairwise(widths)]
-    return tuple(sorted({*widths, *between}))
+    fit = [widths[0], *(int(np.ceil(ENOUGH * width)) for width in widths[1:])]
+    between = [round(float(np.sqrt(low * high))) for low, high in pairwise(fit)]
+    return tuple(sorted({*fit, *between}))
 
 
 def stages(columns: int, widths: tuple[int, ...]) -> list[int]:

@@ -39,7 +39,7 @@ def test_a_window_embeds_the_same_beside_others_and_alone(embedding, channels):
     whole = image(channels, 130)
     asked = windows_of(130, [1, 2, 5, 8, 9, 11, 12, 13, 15, 26, 27, 32, 33, 37, 64, 80, 129, 130])
     together = embedding.embed_windows(whole, asked)
-    assert list(sorted(together)) == sorted(asked)
+    assert sorted(together) == sorted(asked)
     for width, starts in asked.items():
         assert together[width].dtype == np.float32
         for row, start in zip(together[width], starts, strict=True):
@@ -60,6 +60,19 @@ def test_any_windows_of_any_image_embed_as_they_do_alone(channels, columns, data
     for width, starts in asked.items():
         for row, start in zip(together[width], starts, strict=True):
             assert row.tobytes() == SMALL.embed(whole[:, start : start + width]).tobytes()
+
+
+@pytest.mark.parametrize("columns", [1, 9, 12, 20, 64, 65, 99])
+def test_a_window_wider_than_the_image_is_read_as_far_as_the_image_goes(columns):
+    whole = image(19, columns)
+    asked = {100: [0], **({30: [0, columns - 30]} if columns >= 30 else {30: [0]})}
+    together = SMALL.embed_windows(whole, asked)
+    for width, starts in asked.items():
+        for row, start in zip(together[width], starts, strict=True):
+            alone = SMALL.embed(whole[:, start : start + width], width)
+            assert row.tobytes() == alone.tobytes()
+            assert row.min() >= 0
+            assert row.max() <= 1
 
 
 def test_an_image_with_many_rows_as_of_a_camera():

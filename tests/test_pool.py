@@ -1,7 +1,6 @@
 """The pool: bounded, even over the materials, and a function of what was felt, not of when."""
 
 from collections import Counter
-from itertools import zip_longest
 
 import numpy as np
 import pytest

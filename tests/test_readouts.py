@@ -39,8 +39,7 @@ class Dense:
             self.width, total = rows.cols, rows.rows
             self.center = [mpmath.fsum(rows[:, j]) / total for j in range(self.width)]
             variances = [
-                mpmath.fsum((rows[i, j] - self.center[j]) ** 2 for i in range(total)) / total
-                for j in range(self.width)
+                mpmath.fsum((rows[i, j] - self.center[j]) ** 2 for i in range(total)) / total for j in range(self.width)
             ]
             self.scale = [mpmath.sqrt(v) if v else mpmath.mpf(1) for v in variances]
             x = mpmath.matrix(total, self.width)
@@ -57,8 +56,10 @@ class Dense:
             first = 0
             centred = x.copy()
             for group in groups:
-                mean = [mpmath.fsum(x[i, j] for i in range(first, first + len(group))) / len(group)
-                        for j in range(self.width)]
+                mean = [
+                    mpmath.fsum(x[i, j] for i in range(first, first + len(group))) / len(group)
+                    for j in range(self.width)
+                ]
                 for i in range(first, first + len(group)):
                     for j in range(self.width):
                         centred[i, j] -= mean[j]
@@ -151,8 +152,8 @@ def test_a_constant_feature_says_nothing(value):
     without, readout = fit_readout(task_of(groups), 0.01), fit_readout(task_of(wider), 0.01)
     assert not readout.weights[1].any()
     assert np.isfinite(readout.weights).all()
-    for x, longer in zip(groups[0], wider[0], strict=True):
-        longer = longer.copy()
+    for x, row in zip(groups[0], wider[0], strict=True):
+        longer = row.copy()
         longer[1] = -5000  # a value never felt there
         assert np.allclose(without.project(x), readout.project(longer), rtol=1e-9, atol=1e-9)
 

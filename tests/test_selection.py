@@ -64,8 +64,11 @@ def pairwise_error(felt, penalty):
     """Log of the rows' mean error, with the differences of two scores taken for normal."""
     total = 0.0
     for names, readout, held in trials(felt, penalty):
-        scores = {one: readout.scores(readout.project(np.array([r for n, r in held if n == one])), "lda")
-                  for one in names if any(n == one for n, _ in held)}
+        scores = {
+            one: readout.scores(readout.project(np.array([r for n, r in held if n == one])), "lda")
+            for one in names
+            if any(n == one for n, _ in held)
+        }
         residuals = np.concatenate([rows - rows.mean(axis=0) for rows in scores.values()])
         terms = []
         for name, rows in scores.items():

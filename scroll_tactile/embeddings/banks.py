@@ -79,7 +79,8 @@ def bank_size(channels: int, dilation: int) -> int:
 
 def to_levels(image: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
     """Round a tactile image in [-1, 1] to integers in ±LEVELS, held as float32; same shape."""
-    return np.rint(image * np.float32(LEVELS)).astype(np.float32, copy=False)
+    levels: npt.NDArray[np.float32] = np.rint(image * np.float32(LEVELS)).astype(np.float32, copy=False)
+    return levels
 
 
 @lru_cache(maxsize=64)
@@ -104,7 +105,8 @@ def _taps(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
         shapes[at, list(heavy)] = 2
     rounds = -(-count // len(shapes))
     order = np.concatenate([rng.permutation(len(shapes)) for _ in range(rounds)])
-    return shapes[order[:count]]
+    taps: npt.NDArray[np.float32] = shapes[order[:count]]
+    return taps
 
 
 def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> torch.Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
@@ -73,8 +74,8 @@ class Demo:
 
         Raises InputError for a folder of something else, and what the learner and the store raise.
         """
-        plan = {"run": "demo", "sensor": self.sensor.model_dump(mode="json")}
-        plan |= {name: value for name, value in asdict(self).items() if isinstance(value, int)}
+        plan: dict[str, Any] = {"run": "demo", "sensor": self.sensor.model_dump(mode="json"), "seed": self.seed}
+        plan |= {"materials": self.materials, "touches": self.touches, "held_out": self.held_out}
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
         with self._open() as learner:
             return self._learn(learner, notes, tell)

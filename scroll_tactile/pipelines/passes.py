@@ -10,10 +10,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
+import numpy.typing as npt
+
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy
-from scroll_tactile.prediction import Prediction
+from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.streams import Stream
 
 __all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all"]
@@ -82,15 +84,13 @@ def missing(touches: Sequence[Labelled], felt: Mapping[str, int]) -> list[Labell
     return remaining
 
 
-def observe(learner: TactileLearner, material: str, stream: Stream) -> None:
-    """Observe one touch whole: ctrl-C in the middle takes effect when it is done."""
+def observe(learner: TactileLearner, material: str, stream: Stream | npt.ArrayLike) -> Receipt:
+    """Observe one touch whole, as `TactileLearner.observe`: ctrl-C in the middle takes effect when it is done."""
     with _interrupts_held():
-        learner.observe(material, stream)
+        return learner.observe(material, stream)
 
 
-def observe_all(
-    learner: TactileLearner, touches: Sequence[Labelled], each: Callable[[], object] = lambda: None
-) -> int:
+def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Callable[[], object] = lambda: None) -> int:
     """Observe, in order, those that the memory does not hold yet, calling `each` after each; returns how many."""
     remaining = missing(touches, learner.materials)
     for _ in range(len(touches) - len(remaining)):

@@ -19,6 +19,7 @@ class RunFile:
     """Notes of one run, kept in a JSON file that is replaced whole, or nowhere.
 
     path: the file, or None. plan: what was asked for, in JSON's types; a file of another plan is refused.
+    notes: by name. resumed: whether there were notes to go on from.
 
     Raises InputError for a file of another run or no notes at all.
     """
@@ -27,6 +28,7 @@ class RunFile:
         self.path = path
         self.plan = json.loads(json.dumps(plan))
         self.notes: dict[str, Any] = {}
+        self.resumed = False
         if path is None:
             return
         if path.parent.exists() and not path.parent.is_dir():
@@ -34,15 +36,12 @@ class RunFile:
         if path.exists():
             self.notes = self._read(path)
             self.resumed = True
-        elif path.parent.is_dir() and any(path.parent.iterdir()):
+        elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
             raise InputError(
                 f"{path.parent} holds other things, and no {path.name}: no run to go on with. Take an empty folder"
             )
         else:
             self._write()
-
-    resumed = False
-    """Whether there were notes to go on from."""
 
     def _read(self, path: Path) -> dict[str, Any]:
         try:
@@ -60,7 +59,8 @@ class RunFile:
         ]
         if differing:
             raise InputError(
-                f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, or take another folder"
+                f"{path.parent} belongs to another run ({'; '.join(differing)}). "
+                "Ask for the same, or take another folder"
             )
         if not isinstance(notes, dict):
             raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}")
@@ -76,7 +76,7 @@ class RunFile:
         assert self.path is not None
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            draft = self.path.with_name(self.path.name + ".new")
+            draft = _draft(self.path)
             with draft.open("w", encoding="utf-8") as file:
                 json.dump({"format": _FORMAT, "plan": self.plan, "notes": self.notes}, file, indent=1)
                 file.flush()
@@ -84,3 +84,7 @@ class RunFile:
             draft.replace(self.path)
         except OSError as error:
             raise InputError(f"{self.path} cannot be written: {error.strerror}. Take another folder") from error
+
+
+def _draft(path: Path) -> Path:
+    return path.with_name(path.name + ".new")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -120,23 +121,36 @@ def _try(
     cuts = np.flatnonzero(random.random(len(touches)) < 4 / len(touches))  # about five batches
     second = set(random.permutation(len(touches))[: random.integers(1, len(touches))].tolist()) if split else set()
     parts = [[at for at in order if at not in second]] + ([[at for at in order if at in second]] if split else [])
-    reopened, learners = 0, []
-    for at, part in enumerate(parts):
-        learner = TactileLearner.open(folder / str(at), sensor=sensor)
-        for done, place in enumerate(part):
-            observe(learner, *touches[place])
-            if done in cuts:
-                if random.random() < 0.5:
-                    learner.close()
-                    learner = TactileLearner.open(folder / str(at))
-                    reopened += 1
-                else:
-                    learner.predict(probes[0][1])
+    reopened = 0
+    with ExitStack() as opened:
+        learners = []
+        for at, part in enumerate(parts):
+            path = folder / str(at)
+            reopened += _learn(path, sensor, [touches[place] for place in part], set(cuts.tolist()), probes[0], random)
+            learners.append(opened.enter_context(TactileLearner.open(path, mode="read")))
+        joint = learners[0] if len(learners) == 1 else _joined(sensor, learners)
+        same = _predictions(joint, probes) == expected
+        return Trial(len(cuts) + 1, reopened, len(second), joint.digest(), same)
+
+
+def _learn(
+    path: Path, sensor: Sensor, touches: list[Labelled], cuts: set[int], probe: Labelled, random: np.random.Generator
+) -> int:
+    """Fill a memory on disk; after each batch it is opened anew, or asked; returns how often it was opened anew."""
+    reopened = 0
+    learner = TactileLearner.open(path, sensor=sensor)
+    try:
+        for at, (name, stream) in enumerate(touches):
+            observe(learner, name, stream)
+            if at in cuts and random.random() < 0.5:
+                learner.close()
+                learner = TactileLearner.open(path)
+                reopened += 1
+            elif at in cuts:
+                learner.predict(probe[1])
+    finally:
         learner.close()
-        learners.append(learner)
-    joint = learners[0] if len(learners) == 1 else _joined(sensor, learners)
-    same = _predictions(joint, probes) == expected
-    return Trial(len(cuts) + 1, reopened, len(second), joint.digest(), same)
+    return reopened
 
 
 def _joined(sensor: Sensor, learners: Sequence[TactileLearner]) -> TactileLearner:

@@ -25,4 +25,5 @@ def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
             f"expected finite features of magnitude at most {bound}; feature {bad.tolist()} is "
             f"{features[tuple(bad)]}. The embedding's bound is wrong, or it divides by zero"
         )
-    return np.rint(scaled).astype(np.int32)
+    codes: npt.NDArray[np.int32] = np.rint(scaled).astype(np.int32)
+    return codes

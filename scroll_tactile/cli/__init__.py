@@ -1,0 +1,26 @@
+"""The command line: `scroll-tactile`, or `python -m scroll_tactile.cli`."""
+
+from __future__ import annotations
+
+import typer
+
+from scroll_tactile.cli.bench import bench
+from scroll_tactile.cli.demo import demo
+from scroll_tactile.cli.memory import inspect, observe, predict
+from scroll_tactile.cli.replay import replay
+from scroll_tactile.cli.schedules import schedules
+from scroll_tactile.cli.terminal import Commands
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
+    "it has never felt something. Start with: scroll-tactile demo",
+)
+for command in (demo, observe, predict, inspect, replay, schedules):
+    app.command()(command)
+app.add_typer(bench, name="bench")

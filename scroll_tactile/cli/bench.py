@@ -1,0 +1,51 @@
+"""`scroll-tactile bench`: speed beside error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from scroll_tactile.bench.speed import run_speed
+from scroll_tactile.cli.terminal import Commands, console, progress_bar, say, write_json
+
+__all__ = ["bench"]
+
+bench = typer.Typer(cls=Commands, no_args_is_help=True, help="Measure speed beside error, side by side in one run.")
+
+
+@bench.callback()
+def _group() -> None:
+    """Keep `speed` a command of its own while it is the only one."""
+
+
+@bench.command()
+def speed(
+    observations: Annotated[int, typer.Option(min=1000, help="Size of the large memory.")] = 100_000,
+    rounds: Annotated[int, typer.Option(min=5, help="How often each is timed; the least counts.")] = 50,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+) -> None:
+    """Time a prediction beside a ResNet-18, an update beside a plain dsyrk, a large memory beside a small one.
+
+    Filling the large memory takes a few minutes; 10000 observations take twenty seconds.
+    """
+    with progress_bar() as progress:
+        result = run_speed(seed=seed, observations=observations, rounds=rounds, note=lambda what: progress(what, 0, 1))
+    table = Table("what", "ms", "beside", "ms", "ratio", "bar", "error")
+    for record in result["records"]:
+        table.add_row(
+            record["case"],
+            f"{record['milliseconds']:.2f}",
+            record["against"],
+            f"{record['against_milliseconds']:.2f}",
+            f"{record['ratio']:.2f}",
+            record["bar"],
+            record["error"],
+        )
+    console().print(table)
+    if json is not None:
+        write_json(json, result)
+        say(f"written to {json}")

@@ -1,0 +1,70 @@
+"""What can be imported, and what importing brings along."""
+
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import scroll_tactile
+import store
+
+PACKAGES = [
+    scroll_tactile,
+    store,
+    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "embeddings", "ridge")),
+]
+
+
+def modules():
+    for package in (scroll_tactile, store):
+        yield package.__name__
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            yield found.name
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda one: one.__name__)
+def test_the_public_names_are_sorted_there_and_all_there_are(package):
+    # As ruff sorts them: constants, classes, then the rest.
+    names = package.__all__
+    assert sorted(names, key=lambda name: (not name.isupper(), not name[0].isupper(), name)) == list(names)
+    assert len(set(names)) == len(names)
+    leaked = [
+        name
+        for name, item in vars(package).items()
+        if not name.startswith("_") and name not in names and not inspect.ismodule(item) and name != "annotations"
+    ]
+    assert leaked == []
+    for name in names:
+        assert hasattr(package, name)
+
+
+@pytest.mark.parametrize("name", [name for name in modules() if not name.endswith("__main__")])
+def test_every_module_names_what_it_offers(name):
+    module = importlib.import_module(name)
+    assert module.__doc__
+    for public in getattr(module, "__all__", []):
+        assert hasattr(module, public)
+
+
+def test_types_are_shipped():
+    for package in (scroll_tactile, store):
+        assert (Path(package.__file__).parent / "py.typed").exists()
+
+
+def test_importing_brings_no_library_that_only_some_need():
+    code = (
+        "import sys, scroll_tactile; "
+        "print(*[n for n in ('matplotlib', 'sklearn', 'zarr', 'typer', 'rich', 'hypothesis') if n in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.split() == []
+
+
+def test_the_store_knows_nothing_of_touch():
+    code = "import sys, store; print(*[n for n in sys.modules if n.split('.')[0] in ('scroll_tactile', 'torch')])"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.split() == []

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, cast
 
@@ -31,11 +33,13 @@ from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
 from scroll_tactile.windows import extent, scales, scored, stages
-from store import Store
+from store import Store, StoreClosedError, StoreError
 
 __all__ = ["TactileLearner"]
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
+
+logger = logging.getLogger(__name__)
 
 LONGEST_NAME = 200  # characters
 SNAPSHOT_EVERY = 1024  # observations between generations: replaying so many takes about a second on opening
@@ -67,10 +71,7 @@ class TactileLearner:
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
     ) -> None:
-        if readout not in ("lda", "ridge"):
-            raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
-        if not 0 < false_alarms < 1:
-            raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
+        _require_settings(readout, false_alarms)
         self.sensor = sensor
         self.embedding: Embedding = Kernels() if embedding is None else embedding
         self.readout: ReadoutName = readout
@@ -79,6 +80,7 @@ class TactileLearner:
         self._memory = Memory(self.embedding.dimension, self._scales)
         self._store: Store | None = None
         self._saved = 0
+        self._closed = False
         self._model: Model | None = None
         self._lock = threading.RLock()
 
@@ -101,10 +103,15 @@ class TactileLearner:
         Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
         new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
         """
+        _require_settings(readout, false_alarms)
         chosen: Embedding = Kernels() if embedding is None else embedding
+        if sensor is None and not Path(path).exists():
+            raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
         identity = None if sensor is None else _identity(sensor, chosen)
         store = Store.open(path, identity=identity, mode=mode)
         try:
+            if "sensor" not in store.identity:
+                raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
             kept = Sensor.model_validate(store.identity["sensor"])
             _require_same(store, kept, sensor, chosen)
             learner = cls(sensor=kept, embedding=chosen, readout=readout, false_alarms=false_alarms)
@@ -138,6 +145,9 @@ class TactileLearner:
         felt = validate(stream, self.sensor)
         columns, codes = self._read(felt)
         with self._lock:
+            self._require_open()
+            # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
+            self._memory.statistics.require_room(codes)
             if self._store is None:
                 sequence = self._memory.sequence + 1
             else:
@@ -148,7 +158,7 @@ class TactileLearner:
             self._memory.add(material, felt.key, columns, codes, sequence)
             self._model = None
             if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
-                self._snapshot(later=True)
+                self._snapshot_later()
         return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, self._store is not None)
 
     def predict(self, stream: Readings, *, scene: Sequence[str] | None = None) -> Prediction:
@@ -199,31 +209,40 @@ class TactileLearner:
         with self._lock:
             return self._memory.statistics.digest()
 
-    def _snapshot(self, *, later: bool) -> None:
+    def _require_open(self) -> None:
+        if self._closed:
+            raise StoreClosedError(f"{self!r} is closed: open its path again")
+
+    def _snapshot_later(self) -> None:
         assert self._store is not None
         arrays, attributes = self._memory.to_arrays()
-        commit = self._store.commit_later if later else self._store.commit
-        commit(arrays, upto=self._memory.sequence, attributes=attributes)
+        try:
+            self._store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes)
+        except StoreError as error:
+            # The observation itself is durable; only the next opening has more to replay.
+            logger.warning("%s: no generation could be written: %s", self._store.path, error)
+        self._saved = self._memory.sequence
         del arrays
         give_back_scratch()
-        self._saved = self._memory.sequence
 
     def close(self) -> None:
         """Write what opening again would have to replay, and let go of the files; a second call does nothing.
 
-        Nothing is lost without it: what `observe` acknowledged is in the journal.
+        Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
+        `observe` raises StoreClosedError.
         """
         with self._lock:
-            store, self._store = self._store, None
+            store, self._closed = self._store, True
             if store is None:
                 return
-            self._store = store
             try:
                 if store.mode == "write" and self._memory.sequence > self._saved:
-                    self._snapshot(later=False)
+                    arrays, attributes = self._memory.to_arrays()
+                    self._saved = self._memory.sequence
+                    store.commit(arrays, upto=self._saved, attributes=attributes)
             finally:
-                self._store = None
                 store.close()
+                give_back_scratch()
 
     def __enter__(self) -> Self:
         return self
@@ -274,6 +293,13 @@ def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: 
         )
 
 
+def _require_settings(readout: str, false_alarms: float) -> None:
+    if readout not in ("lda", "ridge"):
+        raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
+    if not 0 < false_alarms < 1:
+        raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
+
+
 def _require_name(material: str) -> None:
     if not isinstance(material, str):
         raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
@@ -289,7 +315,8 @@ def _candidates(scene: Sequence[str], names: list[str]) -> list[str]:
     wanted = list(dict.fromkeys(scene))
     if not wanted:
         raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
-    missing = [name for name in wanted if name not in set(names)]
+    felt = set(names)
+    missing = [name for name in wanted if name not in felt]
     if missing:
         raise UnknownMaterialError(
             f"the scene names {missing}, which were never felt; felt were {names if len(names) <= 30 else len(names)}"

@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.windows import extent, scored, stages
@@ -45,7 +46,15 @@ class Memory:
         self.sequence = sequence
 
     def replay(self, record: Record) -> None:
-        """Add the observation of a journal row, without embedding anything again."""
+        """Add the observation of a journal row, without embedding anything again.
+
+        Raises MismatchError for a row of a kind that this version does not know.
+        """
+        if record.kind != OBSERVE:
+            raise MismatchError(
+                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows {OBSERVE!r} only. "
+                "Open the memory with the version that wrote it, or a newer one"
+            )
         columns = cast(int, record.attributes["columns"])
         self.add(record.label, record.key, columns, unpack_codes(record.arrays), record.sequence)
 

@@ -33,7 +33,8 @@ class Prediction:
     probability: that of `material`, given that it is one of the candidates; calibrated on touches held out.
     ranking: every candidate with its probability, likeliest first; equal ones in alphabetical order.
     novelty: how unlike anything felt: in standard deviations above what known materials give when held out; more
-        is newer. Infinite where nothing was ever felt.
+        is newer; with a scene, than its materials. Infinite where nothing was ever felt; 0 where one material only was,
+        for then there is nothing to be told apart from.
     known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
         then `material` is only what comes nearest.
     seconds: how much touch the answer rests on.

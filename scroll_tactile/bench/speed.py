@@ -130,7 +130,8 @@ def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
     scene = Scene(sensor=sensors.BIOTAC, seed=seed)
     stream = np.array(scene.touch(scene.materials[0], 99).readings)
     with tempfile.TemporaryDirectory() as folder:
-        small, large = (_filled(Path(folder) / str(size), scene, size, seed) for size in (1000, observations))
+        small = _filled(Path(folder) / "small", scene, 1000, seed)
+        large = _filled(Path(folder) / "large", scene, observations, seed)
         with small, large:
             calls: dict[str, Callable[[], object]] = {
                 "observe, small": lambda: small.observe("new", stream),

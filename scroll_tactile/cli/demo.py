@@ -26,6 +26,9 @@ def demo(
     seed: Annotated[int, typer.Option(help="Seed of the simulated materials.")] = 0,
     plot: Annotated[Path | None, typer.Option(help="Draw which material was taken for which into this PNG.")] = None,
     sensor: Annotated[str, typer.Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
+    features: Annotated[
+        int, typer.Option(min=64, help="Features of the embedding: fewer than the usual 1008, which take longer.")
+    ] = 504,
     materials: Annotated[int, typer.Option(hidden=True, min=2, max=20)] = 20,
     touches: Annotated[int, typer.Option(hidden=True, min=1)] = 6,
     held_out: Annotated[int, typer.Option(hidden=True, min=1)] = 4,
@@ -36,11 +39,19 @@ def demo(
     about materials it has never met, and about the first 0.3 s of a touch. No data is needed, and nothing is kept
     unless you give --memory.
     """
-    task = Demo(read_sensor(sensor), seed, materials=materials, touches=touches, held_out=held_out, folder=memory)
+    task = Demo(
+        read_sensor(sensor),
+        seed,
+        materials=materials,
+        touches=touches,
+        held_out=held_out,
+        features=features,
+        folder=memory,
+    )
     _require_folder(plot)
     say(
         f"[bold]Simulated[/] {task.sensor.name} touches, seed {seed}: the names are only names, and nothing here is a "
-        f"result.\nEach material is learned from {touches} touches and tested on {held_out} others."
+        f"result.\nEach material is learned from {touches} touches and tested on {held_out} others; {features} features."
     )
     table = Table("#", "learned", "its own touches", "all materials so far", title="accuracy on touches never felt")
     with Live(table, console=console(), refresh_per_second=10) as live:

@@ -11,11 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scroll_tactile.cli.terminal import console, percent, say, verdict
-from scroll_tactile.errors import InputError
-from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines import passes
 from scroll_tactile.pipelines.files import read_sensor, read_stream
-from store import NotAStoreError
+from scroll_tactile.pipelines.memories import open_memory
 
 __all__ = ["inspect", "observe", "predict"]
 
@@ -40,13 +38,7 @@ def observe(
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     readings = read_stream(file)  # before a memory is made for a file that cannot be read
     chosen = None if sensor is None else read_sensor(sensor)
-    try:
-        learner = TactileLearner.open(memory, sensor=chosen)
-    except NotAStoreError as error:
-        if chosen is not None or memory.is_file():
-            raise
-        raise InputError(f"{error}. To make a new memory, say whose readings these are: --sensor") from error
-    with learner:
+    with open_memory(memory, sensor=chosen) as learner:
         receipt = passes.observe(learner, material, readings)
         felt = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
@@ -65,7 +57,7 @@ def predict(
     """Say what a touch in a file feels like; the memory stays as it is."""
     candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
     readings = read_stream(file)
-    with TactileLearner.open(memory, mode="read") as learner:
+    with open_memory(memory, mode="read") as learner:
         prediction = learner.predict(readings, scene=candidates)
     if as_json:
         infinite = prediction.novelty == float("inf")  # JSON has no infinity
@@ -86,7 +78,7 @@ def predict(
 
 def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Show what a memory holds: materials with their counts, sensor, embedding, digest and size on disk."""
-    with TactileLearner.open(memory, mode="read") as learner:
+    with open_memory(memory, mode="read") as learner:
         materials, digest, sensor, embedding = learner.materials, learner.digest(), learner.sensor, learner.embedding
     size = sum(file.stat().st_size for file in memory.rglob("*") if file.is_file())
     if as_json:

@@ -18,6 +18,7 @@ from scroll_tactile.cli.terminal import console, percent, progress_bar, say, wri
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.passes import one_blas_thread
 from scroll_tactile.pipelines.replay import FIGURES, PUBLISHED, Replay, subset, summary
 from scroll_tactile.plots import available, confusion_counts, draw
 
@@ -90,7 +91,7 @@ def replay(
     for file in (json, plot):
         if file is not None and not file.absolute().parent.is_dir():
             raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
-    with progress_bar() as progress:
+    with one_blas_thread(), progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
         if materials < 20:

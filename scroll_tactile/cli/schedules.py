@@ -14,7 +14,7 @@ from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.files import read_sensor
-from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.passes import Labelled, one_blas_thread
 from scroll_tactile.pipelines.schedules import Trial, try_schedules
 from scroll_tactile.sensors import Sensor
 
@@ -32,6 +32,7 @@ def schedules(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the schedules and of the simulated touches.")] = 0,
     touches: Annotated[int, typer.Option(min=1, help="Touches of each material.")] = 6,
     materials: Annotated[int, typer.Option(min=2, max=20, help="How many of the twenty materials.")] = 20,
+    features: Annotated[int, typer.Option(hidden=True, min=64)] = 1008,
 ) -> None:
     """Show that no schedule matters: the same touches give the same memory, to the bit.
 
@@ -41,13 +42,13 @@ def schedules(
     chosen = read_sensor(sensor)
     lessons, probes = _touches(data, chosen, touches, materials, seed)
     done: list[Trial] = []
-    with progress_bar() as progress:
+    with one_blas_thread(), progress_bar() as progress:
 
         def tell(trial: Trial) -> None:
             done.append(trial)
             progress("schedules", len(done), count)
 
-        trials = try_schedules(chosen, lessons, probes, count=count, seed=seed, tell=tell)
+        trials = try_schedules(chosen, lessons, probes, count=count, seed=seed, features=features, tell=tell)
     _show(trials, len(lessons), len(probes), "simulated" if data is None else "real")
 
 

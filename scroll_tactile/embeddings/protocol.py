@@ -56,7 +56,8 @@ def embed_windows(
 
     image: shape (C, T), in [-1, 1]. windows: width in columns → first columns. Returns width → features of
     shape (number of windows, d), where row i equals `embedding.embed(image[:, start_i : start_i + width])`
-    to the bit. The only window of an image may be wider than the image: it is read as far as it goes. An embedding with an `embed_windows(image, windows)` of its own is asked for all at once.
+    to the bit. A window that begins at 0 may be wider than the image: it is read as far as it goes. An embedding
+    with an `embed_windows(image, windows)` of its own is asked for all at once, and told the width there too.
     """
     together = getattr(embedding, "embed_windows", None)
     if together is not None:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.passes import Answers, Labelled, ask, observe_all
+from scroll_tactile.pipelines.passes import Answers, Labelled, ask, observe_all, one_blas_thread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.prediction import Prediction
 from scroll_tactile.sensors import Sensor
@@ -53,7 +54,8 @@ class Demo:
     """A demonstration: a sensor, a seed, and how many materials and touches.
 
     sensor: any but a camera. seed: of the scene. materials: how many, at most twenty. touches: learned of each.
-    held_out: touches of each that are only asked about. folder: where the memory is kept, None for nowhere.
+    held_out: touches of each that are only asked about. features: of the embedding; the usual 1008 take three times
+    as long to fit a readout to, and here twenty are fitted. folder: where the memory is kept, None for nowhere.
     """
 
     sensor: Sensor
@@ -61,6 +63,7 @@ class Demo:
     materials: int = 20
     touches: int = 6
     held_out: int = 4
+    features: int = 504
     folder: Path | None = None
     scene: Scene = field(init=False, repr=False)
 
@@ -75,15 +78,21 @@ class Demo:
         Raises InputError for a folder of something else, and what the learner and the store raise.
         """
         plan: dict[str, Any] = {"run": "demo", "sensor": self.sensor.model_dump(mode="json"), "seed": self.seed}
-        plan |= {"materials": self.materials, "touches": self.touches, "held_out": self.held_out}
+        plan |= {
+            "materials": self.materials,
+            "touches": self.touches,
+            "held_out": self.held_out,
+            "features": self.features,
+        }
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
-        with self._open() as learner:
+        with one_blas_thread(), self._open() as learner:
             return self._learn(learner, notes, tell)
 
     def _open(self) -> TactileLearner:
+        embedding = Kernels(dimension=self.features)
         if self.folder is None:
-            return TactileLearner(sensor=self.sensor)
-        return TactileLearner.open(self.folder / "memory", sensor=self.sensor)
+            return TactileLearner(sensor=self.sensor, embedding=embedding)
+        return TactileLearner.open(self.folder / "memory", sensor=self.sensor, embedding=embedding)
 
     def _learn(self, learner: TactileLearner, notes: RunFile, tell: Callable[[Step], object]) -> Outcome:
         steps: list[Step] = []

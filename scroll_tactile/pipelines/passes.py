@@ -6,11 +6,12 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
@@ -18,7 +19,7 @@ from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.streams import Stream
 
-__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all"]
+__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all", "one_blas_thread"]
 
 Labelled = tuple[str, Stream]
 """A material and how it felt."""
@@ -99,6 +100,12 @@ def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Call
         observe(learner, name, stream)
         each()
     return len(remaining)
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """Keep BLAS to one thread while this is entered: two, on busy cores, made fitting a readout twice as slow."""
+    limits: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
+    return limits
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.passes import Labelled, observe
@@ -79,13 +80,15 @@ def try_schedules(
     *,
     count: int = 20,
     seed: int = 0,
+    features: int = 1008,
     tell: Callable[[Trial], object] = lambda trial: None,
 ) -> list[Trial]:
     """Learn the same touches by `count` random schedules, on disk; the first is the plain one, in memory.
 
     Each draws an order, a batching, where the memory is closed and opened again, and, every other time, which
     touches a second learner feels, whose statistics are added in the end. All should have one digest, and give the
-    probes' predictions of the first, to the bit. `tell` hears of each trial when it is done.
+    probes' predictions of the first, to the bit. `tell` hears of each trial when it is done. features: of the
+    embedding.
 
     Raises InputError for a count below 1 or no touches.
     """
@@ -93,7 +96,8 @@ def try_schedules(
         raise InputError(
             f"expected at least one schedule, touch and probe; came {count}, {len(touches)} and {len(probes)}"
         )
-    plain = TactileLearner(sensor=sensor)
+    embedding = Kernels(dimension=features)
+    plain = TactileLearner(sensor=sensor, embedding=embedding)
     for name, stream in touches:
         observe(plain, name, stream)
     expected = _predictions(plain, probes)
@@ -102,13 +106,16 @@ def try_schedules(
     for number in range(1, count):
         random = np.random.default_rng([seed, number])
         with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
-            trials.append(_try(sensor, touches, probes, expected, random, Path(folder), split=number % 2 == 0))
+            trials.append(
+                _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
+            )
         tell(trials[-1])
     return trials
 
 
 def _try(
     sensor: Sensor,
+    embedding: Kernels,
     touches: Sequence[Labelled],
     probes: Sequence[Labelled],
     expected: list[Prediction],
@@ -126,25 +133,33 @@ def _try(
         learners = []
         for at, part in enumerate(parts):
             path = folder / str(at)
-            reopened += _learn(path, sensor, [touches[place] for place in part], set(cuts.tolist()), probes[0], random)
-            learners.append(opened.enter_context(TactileLearner.open(path, mode="read")))
-        joint = learners[0] if len(learners) == 1 else _joined(sensor, learners)
+            reopened += _learn(
+                path, sensor, embedding, [touches[place] for place in part], set(cuts.tolist()), probes[0], random
+            )
+            learners.append(opened.enter_context(TactileLearner.open(path, embedding=embedding, mode="read")))
+        joint = learners[0] if len(learners) == 1 else _joined(learners)
         same = _predictions(joint, probes) == expected
         return Trial(len(cuts) + 1, reopened, len(second), joint.digest(), same)
 
 
 def _learn(
-    path: Path, sensor: Sensor, touches: list[Labelled], cuts: set[int], probe: Labelled, random: np.random.Generator
+    path: Path,
+    sensor: Sensor,
+    embedding: Kernels,
+    touches: list[Labelled],
+    cuts: set[int],
+    probe: Labelled,
+    random: np.random.Generator,
 ) -> int:
     """Fill a memory on disk; after each batch it is opened anew, or asked; returns how often it was opened anew."""
     reopened = 0
-    learner = TactileLearner.open(path, sensor=sensor)
+    learner = TactileLearner.open(path, sensor=sensor, embedding=embedding)
     try:
         for at, (name, stream) in enumerate(touches):
             observe(learner, name, stream)
             if at in cuts and random.random() < 0.5:
                 learner.close()
-                learner = TactileLearner.open(path)
+                learner = TactileLearner.open(path, embedding=embedding)
                 reopened += 1
             elif at in cuts:
                 learner.predict(probe[1])
@@ -153,9 +168,9 @@ def _learn(
     return reopened
 
 
-def _joined(sensor: Sensor, learners: Sequence[TactileLearner]) -> TactileLearner:
+def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
     """One learner, in memory, that has felt what all of these have."""
-    joint = TactileLearner(sensor=sensor)
+    joint = TactileLearner(sensor=learners[0].sensor, embedding=learners[0].embedding)
     memory = joint._memory
     for learner in learners:
         memory.statistics = memory.statistics + learner._memory.statistics

@@ -72,20 +72,21 @@ class Readout:
     """A classifier of one scale.
 
     penalty: λ, as a share of a scaled feature's variance.
-    weights: W in codes, shape (d, C); z = x @ weights − offset for codes x.
+    center: mean of all rows, in codes, shape (d,).
+    weights: W in codes, shape (d, C); z = (x − center) @ weights for codes x.
     gram: G, shape (C, C). ridge: H, shape (C, C). shares: p_y, shape (C,).
     """
 
     penalty: float
+    center: FloatArray
     weights: FloatArray
-    offset: FloatArray
     gram: FloatArray
     ridge: FloatArray
     shares: FloatArray
 
     def project(self, codes: npt.NDArray[np.floating]) -> FloatArray:
         """z of codes of shape (…, d), shape (…, C): all that any answer needs."""
-        z: FloatArray = codes @ self.weights - self.offset
+        z: FloatArray = (codes - self.center) @ self.weights
         return z
 
     def scores(self, z: FloatArray, kind: ReadoutName) -> FloatArray:
@@ -122,4 +123,4 @@ def fit_readout(task: Task, penalty: float) -> Readout:
     gram = (gram + gram.T) / 2
     weights = solved / task.scale[:, None]
     ridge = np.linalg.inv(np.diag(1.0 / task.shares) + gram)
-    return Readout(penalty, weights, task.center @ weights, gram, (ridge + ridge.T) / 2, task.shares)
+    return Readout(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares)

@@ -114,7 +114,10 @@ def _loss(trial: _Trial, readout: Readout, kind: ReadoutName) -> float:
 
 
 def _squared_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
-    """Σ over held-out rows of ‖t − s(x)‖², exactly: that of the class means, and the spread about them."""
+    """Σ over held-out rows of ‖t − s(x)‖²: that of the class means, and the spread about them.
+
+    Exact where the other folds know every material of this one; where not, the spread is that of all its rows.
+    """
     missed = np.eye(len(at)) - readout.scores(at, "ridge")
     return float(trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge))
 

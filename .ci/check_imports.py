@@ -31,7 +31,7 @@ RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 
 def room_of(module: str) -> str:
     """The first name below the package: scroll_tactile.ridge.codes → ridge."""
-    return (module.split(".") + [""])[1]
+    return [*module.split("."), ""][1]
 
 
 def imported(tree: ast.Module) -> list[tuple[int, str]]:

@@ -173,10 +173,11 @@ class TactileLearner:
         with self._lock:
             if self._model is None:
                 self._model = Model.of(self._memory, self.readout)
-            model = self._model
+            model, longest = self._model, self._memory.statistics.longest
         candidates = model.names if scene is None else _candidates(scene, model.names)
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
+        felt = self._as_far_as_learned(felt, longest)
         columns, codes = self._read(felt)
         places = scored(extent(columns, self._scales), columns)
         means = [codes[width][chosen].mean(axis=0) for width, chosen in places.items()]
@@ -187,6 +188,15 @@ class TactileLearner:
         )
         known = bool(judgement.novelty <= judgement.calibration.threshold(self.false_alarms))
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds)
+
+    def _as_far_as_learned(self, felt: Stream, longest: int) -> Stream:
+        """The part of a touch that lies within the longest one learned, of so many columns.
+
+        What comes later was never felt of any material, and the later part of a slide differs: learned from 2 s of
+        BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
+        """
+        frame = self._scales[0] if self.sensor.camera else 1
+        return felt.first(longest // frame / self.sensor.rate)
 
     def _read(self, felt: Stream) -> tuple[int, dict[int, npt.NDArray[np.int32]]]:
         """The columns of a touch's tactile image, and the codes of its windows by scale."""

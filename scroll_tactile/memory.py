@@ -38,7 +38,7 @@ class Memory:
 
         Raises CapacityError before anything is added.
         """
-        self.statistics.add(material, fold_of(key), codes)
+        self.statistics.add(material, fold_of(key), codes, columns)
         if self.pool.wants(material, key):
             read = extent(columns, self.statistics.scales)
             scored_at = [scored(read, length) for length in stages(columns, self.statistics.scales)]
@@ -52,8 +52,8 @@ class Memory:
         """
         if record.kind != OBSERVE:
             raise MismatchError(
-                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows {OBSERVE!r} only. "
-                "Open the memory with the version that wrote it, or a newer one"
+                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows {OBSERVE!r} "
+                "only. Open the memory with the version that wrote it, or a newer one"
             )
         columns = cast(int, record.attributes["columns"])
         self.add(record.label, record.key, columns, unpack_codes(record.arrays), record.sequence)

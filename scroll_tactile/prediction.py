@@ -37,7 +37,8 @@ class Prediction:
         for then there is nothing to be told apart from.
     known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
         then `material` is only what comes nearest.
-    seconds: how much touch the answer rests on.
+    seconds: how much touch the answer rests on: the stream's length, or that of the longest touch learned where the
+        stream is longer, for nothing was ever felt of how a material goes on after that.
     """
 
     material: str | None

@@ -148,7 +148,7 @@ def test_the_order_in_which_materials_were_felt_changes_no_bit():
     ours, turned = select(statistics_of(felt), SCALE, "lda"), select(statistics_of(felt[::-1]), SCALE, "lda")
     assert ours.losses == turned.losses
     assert ours.readout.weights.tobytes() == turned.readout.weights.tobytes()
-    assert ours.readout.offset.tobytes() == turned.readout.offset.tobytes()
+    assert ours.readout.center.tobytes() == turned.readout.center.tobytes()
 
 
 def test_the_statistics_are_left_as_they_were():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -9,11 +10,11 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
+from scroll_tactile import plots
 from scroll_tactile.cli.terminal import confusion_text, console, percent, say, verdict
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.demo import Demo, Outcome, Step
+from scroll_tactile.pipelines.demo import Demo, Outcome
 from scroll_tactile.pipelines.files import read_sensor
-from scroll_tactile.plots import available, confusion_counts, draw
 
 __all__ = ["demo"]
 
@@ -51,16 +52,17 @@ def demo(
     _require_folder(plot)
     say(
         f"[bold]Simulated[/] {task.sensor.name} touches, seed {seed}: the names are only names, and nothing here is a "
-        f"result.\nEach material is learned from {touches} touches and tested on {held_out} others; {features} features."
+        f"result.\nEach material is learned from {touches} touches and tested on {held_out} others, "
+        f"with {features} features."
     )
     table = Table("#", "learned", "its own touches", "all materials so far", title="accuracy on touches never felt")
-    with Live(table, console=console(), refresh_per_second=10) as live:
-
-        def show(step: Step) -> None:
-            table.add_row(str(len(table.rows) + 1), step.material, percent(step.own), percent(step.all))
-            live.refresh()
-
-        outcome = task.run(show)
+    screen = console()
+    with Live(table, console=screen, refresh_per_second=10) if screen.is_terminal else nullcontext():
+        outcome = task.run(
+            lambda step: table.add_row(str(len(table.rows) + 1), step.material, percent(step.own), percent(step.all))
+        )
+    if not screen.is_terminal:
+        screen.print(table)
     _report(task, outcome, plot)
 
 
@@ -91,11 +93,11 @@ def _report(task: Demo, outcome: Outcome, plot: Path | None) -> None:
 def _show_confusions(task: Demo, outcome: Outcome, plot: Path | None) -> None:
     names = [step.material for step in outcome.steps]
     confusions = outcome.answers.confusions()
-    counts = confusion_counts(names, [task.held_out] * len(names), confusions)
-    if plot is not None and available():
+    counts = plots.confusion_counts(names, [task.held_out] * len(names), confusions)
+    if plot is not None and plots.available():
         curve = [(at + 1, step.all) for at, step in enumerate(outcome.steps)]
         title = f"Simulated {task.sensor.name}, not a result"
-        draw(plot, names, counts, title=title, curves=[curve])
+        plots.draw(plot, names, counts, title=title, curves=[curve])
         say(f"plot: {plot}")
     else:
         if plot is not None:

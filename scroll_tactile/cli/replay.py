@@ -14,13 +14,12 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from scroll_tactile import plots
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.passes import one_blas_thread
 from scroll_tactile.pipelines.replay import FIGURES, PUBLISHED, Replay, subset, summary
-from scroll_tactile.plots import available, confusion_counts, draw
 
 __all__ = ["replay"]
 
@@ -91,12 +90,12 @@ def replay(
     for file in (json, plot):
         if file is not None and not file.absolute().parent.is_dir():
             raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
-    with one_blas_thread(), progress_bar() as progress:
+    with progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
         if materials < 20:
             recordings = subset(recordings, materials)
-        task = Replay(recordings, schedule.value, seed, readout.value, blocked, curve, novelty, memory)
+        task = Replay(recordings, schedule.value, seed, readout.value, blocked, curve, novelty, folder=memory)
         chosen = _parse(folds, recordings)
         results: list[dict[str, Any]] = []
         for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
@@ -121,13 +120,14 @@ def _parse(folds: str, recordings: Recordings) -> list[int]:
 
 def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], *, compared: bool) -> None:
     means = summary(results)
-    table = Table("figure", "mean", "sd over folds", title=f"{recordings.name}, {len(results)} folds, one pass")
+    count = "1 fold" if len(results) == 1 else f"{len(results)} folds"
+    table = Table("figure", "mean", "sd over folds", title=f"{recordings.name}, one pass, {count}")
     for name in FIGURES:
         if name in means:
             mean, spread = means[name]["mean"], means[name]["sd"]
             areas = name in ("novelty_auroc", "calibration_error")
             shown = (f"{mean:.4f}", f"{spread:.4f}") if areas else (percent(mean), percent(spread))
-            table.add_row(_LABELS[name], *shown)
+            table.add_row(_LABELS[name], shown[0], shown[1] if len(results) > 1 else "")
     if compared and recordings.name in PUBLISHED:
         ridge, tuned = PUBLISHED[recordings.name]
         table.add_section()
@@ -179,7 +179,7 @@ def _result(command: str, task: Replay, results: Sequence[Mapping[str, Any]]) ->
 
 
 def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any]]) -> None:
-    if not available():
+    if not plots.available():
         say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
         return
     names = list(dict.fromkeys(recordings.materials))
@@ -189,6 +189,6 @@ def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any
         sum(name == other and fold in folds for other, fold in zip(recordings.materials, recordings.fold, strict=True))
         for name in names
     ]
-    counts = confusion_counts(names, tested, confusions)
-    draw(plot, names, counts, title=recordings.name, curves=[result["curve"] for result in results])
+    counts = plots.confusion_counts(names, tested, confusions)
+    plots.draw(plot, names, counts, title=recordings.name, curves=[result["curve"] for result in results])
     say(f"plot: {plot}")

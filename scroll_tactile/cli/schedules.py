@@ -14,7 +14,7 @@ from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.files import read_sensor
-from scroll_tactile.pipelines.passes import Labelled, one_blas_thread
+from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.schedules import Trial, try_schedules
 from scroll_tactile.sensors import Sensor
 
@@ -42,7 +42,7 @@ def schedules(
     chosen = read_sensor(sensor)
     lessons, probes = _touches(data, chosen, touches, materials, seed)
     done: list[Trial] = []
-    with one_blas_thread(), progress_bar() as progress:
+    with progress_bar() as progress:
 
         def tell(trial: Trial) -> None:
             done.append(trial)
@@ -75,14 +75,14 @@ def _touches(
 
 
 def _show(trials: Sequence[Trial], touches: int, probes: int, kind: str) -> None:
-    table = Table("schedule", "batches", "opened again", "felt by a second learner", "digest", "predictions")
+    table = Table("schedule", "batches", "reopened", "second learner", "digest", "predictions")
     for at, trial in enumerate(trials):
         table.add_row(
             "plain" if at == 0 else str(at),
             str(trial.batches),
             str(trial.reopened),
             str(trial.split),
-            trial.digest[:12],
+            trial.digest[:10],
             "same" if trial.same_predictions else "[red]differ[/]",
         )
     console().print(table)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import auroc, calibration_error, mean_and_spread
-from scroll_tactile.pipelines.passes import Answers, Labelled, ask, missing, observe
+from scroll_tactile.pipelines.passes import Answers, Labelled, ask, missing, observe, one_blas_thread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.schedules import ScheduleName, arrange
 from scroll_tactile.ridge.readouts import ReadoutName
@@ -44,7 +45,7 @@ class Replay:
     blocked: folds of successive repetitions, instead of the published or drawn ones.
     curve: measure the accuracy over the materials met so far after every so many twentieths of the pass; 0: never.
     novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
-    folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
+    features: of the embedding. folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
 
     Raises InputError for a negative curve, and DatasetError where there are no blocked folds.
     """
@@ -56,6 +57,7 @@ class Replay:
     blocked: bool = False
     curve: int = 0
     novelty: bool = False
+    features: int = 1008
     folder: Path | None = None
 
     def __post_init__(self) -> None:
@@ -65,7 +67,7 @@ class Replay:
     @property
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
-        options = ("schedule", "seed", "readout", "blocked", "curve", "novelty")
+        options = ("schedule", "seed", "readout", "blocked", "curve", "novelty", "features")
         size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
         return {"run": "replay", "dataset": self.recordings.name, **size} | {
             name: getattr(self, name) for name in options
@@ -84,7 +86,8 @@ class Replay:
         for fold in folds:
             name = f"fold-{fold}"
             if "digest" not in notes.notes.get(name, {}):
-                figures = _Fold(self, fold, places == fold, progress).run(notes)
+                with one_blas_thread():
+                    figures = _Fold(self, fold, places == fold, progress).run(notes)
                 notes.note(name, figures)
             yield notes.notes[name]
 
@@ -125,9 +128,10 @@ class _Fold:
 
     def _learner(self, path: Path | None = None) -> TactileLearner:
         sensor, readout = self.replay.recordings.sensor, self.replay.readout
+        embedding = Kernels(dimension=self.replay.features)
         if path is None:
-            return TactileLearner(sensor=sensor, readout=readout)
-        return TactileLearner.open(path, sensor=sensor, readout=readout)
+            return TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
+        return TactileLearner.open(path, sensor=sensor, embedding=embedding, readout=readout)
 
     def _learn(self, learner: TactileLearner, notes: RunFile) -> list[list[float]]:
         """Teach what is missing; returns (materials met, accuracy over them) at each point of the curve."""

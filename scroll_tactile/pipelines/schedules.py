@@ -14,7 +14,7 @@ import numpy as np
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.passes import Labelled, observe
+from scroll_tactile.pipelines.passes import Labelled, observe, one_blas_thread
 from scroll_tactile.prediction import Prediction
 from scroll_tactile.sensors import Sensor
 
@@ -96,20 +96,21 @@ def try_schedules(
         raise InputError(
             f"expected at least one schedule, touch and probe; came {count}, {len(touches)} and {len(probes)}"
         )
-    embedding = Kernels(dimension=features)
-    plain = TactileLearner(sensor=sensor, embedding=embedding)
-    for name, stream in touches:
-        observe(plain, name, stream)
-    expected = _predictions(plain, probes)
-    trials = [Trial(1, 0, 0, plain.digest(), True)]
-    tell(trials[0])
-    for number in range(1, count):
-        random = np.random.default_rng([seed, number])
-        with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
-            trials.append(
-                _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
-            )
-        tell(trials[-1])
+    with one_blas_thread():
+        embedding = Kernels(dimension=features)
+        plain = TactileLearner(sensor=sensor, embedding=embedding)
+        for name, stream in touches:
+            observe(plain, name, stream)
+        expected = _predictions(plain, probes)
+        trials = [Trial(1, 0, 0, plain.digest(), True)]
+        tell(trials[0])
+        for number in range(1, count):
+            random = np.random.default_rng([seed, number])
+            with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
+                trials.append(
+                    _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
+                )
+            tell(trials[-1])
     return trials
 
 

@@ -7,6 +7,7 @@ integers do not depend on order, batching or grouping, so neither does the memor
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,6 +45,7 @@ class Statistics:
         self.scales = tuple(scales)
         self._places: dict[str, int] = {}
         self._observations = np.zeros((0, FOLDS), dtype=np.int64)
+        self._lengths: Counter[int] = Counter()
         self._rows = {scale: np.zeros((0, FOLDS), dtype=np.int64) for scale in self.scales}
         self._sums = {scale: np.zeros((0, FOLDS, dimension), dtype=np.int64) for scale in self.scales}
         self._seconds = {scale: [SecondMoment(dimension) for _ in range(FOLDS)] for scale in self.scales}
@@ -54,8 +56,13 @@ class Statistics:
         counts = self._observations.sum(axis=1)
         return {name: int(counts[at]) for name, at in sorted(self._places.items()) if counts[at]}
 
-    def add(self, material: str, fold: int, codes: Codes) -> None:
-        """Add one observation: for each of its scales the codes of its windows, shape (windows, d).
+    @property
+    def longest(self) -> int:
+        """The columns of the longest touch that is in it, 0 where there is none."""
+        return max(self._lengths, default=0)
+
+    def add(self, material: str, fold: int, codes: Codes, columns: int = 0) -> None:
+        """Add one observation, of so many columns: for each scale the codes of its windows, shape (windows, d).
 
         Raises CapacityError, before anything is added, where a sum would not be exact any more.
         """
@@ -66,6 +73,7 @@ class Statistics:
             self._rows[scale][at, fold] += len(rows)
             self._sums[scale][at, fold] += rows.sum(axis=0, dtype=np.int64)
         self._observations[at, fold] += 1
+        self._lengths[columns] += 1
 
     def require_room(self, codes: Codes) -> None:
         """Raise CapacityError where these codes could not be added: all folds together are summed as well."""
@@ -75,19 +83,22 @@ class Statistics:
     def _total_rows(self, scale: int) -> int:
         return sum(moment.rows for moment in self._seconds[scale])
 
-    def remove(self, material: str, fold: int, codes: Codes) -> None:
+    def remove(self, material: str, fold: int, codes: Codes, columns: int = 0) -> None:
         """Take out one observation that was added: the memory is as if it had never been.
 
         Raises UnknownMaterialError for a material without an observation in this fold.
         """
         at = self._places.get(material)
-        if at is None or not self._observations[at, fold]:
-            raise UnknownMaterialError(f"{material!r} has no observation in fold {fold} that could be taken out")
+        if at is None or not self._observations[at, fold] or not self._lengths[columns]:
+            raise UnknownMaterialError(
+                f"{material!r} has no observation of {columns} columns in fold {fold} that could be taken out"
+            )
         for scale, rows in codes.items():
             self._seconds[scale][fold].remove(rows)
             self._rows[scale][at, fold] -= len(rows)
             self._sums[scale][at, fold] -= rows.sum(axis=0, dtype=np.int64)
         self._observations[at, fold] -= 1
+        self._lengths = +(self._lengths - Counter([columns]))
 
     def _place(self, material: str) -> int:
         at = self._places.get(material)
@@ -139,6 +150,7 @@ class Statistics:
         places = [self._places[name] for name in names]
         digest.update(repr(names).encode())
         digest.update(self._observations[places].astype("<i8").tobytes())
+        digest.update(repr(sorted(self._lengths.items())).encode())
         for scale in self.scales:
             digest.update(self._rows[scale][places].astype("<i8").tobytes())
             digest.update(self._sums[scale][places].astype("<i8").tobytes())
@@ -171,6 +183,8 @@ class Statistics:
         if sign > 0:
             for scale in self.scales:
                 require_room(self._total_rows(scale), other._total_rows(scale))
+        joint._lengths.update(self._lengths)
+        (joint._lengths.update if sign > 0 else joint._lengths.subtract)(other._lengths)
         for part, weight in ((self, 1), (other, sign)):
             for name, at in part._places.items():
                 to = joint._place(name)
@@ -186,11 +200,12 @@ class Statistics:
                 joint._seconds[scale][fold] = SecondMoment.of(packed, rows, self.dimension)
         if sign < 0 and not joint._sound():
             raise InputError("statistics can be taken only out of statistics that contain them")
+        joint._lengths = +joint._lengths
         return joint
 
     def _sound(self) -> bool:
         """Whether no count is negative and nothing is left over where there are no rows."""
-        if (self._observations < 0).any():
+        if (self._observations < 0).any() or min(self._lengths.values(), default=0) < 0:
             return False
         for scale in self.scales:
             rows = self._rows[scale]
@@ -204,7 +219,8 @@ class Statistics:
         """What a store keeps: arrays by name, and the materials in the order of their first axis."""
         names = sorted(self.materials)
         places = [self._places[name] for name in names]
-        arrays: dict[str, npt.NDArray[Any]] = {"observations": self._observations[places]}
+        lengths = np.array(sorted(self._lengths.items()), dtype=np.int64).reshape(-1, 2)
+        arrays: dict[str, npt.NDArray[Any]] = {"observations": self._observations[places], "lengths": lengths}
         for scale in self.scales:
             arrays[f"rows-{scale}"] = self._rows[scale][places]
             arrays[f"sums-{scale}"] = self._sums[scale][places]
@@ -225,6 +241,7 @@ class Statistics:
         statistics = cls(dimension, scales)
         statistics._places = {name: at for at, name in enumerate(names)}
         statistics._observations = arrays["observations"]
+        statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
         for scale in statistics.scales:
             statistics._rows[scale] = arrays[f"rows-{scale}"]
             statistics._sums[scale] = arrays[f"sums-{scale}"]

@@ -13,6 +13,7 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.pipelines.demo import Demo
 from scroll_tactile.pipelines.files import read_sensor, read_stream
+from scroll_tactile.pipelines.memories import open_memory
 from scroll_tactile.pipelines.metrics import accuracy, auroc, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.passes import missing
 from scroll_tactile.pipelines.replay import Replay, subset, summary
@@ -203,6 +204,7 @@ class TestReplay:
         (fold,) = Replay(recordings, curve=4, novelty=True, features=128).run([1])
         assert (fold["fold"], fold["learned"], fold["tested"]) == (1, 25, 25)
         assert fold["equals_offline"]
+        assert sum(fold["tested_of"].values()) == 25
         assert [met for met, _ in fold["curve"]] == [1, 2, 3, 4, 5]
         assert fold["curve"][-1][1] == fold["accuracy"] > 0.9
         assert 0 <= fold["calibration_error"] <= 1
@@ -219,7 +221,7 @@ class TestReplay:
 
         with pytest.raises(KeyboardInterrupt):
             list(task.run([0, 1], stop))
-        with TactileLearner.open(tmp_path / "kept" / "fold-1", mode="read") as learner:
+        with open_memory(tmp_path / "kept" / "fold-1", mode="read") as learner:
             assert sum(learner.materials.values()) == 16
         resumed = list(task.run([0, 1]))
         for one, other in zip(whole, resumed, strict=True):
@@ -256,8 +258,6 @@ def test_confusion_counts() -> None:
 
 
 def test_kernels_of_another_size_are_found_again(tmp_path: Path) -> None:
-    from scroll_tactile.pipelines.memories import open_memory
-
     with TactileLearner.open(tmp_path / "m", sensor=sensors.BIOTAC, embedding=Kernels(dimension=64)) as learner:
         learner.observe("silk", Scene(sensors.BIOTAC).touch("silk", 0))
         digest = learner.digest()

@@ -184,11 +184,7 @@ def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any
         return
     names = list(dict.fromkeys(recordings.materials))
     confusions = [(truth, said, count) for (truth, said), count in _confusions(results).items()]
-    folds = {result["fold"] for result in results}
-    tested = [
-        sum(name == other and fold in folds for other, fold in zip(recordings.materials, recordings.fold, strict=True))
-        for name in names
-    ]
+    tested = [sum(result["tested_of"].get(name, 0) for result in results) for name in names]
     counts = plots.confusion_counts(names, tested, confusions)
     plots.draw(plot, names, counts, title=recordings.name, curves=[result["curve"] for result in results])
     say(f"plot: {plot}")

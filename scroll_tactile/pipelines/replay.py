@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,8 @@ class Replay:
     blocked: folds of successive repetitions, instead of the published or drawn ones.
     curve: measure the accuracy over the materials met so far after every so many twentieths of the pass; 0: never.
     novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
-    features: of the embedding. folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
+    features: of the embedding.
+    folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
 
     Raises InputError for a negative curve, and DatasetError where there are no blocked folds.
     """
@@ -119,6 +121,7 @@ class _Fold:
             "fold": self.number,
             "learned": len(self.lessons),
             "tested": len(self.exam),
+            "tested_of": dict(Counter(name for name, _ in self.exam)),
             **{name: figures[name] for name in (*FIGURES, "confusions")},
             "curve": curve,
             "equals_offline": self._offline() == digest,

@@ -20,6 +20,7 @@ from scroll_tactile.errors import (
     InputError,
     MaterialError,
     MismatchError,
+    ScrollTactileError,
     SensorMismatchError,
     UnknownMaterialError,
 )
@@ -81,6 +82,7 @@ class TactileLearner:
         self._store: Store | None = None
         self._saved = 0
         self._closed = False
+        self._whole = True
         self._model: Model | None = None
         self._lock = threading.RLock()
 
@@ -131,7 +133,7 @@ class TactileLearner:
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order."""
         with self._lock:
-            return self._memory.statistics.materials
+            return self._sound().statistics.materials
 
     def observe(self, material: str, stream: Readings) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
@@ -145,17 +147,11 @@ class TactileLearner:
         felt = validate(stream, self.sensor)
         columns, codes = self._read(felt)
         with self._lock:
-            self._require_open()
+            if self._closed:
+                raise StoreClosedError(f"{self!r} is closed: open its path again")
             # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
-            self._memory.statistics.require_room(codes)
-            if self._store is None:
-                sequence = self._memory.sequence + 1
-            else:
-                attributes = {"columns": columns}
-                arrays = pack_codes(codes)
-                record = self._store.append(OBSERVE, material, felt.key, attributes=attributes, arrays=arrays)
-                sequence = record.sequence
-            self._memory.add(material, felt.key, columns, codes, sequence)
+            self._sound().statistics.require_room(codes)
+            sequence = self._keep(material, felt.key, columns, codes)
             self._model = None
             if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
                 self._snapshot_later()
@@ -171,9 +167,10 @@ class TactileLearner:
         """
         felt = validate(stream, self.sensor)
         with self._lock:
+            memory = self._sound()
             if self._model is None:
-                self._model = Model.of(self._memory, self.readout)
-            model, longest = self._model, self._memory.statistics.longest
+                self._model = Model.of(memory, self.readout)
+            model, longest = self._model, memory.statistics.longest
         candidates = model.names if scene is None else _candidates(scene, model.names)
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
@@ -217,11 +214,38 @@ class TactileLearner:
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
         with self._lock:
-            return self._memory.statistics.digest()
+            return self._sound().statistics.digest()
 
-    def _require_open(self) -> None:
-        if self._closed:
-            raise StoreClosedError(f"{self!r} is closed: open its path again")
+    def _keep(self, material: str, key: bytes, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> int:
+        """Write an observation down, then add it; its sequence."""
+        sequence = self._memory.sequence + 1
+        self._whole = False
+        if self._store is not None:
+            try:
+                arrays = pack_codes(codes)
+                record = self._store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=arrays)
+            except StoreError:
+                self._whole = True  # the journal refused it, and the memory never had it
+                raise
+            sequence = record.sequence
+        self._memory.add(material, key, columns, codes, sequence)
+        self._whole = True
+        return sequence
+
+    def _sound(self) -> Memory:
+        """The memory; read anew from the store where ctrl-C, say, came while an observation was being added.
+
+        Raises ScrollTactileError where there is no store to read it from.
+        """
+        if not self._whole:
+            if self._store is None:
+                raise ScrollTactileError(
+                    "an observation was interrupted while it was added, and a memory without a path has nothing to go "
+                    "back to: make a new one"
+                )
+            self._memory = Memory.load(self._store, self.embedding.dimension, self._scales)
+            self._model, self._whole = None, True
+        return self._memory
 
     def _snapshot_later(self) -> None:
         assert self._store is not None
@@ -246,7 +270,8 @@ class TactileLearner:
             if store is None:
                 return
             try:
-                if store.mode == "write" and self._memory.sequence > self._saved:
+                # Half an observation is never saved: the journal has the whole of it, or nothing.
+                if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
                     arrays, attributes = self._memory.to_arrays()
                     self._saved = self._memory.sequence
                     store.commit(arrays, upto=self._saved, attributes=attributes)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.memory import Memory, give_back_scratch
 from scroll_tactile.ridge.calibration import Calibration, calibrate
+from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.selection import Selection, select
 from scroll_tactile.windows import fitting, milestones
@@ -45,9 +46,10 @@ class Model:
         statistics = memory.statistics
         scales = statistics.scales
         stages = [fitting(length, scales) for length in milestones(scales)]
-        chosen = {scale: select(statistics, scale, kind) for scale in scales}
-        selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
-        calibrations = calibrate(memory.pool, stages, selections, kind)
+        with one_thread():
+            chosen = {scale: select(statistics, scale, kind) for scale in scales}
+            selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
+            calibrations = calibrate(memory.pool, stages, selections, kind)
         give_back_scratch()
         return cls(kind, list(statistics.materials), scales, stages, selections, calibrations)
 

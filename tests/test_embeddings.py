@@ -198,8 +198,10 @@ def test_different_images_give_different_features():
 def test_the_seed_decides_the_features_and_the_fingerprint():
     prints = {Kernels(seed, dimension).fingerprint for seed in (0, 1) for dimension in (64, 65)}
     assert len(prints) == 4
-    assert Kernels(0, 64).fingerprint in prints
-    assert not np.array_equal(Kernels(1, 64).embed(image(3, 50)), Kernels(0, 64).embed(image(3, 50)))
+    assert Kernels(seed=0, dimension=64).fingerprint in prints
+    assert not np.array_equal(
+        Kernels(seed=1, dimension=64).embed(image(3, 50)), Kernels(seed=0, dimension=64).embed(image(3, 50))
+    )
 
 
 CHILD = """

@@ -55,7 +55,7 @@ class Kernels:
     name = "kernels"
     bound = 1.0
 
-    def __init__(self, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
+    def __init__(self, *, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
         if not 64 <= dimension <= MOST_FEATURES:
             raise ValueError(f"dimension must lie between 64 and {MOST_FEATURES}; came {dimension}")
         if seed < 0:

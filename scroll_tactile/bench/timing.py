@@ -14,6 +14,9 @@ import numpy as np
 __all__ = ["Timing", "circumstances", "take_turns"]
 
 
+IN_A_ROW = 5
+
+
 @dataclass(frozen=True)
 class Timing:
     """Seconds a call: the least, and the median, over the rounds."""
@@ -23,16 +26,20 @@ class Timing:
 
 
 def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, warm_up: int = 3) -> dict[str, Timing]:
-    """Time calls by name; in every round each is called once, so that a slow moment of the machine hits all."""
+    """Time calls by name; in every round each is called a few times, so that a slow moment of the machine hits all.
+
+    A few, not once: the first call after another's finds its data pushed out of the processor's cache.
+    """
     for call in calls.values():
         for _ in range(warm_up):
             call()
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            begin = time.perf_counter()
-            call()
-            seconds[name].append(time.perf_counter() - begin)
+            for _ in range(IN_A_ROW):
+                begin = time.perf_counter()
+                call()
+                seconds[name].append(time.perf_counter() - begin)
     return {name: Timing(min(taken), float(np.median(taken))) for name, taken in seconds.items()}
 
 

@@ -196,7 +196,7 @@ def test_different_images_give_different_features():
 
 
 def test_the_seed_decides_the_features_and_the_fingerprint():
-    prints = {Kernels(seed, dimension).fingerprint for seed in (0, 1) for dimension in (64, 65)}
+    prints = {Kernels(seed=seed, dimension=dimension).fingerprint for seed in (0, 1) for dimension in (64, 65)}
     assert len(prints) == 4
     assert Kernels(seed=0, dimension=64).fingerprint in prints
     assert not np.array_equal(

@@ -132,7 +132,7 @@ class Kernels:
                 for width, count in uses.items():
                     last = first + len(windows[width])
                     places = min(width, readings) - (TAPS - 1) * dilation
-                    pooled[width].append(_angles(places)[counts[:count, first:last].T])
+                    pooled[width].append(_angles(places)[counts[first:last, :count]])
                     first = last
             for width, starts in windows.items():
                 if self._proportions(width) == self.dimension:
@@ -197,7 +197,7 @@ def _counts(
     readings: int,
     where: tuple[tuple[int, tuple[int, ...]], ...],
 ) -> npt.NDArray[np.int64]:
-    """How often each feature's threshold is exceeded in each window: integers of shape (count, windows)."""
+    """How often each feature's threshold is exceeded in each window: integers of shape (windows, count)."""
     rounds = -(-count // len(kernels))
     responses = kernels.respond(min(count, len(kernels)), image)
     exceeded = torch.empty((count, responses.shape[1]), dtype=torch.float32, device="cpu")
@@ -206,17 +206,18 @@ def _counts(
         size = min(len(kernels), count - first)
         thresholds = kernels.thresholds[at, :size, None]
         torch.gt(responses[:size], thresholds, out=exceeded[first : first + size])
-    counted: npt.NDArray[np.int64] = (exceeded @ _pooling(readings, kernels.dilation, where)).numpy().astype(np.int64)
-    return counted
+    counted = _pooling(readings, kernels.dilation, where) @ exceeded.T
+    integers: npt.NDArray[np.int64] = counted.numpy().astype(np.int64)
+    return integers
 
 
 @lru_cache(maxsize=16)  # of at most 1 MB each
 def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> torch.Tensor:
-    """0/1 matrix of shape (positions, windows): which of the convolution's positions lie within a window."""
+    """0/1 matrix of shape (windows, positions): which of the convolution's positions lie within a window."""
     span = (TAPS - 1) * dilation
     place = torch.arange(readings - span, device="cpu")
     columns = [(place >= start) & (place < start + width - span) for width, starts in where for start in starts]
-    return torch.stack(columns, dim=1).float()
+    return torch.stack(columns).float()
 
 
 @lru_cache(maxsize=1024)

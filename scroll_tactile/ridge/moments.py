@@ -20,7 +20,7 @@ IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
 
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
-BLOCK = 256  # rows that wait; below 2¹³ their product is exact in float64, and 256 already cost no more each
+BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
 
 
@@ -53,7 +53,7 @@ def require_room(rows: int, more: int) -> None:
 class SecondMoment:
     """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
 
-    Rows wait in a block of at most 256, whose product is formed by BLAS in float64: products of integers below
+    Rows wait in a block of at most 512, whose product is formed by BLAS in float64: products of integers below
     2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads.
     """
 

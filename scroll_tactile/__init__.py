@@ -6,7 +6,7 @@ learner.predict(stream).material         # "felt"; or known=False: never felt th
 """
 
 from scroll_tactile import errors, sensors
-from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.embeddings import Embedding, Joined, Kernels, ModuleEmbedding, Vision, check_embedding
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -14,12 +14,16 @@ from scroll_tactile.streams import Stream
 
 __all__ = [
     "Embedding",
+    "Joined",
     "Kernels",
+    "ModuleEmbedding",
     "Prediction",
     "Receipt",
     "Sensor",
     "Stream",
     "TactileLearner",
+    "Vision",
+    "check_embedding",
     "errors",
     "sensors",
 ]

@@ -16,6 +16,7 @@
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
     ├── EmbeddingError                       an embedding broke its promise: mend it before it is used
+    ├── WeightsError                         a file of weights is damaged, another architecture's, or unreachable
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
@@ -81,6 +82,10 @@ class EmbeddingMismatchError(MismatchError):
 
 class EmbeddingError(ScrollTactileError):
     """An embedding gave features that are not finite, not within its bound, or not of its dimension."""
+
+
+class WeightsError(ScrollTactileError):
+    """A file of weights cannot be used: it is damaged, another architecture's, or unreachable."""
 
 
 class DatasetError(ScrollTactileError):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from store.arrays import array_digest, flat_bytes
-from store.errors import DamageError, StoreError, VersionError
+from store.arrays import array_digest, chunk_digest, flat_bytes
+from store.errors import DamageError, RecordError, StoreError, VersionError
 from store.files import remove_tree, sync_folder, sync_tree
 from store.records import JSON
 from store.reporting import reported
@@ -19,7 +19,7 @@ from store.reporting import reported
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["folder_name", "highest_number", "read_generation", "remove_others", "write_generation"]
+__all__ = ["folder_name", "highest_number", "read_generation", "read_rows", "remove_others", "write_generation"]
 
 logger = logging.getLogger(__name__)
 
@@ -41,14 +41,21 @@ def folder_name(number: int) -> str:
 
 
 def write_generation(
-    parent: Path, number: int, upto: int, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, JSON]
+    parent: Path,
+    number: int,
+    upto: int,
+    arrays: Mapping[str, np.ndarray],
+    attributes: Mapping[str, JSON],
+    chunks: Mapping[str, int],
 ) -> dict[str, Any]:
     """Write checked arrays as a durable zarr group in `parent` and return what must be read back.
 
-    That is the group's format and, for each array, its dtype, shape and sha256, as JSON. On any error
-    nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
+    That is the group's format and, for each array, its dtype, shape and sha256, and for one that is in
+    `chunks` (name → rows) a digest of each chunk, as JSON. On any error nothing is left behind. Raises
+    StoreFullError, ReadOnlyError or StoreError.
     """
-    content = {"format": GROUP_VERSION, "arrays": {name: _describe(array) for name, array in arrays.items()}}
+    described = {name: _describe(array, chunks.get(name)) for name, array in arrays.items()}
+    content = {"format": GROUP_VERSION, "arrays": described}
     final = parent / folder_name(number)
     draft = parent / (folder_name(number) + PARTIAL)
     try:
@@ -56,7 +63,7 @@ def write_generation(
             parent.mkdir(exist_ok=True)
             remove_tree(draft)
             known = {"format": GROUP_VERSION, "number": number, "upto": upto, "attributes": attributes}
-            _write_group(draft, known, arrays)
+            _write_group(draft, known, arrays, chunks)
             sync_tree(draft)
             draft.rename(final)
             sync_folder(parent)
@@ -67,11 +74,17 @@ def write_generation(
     return content
 
 
-def _describe(array: np.ndarray) -> dict[str, Any]:
-    return {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
+def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
+    described = {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
+    if rows is None:
+        return described
+    pieces = [chunk_digest(array[first : first + rows]) for first in range(0, len(array), rows)]
+    return described | {"rows": rows, "chunks": pieces}
 
 
-def _write_group(path: Path, attributes: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+def _write_group(
+    path: Path, attributes: dict[str, Any], arrays: Mapping[str, np.ndarray], chunks: Mapping[str, int]
+) -> None:
     # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
     import zarr
     from zarr.codecs import BloscCodec
@@ -84,7 +97,7 @@ def _write_group(path: Path, attributes: dict[str, Any], arrays: Mapping[str, np
             name,
             shape=plain.shape,
             dtype=plain.dtype,
-            chunks=_chunks(plain),
+            **_layout(plain, chunks.get(name)),
             compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
             fill_value=0,
             attributes={"dtype": array.dtype.str},
@@ -102,6 +115,14 @@ def _without_text(array: np.ndarray) -> np.ndarray:
     return flat_bytes(array).view("<u4").reshape(shape)
 
 
+def _layout(array: np.ndarray, rows: int | None) -> dict[str, Any]:
+    if rows is None:
+        return {"chunks": _chunks(array)}
+    # One file for all the chunks: hundreds of small ones would each have to be made durable.
+    rest = tuple(max(1, length) for length in array.shape[1:])
+    return {"chunks": (rows, *rest), "shards": (rows * max(1, -(-len(array) // rows)), *rest)}
+
+
 def _chunks(array: np.ndarray) -> tuple[int, ...]:
     chunks, piece = [], array.nbytes
     for length in array.shape:
@@ -117,32 +138,64 @@ def read_generation(path: Path, number: int, content: Mapping[str, Any]) -> dict
     They are writable and the caller's own. Raises DamageError naming the file or folder, the array and
     the generation, and VersionError for a group of a newer format.
     """
-    if content["format"] > GROUP_VERSION:
-        raise VersionError(
-            f"{path} is written in format {content['format']}; this release reads generations up to format "
-            f"{GROUP_VERSION}: upgrade it; nothing was changed"
-        )
-    import zarr
-
     group = _opened(path, number, content["format"])
     arrays = {}
     for name, description in content["arrays"].items():
         folder = path / name
-        try:
-            node = group[name]
-            array = _read_array(node, description) if isinstance(node, zarr.Array) else None
-        except Exception as error:
-            raise _unreadable(error, f"array {name!r} of generation {number} in {folder}", folder) from error
+        what = f"array {name!r} of generation {number} in {folder}"
+        array = _read(group, name, what, folder, description, slice(None))
         if array is None or array_digest(array) != description["sha256"]:
-            raise DamageError(
-                f"array {name!r} of generation {number} in {folder} is not what was written: its sha256 differs",
-                path=folder,
-            )
+            raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
         arrays[name] = array
     return arrays
 
 
+def read_rows(path: Path, number: int, content: Mapping[str, Any], name: str, first: int, last: int) -> np.ndarray:
+    """Return rows `first` to before `last` of an array that the generation in folder `path` keeps in chunks.
+
+    Only the chunks that hold them are read and verified. The rows are writable and the caller's own.
+    Raises RecordError for an array that is not there or not in chunks and for rows that it has not,
+    otherwise as `read_generation`; DamageError names the file and the chunk.
+    """
+    description = content["arrays"].get(name)
+    if description is None or "rows" not in description:
+        kept = sorted(one for one, described in content["arrays"].items() if "rows" in described)
+        raise RecordError(f"generation {number} in {path} keeps {kept} in chunks, not {name!r}: read it as a whole")
+    length, step = description["shape"][0], description["rows"]
+    if not 0 <= first <= last <= length:
+        raise RecordError(f"array {name!r} of generation {number} has rows 0 to {length}, not {first} to {last}")
+    group = _opened(path, number, content["format"])
+    file = path / name / "c" / "/".join("0" * (len(description["shape"]) + (description["dtype"][1] == "U")))
+    pieces = [np.empty((0, *description["shape"][1:]), description["dtype"])]
+    for chunk in range(first // step, -(-last // step) if last > first else 0):
+        begin, end = chunk * step, min(length, (chunk + 1) * step)
+        what = f"chunk {chunk} (rows {begin} to {end}) of array {name!r} of generation {number} in {file}"
+        shape = [end - begin, *description["shape"][1:]]
+        piece = _read(group, name, what, file, {**description, "shape": shape}, slice(begin, end))
+        if piece is None or chunk_digest(piece) != description["chunks"][chunk]:
+            raise DamageError(f"{what} is not what was written: its digest differs", path=file)
+        pieces.append(piece[max(first - begin, 0) : last - begin])
+    return np.concatenate(pieces)
+
+
+def _read(
+    group: zarr.Group, name: str, what: str, path: Path, description: Mapping[str, Any], rows: slice
+) -> np.ndarray | None:
+    import zarr
+
+    try:
+        node = group[name]
+        return _read_array(node, description, rows) if isinstance(node, zarr.Array) else None
+    except Exception as error:
+        raise _unreadable(error, what, path) from error
+
+
 def _opened(path: Path, number: int, version: int) -> zarr.Group:
+    if version > GROUP_VERSION:
+        raise VersionError(
+            f"{path} is written in format {version}; this release reads generations up to format "
+            f"{GROUP_VERSION}: upgrade it; nothing was changed"
+        )
     import zarr
     from zarr.storage import LocalStore
 
@@ -157,10 +210,10 @@ def _opened(path: Path, number: int, version: int) -> zarr.Group:
     return group
 
 
-def _read_array(node: zarr.Array[Any], description: Mapping[str, Any]) -> np.ndarray | None:
+def _read_array(node: zarr.Array[Any], description: Mapping[str, Any], rows: slice) -> np.ndarray | None:
     shape, dtype = tuple(description["shape"]), np.dtype(description["dtype"])
-    # zarr gives a scalar for a 0-d array.
-    plain = np.asarray(node[...])
+    # zarr gives a scalar for a 0-d array, which has no rows to choose from.
+    plain = np.asarray(node[rows] if shape else node[...])
     if dtype.kind == "U":
         expected: tuple[int, ...] = (*shape, dtype.itemsize // 4)
         if plain.shape != expected or plain.dtype != np.dtype("<u4"):

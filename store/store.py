@@ -14,7 +14,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from store.arrays import check_arrays, decode_payload, encode_payload
+from store.arrays import check_arrays, check_chunks, decode_payload, encode_payload
 from store.background import Background
 from store.errors import (
     DamageError,
@@ -29,6 +29,7 @@ from store.generations import (
     folder_name,
     highest_number,
     read_generation,
+    read_rows,
     remove_others,
     write_generation,
 )
@@ -217,22 +218,57 @@ class Store:
         folder = self.path / GENERATIONS / folder_name(row.number)
         return Generation(row.number, row.upto, attributes, read_generation(folder, row.number, content))
 
+    def read_rows(self, name: str, first: int, last: int, *, generation: int | None = None) -> np.ndarray:
+        """Return rows `first` to before `last` of an array that was committed with `chunks`, and read no others.
+
+        They are of the newest generation, or of the one with the number `generation`, which need not be
+        the newest any more but must still be there. Only what is read is verified: damage elsewhere in
+        the array does not matter here.
+
+        Raises RecordError for an array that is not kept in chunks or has no such rows, DamageError that
+        names file, array and chunk, VersionError, and StoreError where the generation is not there.
+        """
+        self._check_open()
+        while True:
+            row = next((row for row in self._journal.generations() if generation in (None, row.number)), None)
+            if row is None:
+                wanted = "no generation" if generation is None else f"generation {generation} no longer"
+                raise StoreError(f"{self.path} has {wanted}: look at the newest again, with latest()")
+            folder = self.path / GENERATIONS / folder_name(row.number)
+            try:
+                return read_rows(folder, row.number, row.verified(self._journal.path)[1], name, first, last)
+            except DamageError:
+                # A writer may have replaced and removed it while it was read: no damage.
+                if row.number in {row.number for row in self._journal.generations()}:
+                    raise
+
     def commit(
-        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
+        self,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        upto: int,
+        attributes: Mapping[str, JSON] | None = None,
+        chunks: Mapping[str, int] | None = None,
     ) -> int:
         """Write a generation that contains the records up to `upto`, make it current, return its number.
 
+        chunks: name → rows of a chunk, for arrays of which `read_rows` is to read a part. Each is one file.
         A background commit is waited for first, and its failure is raised here in place of committing.
-        Raises RecordError for arrays, attributes or an `upto` that cannot be kept, StoreFullError,
+        Raises RecordError for arrays, attributes, chunks or an `upto` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the generation before then stays current.
         """
-        checked, text = self._check_commit(arrays, upto, attributes)
+        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._background.wait()
         self._background.check()
-        return self._commit(checked, upto, text)
+        return self._commit(checked, upto, text, pieces)
 
     def commit_later(
-        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
+        self,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        upto: int,
+        attributes: Mapping[str, JSON] | None = None,
+        chunks: Mapping[str, int] | None = None,
     ) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
@@ -240,24 +276,29 @@ class Store:
         failure is logged and raised, once, by the next `commit`, `commit_later` (which then queues
         nothing), `flush` or `close`. What cannot be kept is refused at once, with RecordError.
         """
-        checked, text = self._check_commit(arrays, upto, attributes)
+        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._background.check()
-        self._background.submit(lambda: self._commit(checked, upto, text))
+        self._background.submit(lambda: self._commit(checked, upto, text, pieces))
 
     def _check_commit(
-        self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None
-    ) -> tuple[dict[str, np.ndarray], str]:
+        self,
+        arrays: Mapping[str, np.ndarray],
+        upto: int,
+        attributes: Mapping[str, JSON] | None,
+        chunks: Mapping[str, int] | None,
+    ) -> tuple[dict[str, np.ndarray], str, dict[str, int]]:
         self._check_open(write=True)
         if isinstance(upto, bool) or not isinstance(upto, int) or not 0 <= upto <= self._journal.last():
             raise RecordError(f"upto must be a sequence from 0 to the last, {self._journal.last()}, not {upto!r}")
-        return check_arrays(arrays), to_json("attributes", attributes)
+        checked = check_arrays(arrays)
+        return checked, to_json("attributes", attributes), check_chunks(chunks, checked)
 
-    def _commit(self, arrays: dict[str, np.ndarray], upto: int, attributes: str) -> int:
+    def _commit(self, arrays: dict[str, np.ndarray], upto: int, attributes: str, chunks: dict[str, int]) -> int:
         parent = self.path / GENERATIONS
         with self._committing:
             earlier = [row.number for row in self._journal.generations()]
             number = 1 + max([highest_number(parent), *earlier])
-            content = write_generation(parent, number, upto, arrays, from_json(attributes))
+            content = write_generation(parent, number, upto, arrays, from_json(attributes), chunks)
             fallback = [old for old in earlier if old not in self._spoilt][: KEPT_GENERATIONS - 1]
             row = GenerationRow.of(number, upto, clock.time(), attributes, content)
             try:

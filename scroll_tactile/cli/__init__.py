@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from scroll_tactile.cli.bench import bench
+from scroll_tactile.cli.continual import continual
 from scroll_tactile.cli.demo import demo
 from scroll_tactile.cli.memory import inspect, observe, predict
 from scroll_tactile.cli.replay import replay
@@ -21,6 +22,6 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, predict, inspect, replay, schedules):
+for command in (demo, observe, predict, inspect, replay, continual, schedules):
     app.command()(command)
 app.add_typer(bench, name="bench")

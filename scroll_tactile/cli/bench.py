@@ -9,16 +9,12 @@ import typer
 from rich.table import Table
 
 from scroll_tactile.bench.speed import run_speed
+from scroll_tactile.bench.vision import run_vision
 from scroll_tactile.cli.terminal import Commands, console, progress_bar, say, write_json
 
 __all__ = ["bench"]
 
 bench = typer.Typer(cls=Commands, no_args_is_help=True, help="Measure speed beside error, side by side in one run.")
-
-
-@bench.callback()
-def _group() -> None:
-    """Keep `speed` a command of its own while it is the only one."""
 
 
 @bench.command()
@@ -44,6 +40,38 @@ def speed(
             f"{record['ratio']:.2f}",
             record["bar"],
             record["error"],
+        )
+    console().print(table)
+    if json is not None:
+        write_json(json, result)
+        say(f"written to {json}")
+
+
+@bench.command()
+def vision(
+    weights: Annotated[
+        Path | None, typer.Option(help="A .safetensors or .pth file; random weights cost the same.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches and the random weights.")] = 0,
+    quick: Annotated[bool, typer.Option(help="A few rounds: for a look, not for a report.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+) -> None:
+    """Time the vision embedding beside a bare forward pass of its network, in each runtime that is installed."""
+    with progress_bar() as progress:
+        result = run_vision(
+            weights=weights, seed=seed, rounds=5 if quick else 30, note=lambda what: progress(what, 0, 1)
+        )
+    table = Table("what", "image", "ms", "median", "ratio", "to one thread", "error of features")
+    for record in result["records"]:
+        error = record["relative_error"]
+        table.add_row(
+            record["case"],
+            record["image"],
+            f"{record['milliseconds']:.2f}",
+            f"{record['median_milliseconds']:.2f}",
+            f"{record['ratio']:.2f}",
+            f"{record['ratio_to_one_thread']:.2f}",
+            "" if error is None else f"{error:.1e}",
         )
     console().print(table)
     if json is not None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from enum import StrEnum
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,20 +12,12 @@ import typer
 from rich.table import Table
 
 from scroll_tactile import plots
+from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.replay import FIGURES, PUBLISHED, Replay, subset, summary
 
 __all__ = ["replay"]
-
-
-class Dataset(StrEnum):
-    """The recorded sets."""
-
-    BIOTAC = "biotac-20"
-    ROBOSKIN = "roboskin-20"
 
 
 class Schedule(StrEnum):
@@ -87,16 +76,14 @@ def replay(
     Nothing is revisited. Afterwards the same touches are learned in another order: the memory must be the same to
     the bit, so that learning one by one loses nothing against training on everything at once.
     """
-    for file in (json, plot):
-        if file is not None and not file.absolute().parent.is_dir():
-            raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
+    require_folders(json, plot)
     with progress_bar() as progress:
         progress("reading", 0, 1)
-        recordings = load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
+        recordings = read(dataset, data, seed)
         if materials < 20:
             recordings = subset(recordings, materials)
         task = Replay(recordings, schedule.value, seed, readout.value, blocked, curve, novelty, folder=memory)
-        chosen = _parse(folds, recordings)
+        chosen = parse_folds(folds, recordings)
         results: list[dict[str, Any]] = []
         for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
             results.append(done)
@@ -107,15 +94,6 @@ def replay(
         say(f"figures: {json}")
     if plot is not None:
         _plot(plot, recordings, results)
-
-
-def _parse(folds: str, recordings: Recordings) -> list[int]:
-    if folds == "all":
-        return sorted(set(recordings.fold.tolist()))
-    try:
-        return list(dict.fromkeys(int(part) for part in folds.split(",")))
-    except ValueError:
-        raise InputError(f"expected --folds all, or numbers such as 0 or 0,1; came {folds!r}") from None
 
 
 def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], *, compared: bool) -> None:
@@ -165,13 +143,8 @@ def _command(dataset: Dataset, data: Path, task: Replay, folds: str) -> str:
 
 
 def _result(command: str, task: Replay, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    versions = {name: version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy")}
     return {
-        "command": command,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions | {"python": platform.python_version()},
-        "machine": f"{platform.machine()} {platform.system()}",
-        "sensor": task.recordings.sensor.model_dump(mode="json"),
+        **origin(command, task.recordings),
         **task.plan,
         "means": summary(results),
         "folds": list(results),

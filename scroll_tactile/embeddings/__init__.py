@@ -1,6 +1,10 @@
 """Embeddings: frozen maps from a tactile image of any size to a feature vector."""
 
+from scroll_tactile.embeddings.check import check_embedding
+from scroll_tactile.embeddings.joined import Joined
 from scroll_tactile.embeddings.kernels import Kernels
+from scroll_tactile.embeddings.modules import ModuleEmbedding
 from scroll_tactile.embeddings.protocol import Embedding, embed_windows
+from scroll_tactile.embeddings.vision import Vision
 
-__all__ = ["Embedding", "Kernels", "embed_windows"]
+__all__ = ["Embedding", "Joined", "Kernels", "ModuleEmbedding", "Vision", "check_embedding", "embed_windows"]

@@ -10,7 +10,7 @@ from typing import Any
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.passes import Answers, Labelled, ask, observe_all, one_blas_thread
+from scroll_tactile.pipelines.passes import Answers, Labelled, ask, observe_all
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.prediction import Prediction
 from scroll_tactile.sensors import Sensor
@@ -85,7 +85,7 @@ class Demo:
             "features": self.features,
         }
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
-        with one_blas_thread(), self._open() as learner:
+        with self._open() as learner:
             return self._learn(learner, notes, tell)
 
     def _open(self) -> TactileLearner:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import FrameType
 
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
@@ -19,7 +14,7 @@ from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.streams import Stream
 
-__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all", "one_blas_thread"]
+__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all"]
 
 Labelled = tuple[str, Stream]
 """A material and how it felt."""
@@ -86,9 +81,8 @@ def missing(touches: Sequence[Labelled], felt: Mapping[str, int]) -> list[Labell
 
 
 def observe(learner: TactileLearner, material: str, stream: Stream | npt.ArrayLike) -> Receipt:
-    """Observe one touch whole, as `TactileLearner.observe`: ctrl-C in the middle takes effect when it is done."""
-    with _interrupts_held():
-        return learner.observe(material, stream)
+    """Observe one touch, as `TactileLearner.observe`, which is itself whole or not at all where ctrl-C comes."""
+    return learner.observe(material, stream)
 
 
 def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Callable[[], object] = lambda: None) -> int:
@@ -97,32 +91,6 @@ def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Call
     for _ in range(len(touches) - len(remaining)):
         each()
     for name, stream in remaining:
-        observe(learner, name, stream)
+        learner.observe(name, stream)
         each()
     return len(remaining)
-
-
-def one_blas_thread() -> AbstractContextManager[object]:
-    """Keep BLAS to one thread while this is entered: two, on busy cores, made fitting a readout twice as slow."""
-    limits: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
-    return limits
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    # An exception half way through adding would leave statistics that close() then writes as if they were whole.
-    if threading.current_thread() is not threading.main_thread():  # only there do signals arrive
-        yield
-        return
-    held: list[int] = []
-
-    def hold(number: int, _frame: FrameType | None) -> None:
-        held.append(number)
-
-    before = signal.signal(signal.SIGINT, hold)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if held:
-        raise KeyboardInterrupt

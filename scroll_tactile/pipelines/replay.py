@@ -16,7 +16,7 @@ from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import auroc, calibration_error, mean_and_spread
-from scroll_tactile.pipelines.passes import Answers, Labelled, ask, missing, observe, one_blas_thread
+from scroll_tactile.pipelines.passes import Answers, Labelled, ask, missing
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.schedules import ScheduleName, arrange
 from scroll_tactile.ridge.readouts import ReadoutName
@@ -88,9 +88,7 @@ class Replay:
         for fold in folds:
             name = f"fold-{fold}"
             if "digest" not in notes.notes.get(name, {}):
-                with one_blas_thread():
-                    figures = _Fold(self, fold, places == fold, progress).run(notes)
-                notes.note(name, figures)
+                notes.note(name, _Fold(self, fold, places == fold, progress).run(notes))
             yield notes.notes[name]
 
 
@@ -151,7 +149,7 @@ class _Fold:
                 points[str(done)] = [len(met), ask(learner, asked).accuracy]
                 notes.note(name, points)
             if done < total:
-                observe(learner, *self.lessons[done])
+                learner.observe(*self.lessons[done])
             self.progress("learning", done, total)
         return [points[key] for key in sorted(points, key=int)]
 

@@ -14,7 +14,7 @@ import numpy as np
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.passes import Labelled, observe, one_blas_thread
+from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.prediction import Prediction
 from scroll_tactile.sensors import Sensor
 
@@ -96,21 +96,20 @@ def try_schedules(
         raise InputError(
             f"expected at least one schedule, touch and probe; came {count}, {len(touches)} and {len(probes)}"
         )
-    with one_blas_thread():
-        embedding = Kernels(dimension=features)
-        plain = TactileLearner(sensor=sensor, embedding=embedding)
-        for name, stream in touches:
-            observe(plain, name, stream)
-        expected = _predictions(plain, probes)
-        trials = [Trial(1, 0, 0, plain.digest(), True)]
-        tell(trials[0])
-        for number in range(1, count):
-            random = np.random.default_rng([seed, number])
-            with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
-                trials.append(
-                    _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
-                )
-            tell(trials[-1])
+    embedding = Kernels(dimension=features)
+    plain = TactileLearner(sensor=sensor, embedding=embedding)
+    for name, stream in touches:
+        plain.observe(name, stream)
+    expected = _predictions(plain, probes)
+    trials = [Trial(1, 0, 0, plain.digest(), True)]
+    tell(trials[0])
+    for number in range(1, count):
+        random = np.random.default_rng([seed, number])
+        with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
+            trials.append(
+                _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
+            )
+        tell(trials[-1])
     return trials
 
 
@@ -157,7 +156,7 @@ def _learn(
     learner = TactileLearner.open(path, sensor=sensor, embedding=embedding)
     try:
         for at, (name, stream) in enumerate(touches):
-            observe(learner, name, stream)
+            learner.observe(name, stream)
             if at in cuts and random.random() < 0.5:
                 learner.close()
                 learner = TactileLearner.open(path, embedding=embedding)

@@ -1,0 +1,57 @@
+"""What the commands that measure share: the recorded sets, which folds, and what a result says of its making."""
+
+from __future__ import annotations
+
+import platform
+from datetime import UTC, datetime
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.errors import InputError
+
+__all__ = ["Dataset", "origin", "parse_folds", "read", "require_folders"]
+
+
+class Dataset(StrEnum):
+    """The recorded sets."""
+
+    BIOTAC = "biotac-20"
+    ROBOSKIN = "roboskin-20"
+
+
+def read(dataset: Dataset, data: Path, seed: int) -> Recordings:
+    """Read a recorded set. Raises DatasetError for a folder that is not laid out as published."""
+    return load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
+
+
+def parse_folds(folds: str, recordings: Recordings) -> list[int]:
+    """The folds that --folds asks for: "all", or numbers. Raises InputError for anything else."""
+    if folds == "all":
+        return sorted(set(recordings.fold.tolist()))
+    try:
+        return list(dict.fromkeys(int(part) for part in folds.split(",")))
+    except ValueError:
+        raise InputError(f"expected --folds all, or numbers such as 0 or 0,1; came {folds!r}") from None
+
+
+def require_folders(*files: Path | None) -> None:
+    """Raise InputError, before anything is measured, where a file could not be written for want of its folder."""
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
+
+
+def origin(command: str, recordings: Recordings) -> dict[str, Any]:
+    """What made a result: the command, when, with which versions, on what machine, from which sensor."""
+    versions = {name: version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy")}
+    return {
+        "command": command,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions | {"python": platform.python_version()},
+        "machine": f"{platform.machine()} {platform.system()}",
+        "sensor": recordings.sensor.model_dump(mode="json"),
+    }

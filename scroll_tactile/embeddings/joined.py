@@ -1,0 +1,71 @@
+"""Several embeddings side by side, as one."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.embeddings.protocol import Embedding, embed_windows
+from scroll_tactile.errors import InputError
+
+__all__ = ["Joined"]
+
+
+class Joined:
+    """Features of several embeddings, one after another: what one of them misses another may see.
+
+    Each one's features are divided by its bound, so that all lie in [-1, 1]. Windows are those that every part can
+    read, and they are judged as the most demanding part asks for.
+
+    Raises InputError for fewer than two embeddings.
+
+    >>> from scroll_tactile.embeddings.kernels import Kernels
+    >>> Joined(Kernels(dimension=64), Kernels(seed=2, dimension=128))
+    Joined(Kernels(seed=1, dimension=64), Kernels(seed=2, dimension=128))
+    """
+
+    bound = 1.0
+
+    def __init__(self, *embeddings: Embedding) -> None:
+        if len(embeddings) < 2:
+            raise InputError(f"expected at least two embeddings to join; came {len(embeddings)}")
+        strange = [one for one in embeddings if not isinstance(one, Embedding)]
+        if strange:
+            raise InputError(f"expected embeddings, such as Joined(Kernels(), Vision()); came {strange[0]!r:.100}")
+        self.parts: tuple[Embedding, ...] = embeddings
+        self.name = "+".join(part.name for part in embeddings)
+        self.dimension = sum(part.dimension for part in embeddings)
+        self.partial_windows: bool = all(getattr(part, "partial_windows", True) for part in embeddings)
+        widest = any(getattr(part, "judged_scales", "all") == "widest" for part in embeddings)
+        self.judged_scales = "widest" if widest else "all"
+
+    def __repr__(self) -> str:
+        return f"Joined({', '.join(map(repr, self.parts))})"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A hash of the parts' fingerprints, bounds and dimensions, in their order."""
+        digest = hashlib.sha256(b"joined 1")
+        for part in self.parts:
+            digest.update(f"\n{part.name} {part.dimension} {part.bound!r} {part.fingerprint}".encode())
+        return digest.hexdigest()
+
+    def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        """Features in [-1, 1], shape (d,), of a tactile image of shape (C, T) in [-1, 1]."""
+        return np.concatenate([np.divide(part.embed(image), part.bound) for part in self.parts])
+
+    def embed_windows(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
+    ) -> dict[int, npt.NDArray[np.floating]]:
+        """Embed windows of an image: width → first columns, to width → features (windows, d)."""
+        embedded = [embed_windows(part, image, windows) for part in self.parts]
+        return {
+            width: np.concatenate(
+                [np.divide(one[width], part.bound) for one, part in zip(embedded, self.parts, strict=True)], axis=1
+            )
+            for width in windows
+        }

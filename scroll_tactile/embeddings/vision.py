@@ -1,0 +1,254 @@
+"""A residual network's stages, averaged over windows: the embedding of the paper that this library follows."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+from torch.nn import functional
+
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
+from scroll_tactile.embeddings.weights import load_network
+from scroll_tactile.errors import InputError
+
+__all__ = ["TOGETHER", "TunableVision", "Vision", "pool_windows", "to_planes"]
+
+FloatArray = npt.NDArray[np.float32]
+
+# Of each colour plane in [0, 1], as torchvision's networks were trained.
+MEAN = (0.485, 0.456, 0.406)
+DEVIATION = (0.229, 0.224, 0.225)
+
+# Columns from which windows share one pass over the whole image: RoboSkin is told apart 0.3 points better so than in
+# windows apart, and one pass is cheaper. Narrower ones are cut out first, for early decisions rest on them, and these
+# see only what was felt: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
+TOGETHER = 48
+MOST_COLUMNS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory
+LEAST = {"torchvision": 1, "universal": 3}  # rows and columns: a kernel has to fit the padded image
+BATCH = 32  # images at once in `embed_bulk`
+
+
+class Vision:
+    """Stages of a ResNet, each averaged over a window and scaled to length 1, side by side.
+
+    weights: torchvision's "resnet18", "resnet34" or "resnet50", fetched once; a `.safetensors` or `.pth` file in
+        torchvision's or Meta-Dataset's (URL) layout; a state dict; or None for a random network, the control that shows
+        what the weights are worth.
+    stages: which, ascending: 0 the stem, 1 to 4 the layers. Nothing after the last of them is computed.
+    runtime: "torch", or "onnxruntime" or "openvino", which are faster and need their extras.
+    precision: "bfloat16" is faster on processors that have it, with an error of half a percent.
+    seed, depth: of the random network; the depth of given weights is seen from them.
+
+    A touch narrower than a window is not read at that scale (`partial_windows` is False): a network is lost at a
+    length that it did not learn from. Where several scales fit only the widest is judged (`judged_scales`), so that
+    a touch costs one forward pass.
+
+    One image gives the same bytes whatever was embedded before; another machine, runtime or version may give other
+    last bits, and so another fingerprint.
+
+    Raises WeightsError for weights that cannot be used, InputError for settings that do not fit.
+
+    >>> import numpy as np
+    >>> Vision(None, seed=0, stages=(1, 2)).embed(np.zeros((19, 400), dtype=np.float32)).shape
+    (192,)
+    """
+
+    name = "vision"
+    bound = 1.0
+    partial_windows = False
+    judged_scales: Literal["widest", "all"] = "widest"
+
+    def __init__(
+        self,
+        weights: str | os.PathLike[str] | Mapping[str, torch.Tensor] | None = "resnet18",
+        *,
+        stages: Sequence[int] = (1, 2, 3),
+        runtime: RuntimeName = "torch",
+        precision: Precision = "float32",
+        seed: int | None = None,
+        depth: int = 18,
+    ) -> None:
+        self.stages = tuple(stages)
+        if not self.stages or list(self.stages) != sorted(set(self.stages) & set(range(5))):
+            raise InputError(f"expected stages from 0 to 4, ascending, each once; came {self.stages}")
+        if (weights is None) != (seed is not None):
+            raise InputError(
+                f"a random network, weights=None, and only that, needs a seed; came seed={seed!r} with weights "
+                f"{'None' if weights is None else 'given'}"
+            )
+        self.runtime: RuntimeName = runtime
+        self.precision: Precision = precision
+        if weights is None:
+            assert seed is not None
+            self._net = ResNet.random(seed, depth)
+            self._source = f"None, seed={seed}"
+        else:
+            self._net = load_network(weights)
+            self._source = "<state dict>" if isinstance(weights, Mapping) else repr(os.fspath(weights))
+        self._net.requires_grad_(False)
+        self._run = make_runtime(runtime, self._net, self.stages[-1], precision)
+        self.dimension = sum(self._net.widths[stage] for stage in self.stages)
+
+    def __repr__(self) -> str:
+        settings = f"stages={self.stages}, runtime={self.runtime!r}, precision={self.precision!r}"
+        return f"Vision({self._source}, {settings}, depth={self._net.depth})"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A hash of all the tensors, the settings, the runtime's version and the features of three fixed images."""
+        settings = (self._net.depth, self._net.stem, self.stages, self.runtime, version_of(self.runtime))
+        digest = hashlib.sha256(f"vision 1 {settings} {self.precision} {MEAN} {DEVIATION} {TOGETHER}".encode())
+        for name, tensor in sorted(self._net.state_dict().items()):
+            digest.update(f"\n{name} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.contiguous().numpy().tobytes())
+        for channels, columns in ((3, 9), (19, 30), (60, 75)):
+            place = np.arange(channels * columns).reshape(channels, columns)
+            image = ((place * (place + 7) * 13 % 255) / 127.0 - 1).astype(np.float32)
+            digest.update(self.embed(image).astype("<f4").tobytes())
+        return digest.hexdigest()
+
+    def embed(self, image: npt.NDArray[np.float32]) -> FloatArray:
+        """Features in [0, 1], float32 of shape (d,), of a tactile image of shape (C, T) in [-1, 1].
+
+        Raises InputError for an image that has not two axes, or an empty one.
+        """
+        columns = self._require_image(image)
+        features: FloatArray = self._read(image, [(0, columns)])[0]
+        return features
+
+    def embed_windows(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
+    ) -> dict[int, FloatArray]:
+        """Embed windows of an image: width → first columns, to width → features (windows, d).
+
+        Windows of 48 columns or more are averaged from one pass over the whole image, so that they also see a little
+        of what lies beside them. A narrower one is what `embed` gives for it alone, to the bit.
+        """
+        columns = self._require_image(image)
+        wide = [width for width in windows if width >= TOGETHER and columns <= MOST_COLUMNS]
+        places = [(start, width) for width in wide for start in windows[width]]
+        pooled = iter(self._read(image, places)) if places else iter(())
+        features: dict[int, FloatArray] = {}
+        for width, starts in windows.items():
+            rows = (
+                [next(pooled) for _ in starts]
+                if width in wide
+                else [self.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts]
+            )
+            features[width] = np.stack(rows) if rows else np.empty((0, self.dimension), np.float32)
+        return features
+
+    def embed_bulk(self, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:
+        """Features (N, d) of whole images, for work where speed counts and the last bits do not.
+
+        Images of one size go through the network together, on as many threads as torch has, and so their last bits
+        differ from those of `embed`: what a memory is to hold has to come from the latter.
+        """
+        features = np.empty((len(images), self.dimension), np.float32)
+        sizes: dict[tuple[int, ...], list[int]] = {}
+        for at, image in enumerate(images):
+            self._require_image(image)
+            sizes.setdefault(image.shape, []).append(at)
+        for (_, columns), members in sizes.items():
+            for first in range(0, len(members), BATCH):
+                batch = members[first : first + BATCH]
+                with torch.inference_mode(), torch.autocast("cpu", enabled=False):
+                    planes = to_planes(torch.from_numpy(np.stack([images[at] for at in batch]).astype(np.float32)))
+                    features[batch] = self._pooled(planes, [(0, columns)], columns)[:, 0]
+        return features
+
+    def network(self) -> TunableVision:
+        """A copy of the network that can be trained, with this embedding's reading of windows around it.
+
+        A new one at each call: training it changes nothing here. `Vision(tuned.net.state_dict(), …)` is the embedding
+        of what was trained.
+        """
+        net = copy.deepcopy(self._net).requires_grad_(True)
+        return TunableVision(net, self.stages)
+
+    def _require_image(self, image: npt.NDArray[np.floating]) -> int:
+        """The number of columns of an image that the network can read."""
+        if image.ndim != 2 or 0 in image.shape:
+            raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
+        if min(image.shape) < LEAST[self._net.stem]:
+            raise InputError(
+                f"expected a tactile image of at least {LEAST[self._net.stem]} channels and columns, which the "
+                f"{self._net.stem} stem needs; came {image.shape}. Take weights in torchvision's layout, or Kernels"
+            )
+        return int(image.shape[1])
+
+    def _read(self, image: npt.NDArray[np.float32], windows: Sequence[tuple[int, int]]) -> FloatArray:
+        """Features (windows, d) from one pass over an image."""
+        with steady():
+            planes = to_planes(torch.tensor(image[None], dtype=torch.float32))
+            features: FloatArray = self._pooled(planes, windows, image.shape[1])[0]
+            return features
+
+    def _pooled(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], columns: int) -> FloatArray:
+        maps = self._run(planes.numpy())
+        pooled = pool_windows([torch.from_numpy(maps[stage]) for stage in self.stages], columns, windows)
+        # Rounding may pass 1 by a unit in the last place.
+        features: FloatArray = np.minimum(pooled.numpy(), np.float32(1))
+        return features
+
+
+class TunableVision(nn.Module):
+    """The differentiable twin of a Vision, in float32: `net` is its ResNet, to be trained.
+
+    Batch normalisation keeps its statistics, in training mode too: a robot's few touches would spoil them.
+    """
+
+    def __init__(self, net: ResNet, stages: Sequence[int]) -> None:
+        super().__init__()
+        self.net = net
+        self.stages = tuple(stages)
+        self.eval()
+
+    def train(self, mode: bool = True) -> TunableVision:
+        """Stay in evaluation mode, whatever is asked for; parameters are trained none the less."""
+        super().train(False)
+        return self
+
+    def forward(self, images: torch.Tensor, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
+        """Features (B, windows, d) of images (B, C, T) in [-1, 1], at windows (first column, width).
+
+        Equal to the embedding's but for rounding; all windows are averaged from one pass.
+        """
+        maps = self.net(to_planes(images), self.stages[-1])
+        return pool_windows([maps[stage] for stage in self.stages], images.shape[-1], windows)
+
+
+def to_planes(images: torch.Tensor) -> torch.Tensor:
+    """Tactile images (B, C, T) in [-1, 1] as colour planes (B, 3, C, T), scaled as in the networks' training."""
+    mean = torch.tensor(MEAN, dtype=images.dtype, device=images.device)[:, None, None]
+    deviation = torch.tensor(DEVIATION, dtype=images.dtype, device=images.device)[:, None, None]
+    return ((images[:, None] + 1) / 2 - mean) / deviation
+
+
+def pool_windows(maps: Sequence[torch.Tensor], columns: int, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
+    """Average maps over windows: features (B, windows, d), each map's part of them of length 1.
+
+    maps: of some stages, each (B, planes, rows, W), of an image of so many columns. windows: (first column, width) in
+    columns of the image; one that reaches beyond it is taken as far as it goes. Averaged are all rows, and the
+    columns of the map that the window covers, at least one. A part that is zero stays zero.
+    """
+    parts = []
+    for stage in maps:
+        across = stage.shape[-1]
+        # Window by window: what is asked for beside a window must not change its bits, and a product would.
+        averages = []
+        for start, width in windows:
+            first = start * across // columns
+            after = max(first + 1, -(-min(start + width, columns) * across // columns))
+            averages.append(stage[..., first:after].mean(dim=(2, 3)))
+        parts.append(functional.normalize(torch.stack(averages, dim=1), dim=-1))
+    return torch.cat(parts, dim=-1)

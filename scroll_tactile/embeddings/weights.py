@@ -1,0 +1,221 @@
+"""Weights of residual networks: read from files that may be damaged, hostile or another architecture's, or fetched.
+
+Read are `.safetensors` and what `torch.save` writes, in torchvision's names and those of Meta-Dataset's universal
+representations: bare, or within a checkpoint, with the prefixes that wrappers leave. Classifiers are left out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import re
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from scroll_tactile.embeddings.resnet import BLOCKS, BOTTLENECK, ResNet, Stem
+from scroll_tactile.errors import WeightsError
+
+__all__ = ["CACHE_VARIABLE", "PUBLISHED", "cache_folder", "load_network", "network_of", "read_tensors"]
+
+Tensors = dict[str, torch.Tensor]
+
+# torchvision's; a name ends in the first eight hex digits of the file's SHA-256.
+PUBLISHED: Final = {
+    "resnet18": "https://download.pytorch.org/models/resnet18-f37072fd.pth",
+    "resnet34": "https://download.pytorch.org/models/resnet34-b627a593.pth",
+    "resnet50": "https://download.pytorch.org/models/resnet50-0676ba61.pth",
+}
+CACHE_VARIABLE: Final = "SCROLL_TACTILE_CACHE"
+CONTAINERS = ("state_dict", "model_state_dict", "model", "net", "backbone")  # under which checkpoints keep the tensors
+PREFIXES = re.compile(r"^(?:(?:module|backbone|model|encoder|net)\.)+")  # left by wrappers around the network
+HEADS = re.compile(r"^(?:fc|cls_fn|classifier)\.|(?:^|\.)num_batches_tracked$")
+NAMED = 5  # tensors in a message
+
+
+def load_network(source: str | os.PathLike[str] | Mapping[str, torch.Tensor]) -> ResNet:
+    """Make the network of a published name, a file or a state dict, in float32 and evaluation mode.
+
+    source: "resnet18", "resnet34" or "resnet50" for torchvision's ImageNet weights, fetched once into the cache;
+    the path of a `.safetensors`, `.pth` or `.pt` file; or tensors by name.
+
+    Raises WeightsError for weights that cannot be had, are damaged, or belong to another architecture.
+    """
+    if isinstance(source, Mapping):
+        return network_of(source, "the given state dict")
+    path = _published(source) if isinstance(source, str) and source in PUBLISHED else Path(source)
+    return network_of(read_tensors(path), str(path))
+
+
+def read_tensors(path: Path) -> Mapping[str, Any]:
+    """What a file holds: tensors by name, or a checkpoint that has them inside. Nothing in it is executed.
+
+    Raises WeightsError for a file that is not there, damaged, or a pickle of more than tensors and plain values.
+    """
+    if not path.is_file():
+        raise WeightsError(
+            f"expected a file of weights; there is none at {path}. Give a .safetensors or .pth file, or one of the "
+            f"published names {sorted(PUBLISHED)}"
+        )
+    if path.suffix == ".safetensors":
+        return _read_safetensors(path)
+    try:
+        with _numpy_scalars_allowed():
+            held = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise WeightsError(
+            f"{path} is no file of tensors: it is damaged, or a pickle that would execute code when it is read, "
+            f"which is refused. If you trust its maker, read it there and save its state dict alone "
+            f"({str(error).splitlines()[0]:.200})"
+        ) from error
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError, IndexError) as error:
+        raise WeightsError(f"{path} cannot be read as what torch.save writes: it is damaged or cut off") from error
+    if not isinstance(held, Mapping):
+        raise WeightsError(f"expected tensors by name in {path}; it holds a {type(held).__name__}")
+    return held
+
+
+def network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
+    """Make the network that tensors belong to; depth and stem are read off their names and shapes.
+
+    where: what messages call their source. The tensors are copied.
+
+    Raises WeightsError that names what is missing, left over, of another shape, or not finite.
+    """
+    given = _cleaned(tensors, where)
+    depth, stem = _architecture(given, where)
+    net = ResNet.empty(depth, stem)
+    wanted = {name: t for name, t in net.state_dict().items() if not HEADS.search(name)}
+    kind = f"a ResNet-{depth} with the {stem} stem"
+    if missing := sorted(set(wanted) - set(given)):
+        raise WeightsError(f"{where} looks like {kind}, but lacks {_listed(missing)}")
+    if extra := sorted(set(given) - set(wanted)):
+        raise WeightsError(f"{where} looks like {kind}, but also has {_listed(extra)}: it is another architecture's")
+    for name, own in wanted.items():
+        tensor = given[name]
+        if tensor.shape != own.shape or not tensor.is_floating_point():
+            raise WeightsError(
+                f"{where} looks like {kind}, but {name} is {tensor.dtype} of shape {tuple(tensor.shape)}; "
+                f"expected floats of shape {tuple(own.shape)}"
+            )
+        own.copy_(tensor.detach())
+        # Looked at after rounding to float32: a double may be too large for it.
+        if not torch.isfinite(own).all() or (name.endswith("running_var") and (own < 0).any()):
+            raise WeightsError(f"{name} in {where} has NaN, infinite or impossible values: the file is damaged")
+    return net
+
+
+def cache_folder() -> Path:
+    """Where fetched weights are kept: $SCROLL_TACTILE_CACHE, or the platform's cache folder; weights/ within it."""
+    if chosen := os.environ.get(CACHE_VARIABLE):
+        return Path(chosen).expanduser() / "weights"
+    return Path(_pooch().os_cache("scroll-tactile")) / "weights"
+
+
+def _published(name: str) -> Path:
+    """The file of a published name, fetched where the cache has none."""
+    url = PUBLISHED[name]
+    path = cache_folder() / url.rsplit("/", 1)[1]
+    if not path.is_file():
+        try:
+            _fetch(url, path)
+        except Exception as error:  # the downloader's errors are many: no network, no room, a proxy that refuses
+            raise WeightsError(
+                f"the weights {name!r} could not be fetched from {url} ({type(error).__name__}: {error!s:.200}). "
+                f"Put that file at {path} by hand, or give Vision the path of a file of weights, or use Kernels, "
+                "which need none"
+            ) from error
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    expected = path.stem.rsplit("-", 1)[1]
+    if not digest.startswith(expected):
+        raise WeightsError(
+            f"{path} is damaged: its SHA-256 begins with {digest[:8]}, where its publisher's name says {expected}. "
+            "Delete it, so that it is fetched again"
+        )
+    return path
+
+
+def _fetch(url: str, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Into a file beside it first, and then renamed: what is there is whole. The hash is compared by the caller.
+    _pooch().retrieve(url, known_hash=None, fname=path.name, path=path.parent)
+
+
+def _pooch() -> Any:
+    try:
+        import pooch
+    except ImportError as error:
+        raise WeightsError(
+            "published weights are fetched by pooch, which is not installed: pip install 'scroll-tactile[vision]', "
+            "or give the path of a file of weights"
+        ) from error
+    return pooch
+
+
+def _read_safetensors(path: Path) -> Tensors:
+    try:
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+    except ImportError as error:
+        raise WeightsError(
+            f"{path} needs safetensors, which is not installed: pip install 'scroll-tactile[vision]'"
+        ) from error
+    try:
+        tensors: Tensors = load_file(path)
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        raise WeightsError(f"{path} cannot be read as safetensors: {error}. It is damaged or cut off") from error
+    return tensors
+
+
+def _numpy_scalars_allowed() -> AbstractContextManager[None]:
+    """Checkpoints often hold a best accuracy that is a NumPy scalar, beside the tensors; to read one runs nothing."""
+    allow = getattr(torch.serialization, "safe_globals", None)  # torch 2.5
+    if allow is None:
+        return nullcontext()
+    scalar: Any = np.float64(0).__reduce__()[0]
+    kinds = [type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?")]
+    context: AbstractContextManager[None] = allow(
+        [np.dtype, *kinds, scalar, (scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar")]
+    )
+    return context
+
+
+def _cleaned(tensors: Mapping[str, Any], where: str) -> Tensors:
+    """The network's tensors, by torchvision's names."""
+    for container in CONTAINERS:
+        if isinstance(inside := tensors.get(container), Mapping):
+            return _cleaned(inside, where)
+    named = {PREFIXES.sub("", str(name)): tensor for name, tensor in tensors.items()}
+    kept = {name: tensor for name, tensor in named.items() if not HEADS.search(name)}
+    if strange := sorted(name for name, tensor in kept.items() if not isinstance(tensor, torch.Tensor)):
+        raise WeightsError(f"expected tensors by name in {where}; {_listed(strange)} are none")
+    return kept
+
+
+def _architecture(tensors: Tensors, where: str) -> tuple[int, Stem]:
+    first = tensors.get("conv1.weight")
+    kernel = tuple(first.shape[2:]) if first is not None and first.ndim == 4 else None
+    stems: dict[object, Stem] = {(7, 7): "torchvision", (5, 5): "universal"}
+    found = [re.match(r"layer([1-4])\.(\d+)\.", name) for name in tensors]
+    places = {(int(match[1]), int(match[2])) for match in found if match}
+    blocks = tuple(sum(layer == of for of, _ in places) for layer in (1, 2, 3, 4))
+    bottleneck = any(re.fullmatch(r"layer[1-4]\.\d+\.conv3\.weight", name) for name in tensors)
+    for depth, theirs in BLOCKS.items():
+        if kernel in stems and blocks == theirs and bottleneck == (depth >= BOTTLENECK):
+            return depth, stems[kernel]
+    raise WeightsError(
+        f"expected in {where} a ResNet of depth {', '.join(map(str, BLOCKS))} with a first convolution conv1.weight of "
+        f"7 × 7 (torchvision) or 5 × 5 (universal); found a first kernel of {kernel} and {blocks} "
+        f"{'bottleneck' if bottleneck else 'basic'} blocks in layer1 to layer4, among {len(tensors)} tensors "
+        f"({_listed(sorted(tensors))})"
+    )
+
+
+def _listed(names: list[str]) -> str:
+    rest = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,104 @@
+"""What runs the network: the same features in each, the same bytes from one."""
+
+import builtins
+
+import numpy as np
+import pytest
+import torch
+
+from scroll_tactile.embeddings import Vision, check_embedding
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.runtimes import make_runtime, steady
+from scroll_tactile.errors import InputError
+
+STATE = ResNet.random(0).state_dict()
+
+
+def vision(runtime, **settings):
+    if runtime != "torch":
+        pytest.importorskip(runtime, reason=f"{runtime} is not installed, and needed by few")
+        pytest.importorskip("onnx", reason="onnx is not installed")
+    return Vision(STATE, runtime=runtime, **settings)
+
+
+def image(channels, columns):
+    return np.random.default_rng([channels, columns]).uniform(-1, 1, (channels, columns)).astype(np.float32)
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+def test_each_gives_torchs_features_for_any_size(runtime):
+    ours, theirs = vision(runtime, stages=(0, 1, 2, 3, 4)), Vision(STATE, stages=(0, 1, 2, 3, 4))
+    for channels, columns in ((19, 400), (60, 75), (19, 9), (1, 1), (180, 80)):
+        assert np.abs(ours.embed(image(channels, columns)) - theirs.embed(image(channels, columns))).max() < 1e-5
+    assert ours.fingerprint != theirs.fingerprint
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+def test_each_keeps_the_promises_of_an_embedding(runtime):
+    check_embedding(vision(runtime), columns=(9, 60))
+    batch = [image(19, 30), image(19, 30) / 2]
+    ours = vision(runtime)
+    assert np.abs(ours.embed_bulk(batch) - np.stack([ours.embed(one) for one in batch])).max() < 1e-5
+
+
+@pytest.mark.parametrize("runtime", ["torch", "openvino"])
+def test_bfloat16_is_close_and_float32_closer(runtime):
+    truth = Vision(STATE).embed(image(19, 100))
+    errors = {
+        precision: np.linalg.norm(vision(runtime, precision=precision).embed(image(19, 100)) - truth)
+        for precision in ("float32", "bfloat16")
+    }
+    assert errors["float32"] < 1e-5
+    # OpenVINO takes bfloat16 only where the processor has it.
+    assert errors["bfloat16"] < 0.05
+    check_embedding(vision(runtime, precision="bfloat16"), columns=(9, 60))
+
+
+@pytest.mark.parametrize(("depth", "stem"), [(50, "torchvision"), (18, "universal")])
+def test_the_graph_is_the_network_in_other_arrangements_too(depth, stem):
+    pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    net = ResNet.random(1, depth, stem)
+    planes = np.random.default_rng(0).standard_normal((2, 3, 19, 33)).astype(np.float32)
+    maps, truth = make_runtime("onnxruntime", net, 4)(planes), make_runtime("torch", net, 4)(planes)
+    assert [one.shape for one in maps] == [one.shape for one in truth]
+    assert all(np.allclose(a, b, atol=1e-4 * np.abs(b).max()) for a, b in zip(maps, truth, strict=True))
+    assert len(make_runtime("onnxruntime", net, 0)(planes)) == 1
+
+
+def test_onnxruntime_has_no_bfloat16_and_says_so():
+    with pytest.raises(InputError, match="ONNX Runtime has no bfloat16"):
+        Vision(STATE, runtime="onnxruntime", precision="bfloat16")
+
+
+@pytest.mark.parametrize(
+    ("runtime", "package"), [("onnxruntime", "onnxruntime"), ("openvino", "openvino"), ("onnxruntime", "onnx")]
+)
+def test_a_missing_package_is_named_with_its_extra(monkeypatch, runtime, package):
+    if package == "onnx":
+        pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.split(".")[0] == package:
+            raise ImportError(f"No module named {name!r}")
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    extra = "openvino" if runtime == "openvino" else "onnx"
+    with pytest.raises(InputError, match=rf"(?s)needs the package {package}.*scroll-tactile\[{extra}\]"):
+        Vision(STATE, runtime=runtime)
+
+
+def test_steady_gives_back_what_it_changed():
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    try:
+        torch.set_num_threads(2)
+        torch.set_float32_matmul_precision("high")
+        with pytest.raises(KeyError), steady():
+            assert torch.get_num_threads() == 1
+            assert torch.get_float32_matmul_precision() == "highest"
+            raise KeyError
+        assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == (2, "high")
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)

@@ -1,0 +1,244 @@
+"""Weights from files that are whole, damaged, hostile, another architecture's, or out of reach."""
+
+import hashlib
+import os
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from scroll_tactile.embeddings import weights
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.weights import load_network
+from scroll_tactile.errors import WeightsError
+
+
+@pytest.fixture(scope="module")
+def net():
+    return ResNet.random(0)
+
+
+@pytest.fixture
+def state(net):
+    return dict(net.state_dict())
+
+
+def same(one, other):
+    mine, theirs = one.state_dict(), other.state_dict()
+    return mine.keys() == theirs.keys() and all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+def refusal(source):
+    with pytest.raises(WeightsError) as caught:
+        load_network(source)
+    return str(caught.value)
+
+
+def test_safetensors_and_torch_files_give_the_network_back(net, state, tmp_path):
+    head = {"fc.weight": torch.zeros(10, 512), "fc.bias": torch.zeros(10)}
+    save_file(state | head, tmp_path / "one.safetensors")
+    torch.save(state | head, tmp_path / "two.pth")
+    for source in (tmp_path / "one.safetensors", str(tmp_path / "two.pth"), state):
+        loaded = load_network(source)
+        assert same(loaded, net)
+        assert (loaded.depth, loaded.stem, loaded.training) == (18, "torchvision", False)
+
+
+def test_the_given_tensors_are_copied(state):
+    loaded = load_network(state)
+    kept = loaded.conv1.weight.clone()
+    state["conv1.weight"] = state["conv1.weight"].clone()
+    loaded = load_network(state)
+    state["conv1.weight"].zero_()
+    assert torch.equal(loaded.conv1.weight, kept)
+
+
+@pytest.mark.parametrize(("depth", "stem"), [(18, "universal"), (34, "torchvision"), (50, "universal")])
+def test_depth_and_stem_are_seen_from_the_tensors(depth, stem):
+    net = ResNet.random(1, depth, stem)
+    loaded = load_network(net.state_dict())
+    assert (loaded.depth, loaded.stem) == (depth, stem)
+    assert same(loaded, net)
+
+
+def test_a_checkpoint_of_universal_representations_is_read(tmp_path):
+    net = ResNet.random(1, 18, "universal")
+    inside = {f"module.{name}": tensor for name, tensor in net.state_dict().items()}
+    inside |= {"cls_fn.weight": torch.zeros(512, 64), "cls_fn.scale": torch.tensor(10.0)}
+    checkpoint = {
+        "epoch": 7,
+        "args": {"model.name": "url", "train.optimizer": "momentum"},
+        "state_dict": inside,
+        "best_val_acc": np.float64(63.2),  # what its training code leaves: a NumPy scalar
+        "best_val_loss": np.float32(1.5),
+    }
+    torch.save(checkpoint, tmp_path / "model_best.pth.tar")
+    assert same(load_network(tmp_path / "model_best.pth.tar"), net)
+
+
+def test_half_precision_is_read_as_float32(net, state):
+    halves = {name: t.half() if t.is_floating_point() else t for name, t in state.items()}
+    loaded = load_network(halves)
+    assert loaded.conv1.weight.dtype == torch.float32
+    assert torch.equal(loaded.conv1.weight, net.conv1.weight.half().float())
+
+
+def test_what_is_missing_or_left_over_is_named(state):
+    del state["layer3.1.bn2.running_mean"]
+    assert "ResNet-18" in refusal(state)
+    assert "lacks layer3.1.bn2.running_mean" in refusal(state)
+    state["layer3.1.bn2.running_mean"] = torch.zeros(256)
+    state["attention.weight"] = torch.zeros(3)
+    assert "also has attention.weight" in refusal(state)
+
+
+def test_a_tensor_of_another_shape_or_type_is_named(state):
+    state["layer2.0.conv1.weight"] = torch.zeros(128, 64, 5, 5)
+    message = refusal(state)
+    assert "layer2.0.conv1.weight" in message
+    assert "(128, 64, 5, 5)" in message
+    assert "(128, 64, 3, 3)" in message
+    state["layer2.0.conv1.weight"] = torch.zeros(128, 64, 3, 3, dtype=torch.int32)
+    assert "torch.int32" in refusal(state)
+
+
+@pytest.mark.parametrize(("name", "value"), [("layer1.0.conv1.weight", np.nan), ("bn1.running_var", -1.0)])
+def test_values_that_cannot_be_are_refused(state, name, value):
+    state[name] = state[name].clone()
+    state[name].view(-1)[3] = value
+    message = refusal(state)
+    assert name in message
+    assert "NaN, infinite or impossible" in message
+
+
+def test_a_double_that_overflows_float32_is_refused(state):
+    state["bn1.bias"] = torch.full((64,), 1e300, dtype=torch.float64)
+    assert "bn1.bias" in refusal(state)
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {},
+        {"conv1.weight": torch.zeros(64, 3, 3, 3)},
+        {"patch_embed.proj.weight": torch.zeros(768, 3, 16, 16)},
+        {"conv1.weight": torch.zeros(64, 3, 7, 7), "layer3.22.conv3.weight": torch.zeros(1)},
+    ],
+    ids=["nothing", "a small stem", "a transformer", "a ResNet-101"],
+)
+def test_another_architecture_is_refused(tensors):
+    message = refusal(tensors)
+    assert "expected in the given state dict a ResNet of depth 18, 34, 50" in message
+
+
+def test_names_without_tensors_are_refused():
+    assert "epoch are none" in refusal({"epoch": 3})
+
+
+class Hostile:
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return (os.mkdir, (str(self.mark),))
+
+
+@pytest.mark.parametrize("how", ["torch", "pickle"])
+def test_a_pickle_that_would_execute_is_refused_and_not_executed(tmp_path, how):
+    path, mark = tmp_path / "weights.pth", tmp_path / "executed"
+    held = {"conv1.weight": torch.zeros(3), "more": Hostile(mark)}
+    if how == "torch":
+        torch.save(held, path)
+    else:
+        path.write_bytes(pickle.dumps(held, protocol=2))
+    message = refusal(path)
+    assert "execute code" in message
+    assert str(path) in message
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("suffix", ["safetensors", "pth"])
+@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.999])
+def test_a_file_cut_off_is_refused(state, tmp_path, suffix, keep):
+    path = tmp_path / f"weights.{suffix}"
+    small = {name: state[name] for name in ("conv1.weight", "bn1.weight", "layer1.0.conv1.weight")}
+    save_file(small, path) if suffix == "safetensors" else torch.save(small, path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep)])
+    assert str(path) in refusal(path)
+
+
+@pytest.mark.parametrize("suffix", ["safetensors", "pth"])
+def test_a_file_of_something_else_is_refused(tmp_path, suffix):
+    path = tmp_path / f"weights.{suffix}"
+    path.write_text("<html>404 not found</html>" * 20)
+    assert str(path) in refusal(path)
+    torch.save([1, 2, 3], tmp_path / "list.pth")
+    assert "holds a list" in refusal(tmp_path / "list.pth")
+
+
+def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path):
+    message = refusal(tmp_path / "none.pth")
+    assert f"there is none at {tmp_path / 'none.pth'}" in message
+    assert "resnet18" in message
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(weights.CACHE_VARIABLE, str(tmp_path))
+    return tmp_path / "weights"
+
+
+def test_without_a_network_it_says_where_to_put_the_file(cache, monkeypatch):
+    def unreachable(url, path):
+        raise ConnectionError("Name or service not known")
+
+    monkeypatch.setattr(weights, "_fetch", unreachable)
+    message = refusal("resnet18")
+    assert "https://download.pytorch.org/models/resnet18-f37072fd.pth" in message
+    assert f"Put that file at {cache / 'resnet18-f37072fd.pth'} by hand" in message
+    assert "Name or service not known" in message
+
+
+def test_published_weights_are_fetched_once_and_checked(cache, state, monkeypatch, tmp_path):
+    torch.save(state, tmp_path / "published.pth")
+    content = (tmp_path / "published.pth").read_bytes()
+    url = f"https://example.org/resnet18-{hashlib.sha256(content).hexdigest()[:8]}.pth"
+    fetched = []
+
+    def fetch(url, path):
+        fetched.append(url)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+    monkeypatch.setattr(weights, "_fetch", fetch)
+    monkeypatch.setattr(weights, "PUBLISHED", {"resnet18": url})
+    for _ in range(2):
+        assert load_network("resnet18").depth == 18
+    assert fetched == [url]
+
+
+def test_a_damaged_download_is_noticed(cache, monkeypatch):
+    cache.mkdir()
+    (cache / "resnet50-0676ba61.pth").write_bytes(b"half")
+    message = refusal("resnet50")
+    assert "is damaged" in message
+    assert "0676ba61" in message
+    assert "Delete it" in message
+
+
+def test_the_downloader_itself_is_asked_for_the_right_file(cache, monkeypatch):
+    import pooch
+
+    asked = {}
+
+    def retrieve(url, **settings):
+        asked.update(settings, url=url)
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(pooch, "retrieve", retrieve)
+    assert "no route to host" in refusal("resnet34")
+    assert asked["url"] == weights.PUBLISHED["resnet34"]
+    assert asked["path"] / asked["fname"] == cache / "resnet34-b627a593.pth"

@@ -18,6 +18,7 @@
     ├── EmbeddingError                       an embedding broke its promise: mend it before it is used
     ├── WeightsError                         a file of weights is damaged, another architecture's, or unreachable
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
+    ├── FineTuneError                    a fine-tune had to stop: the f* before it stays
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
@@ -90,6 +91,10 @@ class WeightsError(ScrollTactileError):
 
 class DatasetError(ScrollTactileError):
     """A data set's folder is not laid out as its publisher does, or a file in it cannot be read."""
+
+
+class FineTuneError(ScrollTactileError):
+    """A fine-tune had to stop, with a loss that is not finite or without memory; the f* before it stays."""
 
 
 class CapacityError(ScrollTactileError, OverflowError):

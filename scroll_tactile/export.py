@@ -19,7 +19,6 @@ from scroll_tactile.model import Model
 from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import validate
-from scroll_tactile.windows import extent, scored, stages
 
 __all__ = ["export_onnx"]
 
@@ -74,7 +73,7 @@ def _shape(sensor: Sensor) -> tuple[int, int]:
 
 def _scales(model: Model, columns: int) -> tuple[int, list[int]]:
     """The stage that a touch of so many columns is judged at, and its scales."""
-    stage = min(len(stages(columns, tuple(model.scales))), len(model.calibrations)) - 1
+    stage = min(len(model.reading.stages(columns)), len(model.calibrations)) - 1
     scales = list(model.stages[stage])
     for name in model.names:
         if any(name not in model.selections[scale].places for scale in scales):
@@ -90,8 +89,8 @@ def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, i
     net = embedding.network().net
     quick, last = folded(net, embedding.stages[-1]), embedding.stages[-1]
     planes = _planes(graph, shape[1], read)
-    windows = extent(read, tuple(model.scales))
-    places = scored(windows, read)
+    windows = model.reading.extent(read)
+    places = model.reading.places(read)
     whole: list[str] = []
     features = {}
     for scale in _scales(model, read)[1]:

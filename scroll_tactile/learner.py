@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, cast
@@ -24,8 +24,10 @@ from scroll_tactile.errors import (
     SensorMismatchError,
     UnknownMaterialError,
 )
+from scroll_tactile.exemplars import Exemplar, mean_code, rank
+from scroll_tactile.finetune import fine_tune
 from scroll_tactile.images import tactile_image
-from scroll_tactile.memory import OBSERVE, Memory, give_back_scratch, pack_codes
+from scroll_tactile.memory import OBSERVE, READINGS, Capacity, Memory, give_back_scratch, pack_codes
 from scroll_tactile.model import Model
 from scroll_tactile.prediction import Prediction, Receipt
 from scroll_tactile.ridge.codes import BITS, to_codes
@@ -33,7 +35,9 @@ from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
-from scroll_tactile.windows import extent, scales, scored, stages
+from scroll_tactile.tuned import TuneReport
+from scroll_tactile.tuning import TunedReader
+from scroll_tactile.windows import Reading, scales
 from store import Store, StoreClosedError, StoreError
 
 __all__ = ["TactileLearner"]
@@ -60,6 +64,8 @@ class TactileLearner:
     sensor: whose streams it reads. embedding: the frozen features, `Kernels()` unless given.
     readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
     false_alarms: the share of touches of known materials that may be called unknown.
+    exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
+    choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
 
     In memory only; `TactileLearner.open` gives one with a path. Methods may be called from any thread.
     """
@@ -71,14 +77,18 @@ class TactileLearner:
         embedding: Embedding | None = None,
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
+        exemplars: int | None = None,
+        exemplar_bytes: int | None = None,
     ) -> None:
         _require_settings(readout, false_alarms)
         self.sensor = sensor
         self.embedding: Embedding = Kernels() if embedding is None else embedding
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
-        self._scales = scales(sensor)
-        self._memory = Memory(self.embedding.dimension, self._scales)
+        self._reading = Reading.of(sensor, self.embedding)
+        self._capacity = _capacity(exemplars, exemplar_bytes)
+        self._memory = Memory(self.embedding.dimension, self._reading, self._capacity)
+        self._tuned_reader: TunedReader | None = None
         self._store: Store | None = None
         self._saved = 0
         self._closed = False
@@ -95,11 +105,14 @@ class TactileLearner:
         embedding: Embedding | None = None,
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
+        exemplars: int | None = None,
+        exemplar_bytes: int | None = None,
         mode: Literal["write", "read"] = "write",
     ) -> TactileLearner:
         """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
 
-        sensor: may be left out for a memory that is there. mode: "read" for one that another process writes;
+        sensor: may be left out for a memory that is there, and so may the size of the buffer.
+        mode: "read" for one that another process writes;
         it shows what was committed when it was opened.
 
         Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
@@ -109,15 +122,24 @@ class TactileLearner:
         chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        identity = None if sensor is None else _identity(sensor, chosen)
+        asked = _capacity(exemplars, exemplar_bytes)
+        identity = None if sensor is None else _identity(sensor, chosen, asked)
         store = Store.open(path, identity=identity, mode=mode)
         try:
             if "sensor" not in store.identity:
                 raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
             kept = Sensor.model_validate(store.identity["sensor"])
             _require_same(store, kept, sensor, chosen)
-            learner = cls(sensor=kept, embedding=chosen, readout=readout, false_alarms=false_alarms)
-            learner._memory = Memory.load(store, chosen.dimension, learner._scales)
+            capacity = _kept_capacity(store, asked, given=exemplars is not None or exemplar_bytes is not None)
+            learner = cls(
+                sensor=kept,
+                embedding=chosen,
+                readout=readout,
+                false_alarms=false_alarms,
+                exemplars=capacity.streams,
+                exemplar_bytes=capacity.nbytes,
+            )
+            learner._memory = Memory.load(store, chosen.dimension, learner._reading, capacity)
         except BaseException:
             store.close()
             raise
@@ -145,22 +167,24 @@ class TactileLearner:
         """
         _require_name(material)
         felt = validate(stream, self.sensor)
-        columns, codes = self._read(felt)
+        image = tactile_image(felt)
+        columns, codes = image.shape[1], self._codes(image)
         with self._lock:
-            if self._closed:
-                raise StoreClosedError(f"{self!r} is closed: open its path again")
+            self._require_open()
             # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
             self._sound().statistics.require_room(codes)
-            sequence = self._keep(material, felt.key, columns, codes)
+            sequence = self._keep(material, felt, columns, codes)
             self._model = None
             if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
                 self._snapshot_later()
         return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, self._store is not None)
 
-    def predict(self, stream: Readings, *, scene: Sequence[str] | None = None) -> Prediction:
+    def predict(self, stream: Readings, *, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
         """Say what a stream feels like; the memory stays as it is.
 
         stream: as for `observe`. scene: the materials that can be here; all that were felt where it is None.
+        tuned: ask f*, where there is one that was kept (see `fine_tune`), that knows all the candidates, and whose
+        last stage the touch reaches; f answers otherwise, and `Prediction.tuned` says which of them did.
 
         Raises StreamError, UnknownMaterialError for a scene that names a material never felt, InputError for an
         empty one. Before anything was felt the answer is material None, known False.
@@ -168,23 +192,27 @@ class TactileLearner:
         felt = validate(stream, self.sensor)
         with self._lock:
             memory = self._sound()
-            if self._model is None:
-                self._model = Model.of(memory, self.readout)
-            model, longest = self._model, memory.statistics.longest
+            model, longest = self.model(), memory.statistics.longest
+            reader = self._tuned() if tuned else None
         candidates = model.names if scene is None else _candidates(scene, model.names)
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
         felt = self._as_far_as_learned(felt, longest)
-        columns, codes = self._read(felt)
-        places = scored(extent(columns, self._scales), columns)
-        means = [codes[width][chosen].mean(axis=0) for width, chosen in places.items()]
-        judgement = model.judge(candidates, means, len(stages(columns, self._scales)))
+        image = tactile_image(felt)
+        columns = image.shape[1]
+        codes = self._codes(image, model.needed(candidates, columns))
+        places = self._reading.places(columns)
+        means = {width: rows[places[width]].mean(axis=0) for width, rows in codes.items()}
+        logits = None
+        if reader is not None and set(candidates) <= set(reader.tuned.names) and model.is_last(columns):
+            logits = reader.logits(image)
+        judgement = model.judge(candidates, means, columns, logits)
         ranking = sorted(
             zip(candidates, judgement.probability.tolist(), strict=True),
             key=lambda entry: (-entry[1], entry[0]),
         )
         known = bool(judgement.novelty <= judgement.calibration.threshold(self.false_alarms))
-        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds)
+        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds, tuned=logits is not None)
 
     def _as_far_as_learned(self, felt: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned, of so many columns.
@@ -192,43 +220,135 @@ class TactileLearner:
         What comes later was never felt of any material, and the later part of a slide differs: learned from 2 s of
         BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
         """
-        frame = self._scales[0] if self.sensor.camera else 1
+        frame = self._reading.widths[0] if self.sensor.camera else 1
         return felt.first(longest // frame / self.sensor.rate)
 
-    def _read(self, felt: Stream) -> tuple[int, dict[int, npt.NDArray[np.int32]]]:
-        """The columns of a touch's tactile image, and the codes of its windows by scale."""
-        image = tactile_image(felt)
-        columns = image.shape[1]
-        windows = extent(columns, self._scales)
+    def _codes(
+        self, image: npt.NDArray[np.float32], widths: Sequence[int] | None = None
+    ) -> dict[int, npt.NDArray[np.int32]]:
+        """The codes of a tactile image's windows, by scale: all, or those of some widths."""
+        windows = self._reading.extent(image.shape[1])
+        if widths is not None:
+            windows = {width: windows[width] for width in widths}
         codes = {}
         for width, features in embed_windows(self.embedding, image, windows).items():
-            begin = windows[width]
-            expected = (len(begin), self.embedding.dimension)
+            expected = (len(windows[width]), self.embedding.dimension)
             if features.shape != expected:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
                 )
             codes[width] = to_codes(features, self.embedding.bound)
-        return columns, codes
+        return codes
+
+    def model(self) -> Model:
+        """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""
+        with self._lock:
+            memory = self._sound()
+            if self._model is None:
+                self._model = Model.of(memory, self.readout)
+            return self._model
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
         with self._lock:
             return self._sound().statistics.digest()
 
-    def _keep(self, material: str, key: bytes, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> int:
+    @property
+    def exemplars(self) -> dict[str, list[bytes]]:
+        """Material → content hashes of its exemplars, in rank order; materials in alphabetical order."""
+        with self._lock:
+            return {name: [one.key for one in those] for name, those in self._ranked().items()}
+
+    def _ranked(self) -> dict[str, list[Exemplar]]:
+        memory = self._sound()
+        if memory.exemplars is None:
+            return {}
+        statistics = memory.statistics
+
+        def mean(material: str, scale: int) -> npt.NDArray[np.int64]:
+            total = statistics.sums(scale, [material]).sum(axis=(0, 1))
+            return mean_code(total, int(statistics.counts(scale, [material]).sum()))
+
+        return rank(memory.exemplars, mean)
+
+    def fine_tune(
+        self,
+        *,
+        epochs: int | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+        progress: Callable[[str, int, int], object] | None = None,
+    ) -> TuneReport:
+        """Make f* from f by training on the exemplars; durable when this returns.
+
+        epochs: the most, 8 unless given; how many are taken is decided on exemplars held out. seed: of the order and
+        the augmentation. device: torch's name of one. progress: told (what is being done, steps done, steps in all).
+
+        The same memory, seed and device give the same f*, to the bit. f stays as it is, and f* stays what it is when
+        more is observed. Where f* does worse than f on the exemplars held out the report says so, and f goes on
+        answering. Interrupted, or after an error, the f* before stays.
+
+        Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
+        enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
+        """
+        with self._lock:
+            self._require_open()
+            model, ranked = self.model(), self._ranked()
+            without = sorted(set(model.names) - set(ranked))
+        if without and ranked:
+            raise InputError(
+                f"expected an exemplar of every material; the buffer of {self._capacity.streams} has none of "
+                f"{without[:10]}. Open a new memory with exemplars of at least {len(model.names)}"
+            )
+        told = progress or (lambda what, done, of: None)
+        tuned, report = fine_tune(
+            self.embedding, model, ranked, self.sensor, epochs=epochs, seed=seed, device=device, progress=told
+        )
+        with self._lock:
+            self._require_open()
+            memory = self._sound()
+            before, memory.tuned = memory.tuned, tuned
+            try:
+                self._snapshot()
+            except BaseException:
+                memory.tuned = before
+                raise
+            self._tuned_reader = None
+        return report
+
+    def tuned_digest(self) -> str | None:
+        """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
+        with self._lock:
+            tuned = self._sound().tuned
+            return None if tuned is None else tuned.digest()
+
+    def _tuned(self) -> TunedReader | None:
+        tuned = self._sound().tuned
+        if tuned is None or not tuned.kept:
+            return None
+        if self._tuned_reader is None or self._tuned_reader.tuned is not tuned:
+            self._tuned_reader = TunedReader(self.embedding, self._reading, tuned)
+        return self._tuned_reader
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise StoreClosedError(f"{self!r} is closed: open its path again")
+
+    def _keep(self, material: str, felt: Stream, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> int:
         """Write an observation down, then add it; its sequence."""
         sequence = self._memory.sequence + 1
+        wanted = self._memory.wants_readings(material, felt.key, felt.readings.nbytes)
+        readings = felt.readings if wanted else None
         self._whole = False
         if self._store is not None:
             try:
-                arrays = pack_codes(codes)
-                record = self._store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=arrays)
+                arrays = pack_codes(codes) | ({READINGS: felt.readings} if wanted else {})
+                record = self._store.append(OBSERVE, material, felt.key, attributes={"columns": columns}, arrays=arrays)
             except StoreError:
                 self._whole = True  # the journal refused it, and the memory never had it
                 raise
             sequence = record.sequence
-        self._memory.add(material, key, columns, codes, sequence)
+        self._memory.add(material, felt.key, columns, codes, sequence, readings)
         self._whole = True
         return sequence
 
@@ -243,7 +363,7 @@ class TactileLearner:
                     "an observation was interrupted while it was added, and a memory without a path has nothing to go "
                     "back to: make a new one"
                 )
-            self._memory = Memory.load(self._store, self.embedding.dimension, self._scales)
+            self._memory = Memory.load(self._store, self.embedding.dimension, self._reading, self._capacity)
             self._model, self._whole = None, True
         return self._memory
 
@@ -251,13 +371,20 @@ class TactileLearner:
         assert self._store is not None
         arrays, attributes = self._memory.to_arrays()
         try:
-            self._store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes)
+            chunks = self._memory.chunks()
+            self._store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes, chunks=chunks)
         except StoreError as error:
             # The observation itself is durable; only the next opening has more to replay.
             logger.warning("%s: no generation could be written: %s", self._store.path, error)
         self._saved = self._memory.sequence
         del arrays
         give_back_scratch()
+
+    def _snapshot(self) -> None:
+        if self._store is not None:
+            arrays, attributes = self._memory.to_arrays()
+            self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
+            self._store.commit(arrays, upto=self._saved, attributes=attributes, chunks=self._memory.chunks())
 
     def close(self) -> None:
         """Write what opening again would have to replay, and let go of the files; a second call does nothing.
@@ -272,9 +399,7 @@ class TactileLearner:
             try:
                 # Half an observation is never saved: the journal has the whole of it, or nothing.
                 if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
-                    arrays, attributes = self._memory.to_arrays()
-                    self._saved = self._memory.sequence
-                    store.commit(arrays, upto=self._saved, attributes=attributes)
+                    self._snapshot()
             finally:
                 store.close()
                 give_back_scratch()
@@ -288,8 +413,32 @@ class TactileLearner:
         self.close()
 
 
-def _identity(sensor: Sensor, embedding: Embedding) -> dict[str, Any]:
+def _capacity(streams: int | None, nbytes: int | None) -> Capacity:
+    """The size of the buffer that was asked for. Raises InputError for one below 0."""
+    for what, size in (("exemplars", streams), ("exemplar_bytes", nbytes)):
+        if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 0):
+            raise InputError(f"expected {what} as a whole number of 0 or more; came {size!r}")
+    if streams is None and nbytes is None:
+        return Capacity()
+    return Capacity(0 if nbytes == 0 else streams, nbytes or None)
+
+
+def _kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
+    """The size of the buffer that a memory was made with. Raises MismatchError where another one was asked for."""
+    if "exemplars" not in store.identity:  # made before there were any: those felt from now on are kept
+        return asked
+    kept = Capacity(*cast(list[int | None], store.identity["exemplars"]))
+    if given and kept != asked:
+        raise MismatchError(
+            f"{store.path} was made with exemplars={kept.streams}, exemplar_bytes={kept.nbytes}; it was opened with "
+            f"{asked.streams} and {asked.nbytes}. What was not kept cannot be had back: leave them out"
+        )
+    return kept
+
+
+def _identity(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dict[str, Any]:
     return {
+        "exemplars": [capacity.streams, capacity.nbytes],
         "sensor": sensor.model_dump(mode="json"),
         "embedding": {
             "name": embedding.name,
@@ -313,7 +462,7 @@ def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: 
             f"{store.path} holds the memory of sensor {kept.name!r}; it was opened for {sensor.name!r} "
             f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
         )
-    mine = _identity(kept, embedding)
+    mine = _identity(kept, embedding, Capacity())
     if (theirs := cast(dict[str, Any], store.identity["embedding"])) != mine["embedding"]:
         ours = mine["embedding"]
         raise EmbeddingMismatchError(

@@ -1,48 +1,86 @@
-"""A memory: exact statistics with their pool, and how both are kept in a store."""
+"""A memory: exact statistics, pool, exemplars and f*, and how they are kept in a store."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.exemplars import Exemplar, ExemplarPool
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
-from scroll_tactile.windows import extent, scored, stages
+from scroll_tactile.tuned import Tuned
+from scroll_tactile.windows import Reading
 from store import Record, Store
 
-__all__ = ["OBSERVE", "Memory", "give_back_scratch", "pack_codes", "unpack_codes"]
+__all__ = ["OBSERVE", "READINGS", "Capacity", "Memory", "give_back_scratch", "pack_codes", "unpack_codes"]
 
 logger = logging.getLogger(__name__)
 
 OBSERVE = "observe"  # the kind of a journal row
+READINGS = "readings"  # the array of a row that keeps a stream raw
 Codes = dict[int, npt.NDArray[np.int32]]
 
 
-class Memory:
-    """What was felt: statistics at every scale, and the pool of touches that readouts are tried on."""
+@dataclass(frozen=True)
+class Capacity:
+    """Of the exemplar buffer: in streams, or in bytes of raw readings; 0 streams: nothing is kept raw."""
 
-    def __init__(self, dimension: int, scales: Sequence[int]) -> None:
-        self.statistics = Statistics(dimension, scales)
+    streams: int | None = 400
+    nbytes: int | None = None
+
+    def pool(self) -> ExemplarPool | None:
+        """An empty pool of this capacity; None where nothing is to be kept."""
+        return None if self.streams == 0 else ExemplarPool(self.streams, capacity_bytes=self.nbytes)
+
+
+class Memory:
+    """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
+
+    dimension: d. reading: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
+    tuned: f*, of the last fine-tune; None before one.
+    """
+
+    def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
+        self.reading = reading
+        self.capacity = capacity or Capacity()
+        self.statistics = Statistics(dimension, reading.widths)
         self.pool = Pool()
+        self.exemplars = self.capacity.pool()
+        self.tuned: Tuned | None = None
         self.sequence = 0
 
-    def add(self, material: str, key: bytes, columns: int, codes: Codes, sequence: int) -> None:
-        """Add an observation: a touch of so many columns, its codes by scale.
+    def wants_readings(self, material: str, key: bytes, nbytes: int) -> bool:
+        """Whether a stream's readings, of so many bytes, are to be kept as an exemplar's."""
+        return self.exemplars is not None and self.exemplars.wants(material, key, nbytes)
+
+    def add(
+        self,
+        material: str,
+        key: bytes,
+        columns: int,
+        codes: Codes,
+        sequence: int,
+        readings: npt.NDArray[np.float32] | None = None,
+    ) -> None:
+        """Add an observation: a touch of so many columns, its codes by scale, its readings where they are wanted.
 
         Raises CapacityError before anything is added.
         """
         self.statistics.add(material, fold_of(key), codes, columns)
         if self.pool.wants(material, key):
-            read = extent(columns, self.statistics.scales)
-            scored_at = [scored(read, length) for length in stages(columns, self.statistics.scales)]
+            scored_at = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
             self.pool.add(material, key, Touch.of(scored_at, codes))
+        if readings is not None and self.wants_readings(material, key, readings.nbytes):
+            assert self.exemplars is not None
+            self.exemplars.add(Exemplar.of(material, key, readings, codes))
         self.sequence = sequence
 
     def replay(self, record: Record) -> None:
@@ -56,30 +94,38 @@ class Memory:
                 "only. Open the memory with the version that wrote it, or a newer one"
             )
         columns = cast(int, record.attributes["columns"])
-        self.add(record.label, record.key, columns, unpack_codes(record.arrays), record.sequence)
+        codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
+        self.add(record.label, record.key, columns, codes, record.sequence, readings)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """Arrays and attributes of a generation."""
         arrays, names = self.statistics.to_arrays()
         pooled, materials = self.pool.to_arrays()
-        attributes = {
+        attributes: dict[str, Any] = {
             "dimension": self.statistics.dimension,
             "scales": list(self.statistics.scales),
             "materials": names,
             "pool": materials,
         }
-        return arrays | pooled, attributes
+        arrays |= pooled
+        for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
+            if part is not None:
+                its_arrays, attributes[name] = part.to_arrays()
+                arrays |= its_arrays
+        return arrays, attributes
+
+    def chunks(self) -> dict[str, int]:
+        """Rows in a chunk, of the arrays that are read piece by piece: one exemplar of the usual length is one read."""
+        lengths = [] if self.exemplars is None else [len(one.readings) for one in self.exemplars]
+        return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
 
     @classmethod
-    def load(cls, store: Store, dimension: int, scales: Sequence[int]) -> Memory:
+    def load(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None = None) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
-        memory = cls(dimension, scales)
+        memory = cls(dimension, reading, capacity)
         generation = store.latest()
         if generation is not None:
-            names = cast(list[str], generation.attributes["materials"])
-            pool = cast(list[str], generation.attributes["pool"])
-            memory.statistics = Statistics.from_arrays(dimension, scales, generation.arrays, names)
-            memory.pool = Pool.from_arrays(generation.arrays, pool)
+            memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
             memory.sequence = generation.upto
         replayed = 0
         for record in store.records(after=memory.sequence):
@@ -93,15 +139,30 @@ class Memory:
         )
         return memory
 
+    def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+        names, widths = attributes["materials"], self.reading.widths
+        self.statistics = Statistics.from_arrays(self.statistics.dimension, widths, arrays, names)
+        self.pool = Pool.from_arrays(arrays, attributes["pool"])
+        if self.exemplars is not None and "exemplars" in attributes:
+            self.exemplars = ExemplarPool.from_arrays(
+                arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
+            )
+        if "tuned" in attributes:
+            self.tuned = Tuned.from_arrays(arrays, attributes["tuned"])
+
 
 def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
     """Codes by scale as the arrays of a journal row: their distinct values, and places among them.
 
     Windows hold few distinct values (a proportion of 22 positions has 23), so a place is a byte and packs well.
+    A network's features hardly repeat: they are kept as they are.
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     for scale, rows in codes.items():
         values, places = np.unique(rows, return_inverse=True)
+        if 4 * len(values) > rows.size and rows.size > 2**8:
+            arrays[f"codes-{scale}"] = rows
+            continue
         kind = np.uint8 if len(values) <= 2**8 else np.uint16 if len(values) <= 2**16 else np.uint32
         arrays[f"values-{scale}"] = values
         # Feature by feature: one feature's values in neighbouring windows are alike.
@@ -111,11 +172,13 @@ def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDAr
 
 def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
     """The codes that `pack_codes` packed."""
+    plain = {int(name.removeprefix("codes-")): rows for name, rows in arrays.items() if name.startswith("codes-")}
     scales = [int(name.removeprefix("values-")) for name in arrays if name.startswith("values-")]
-    return {
+    packed = {
         scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
-        for scale in sorted(scales)
+        for scale in scales
     }
+    return dict(sorted((plain | packed).items()))
 
 
 def give_back_scratch() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from scroll_tactile.ridge.calibration import Calibration, calibrate
 from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.selection import Selection, select
-from scroll_tactile.windows import fitting, milestones
+from scroll_tactile.windows import Reading
 
 __all__ = ["Judgement", "Model"]
 
@@ -31,11 +31,11 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Model:
-    """names: the materials. selections: scale → its readout. stages: for each, the scales that fit there."""
+    """names: the materials. selections: scale → its readout. stages: for each, the scales that judge there."""
 
     kind: ReadoutName
     names: list[str]
-    scales: Sequence[int]
+    reading: Reading
     stages: list[list[int]]
     selections: dict[int, Selection]
     calibrations: list[Calibration]
@@ -45,57 +45,82 @@ class Model:
         """Fit the readouts of a memory and calibrate them."""
         statistics = memory.statistics
         scales = statistics.scales
-        stages = [fitting(length, scales) for length in milestones(scales)]
+        stages = [memory.reading.judging(length) for length in memory.reading.milestones()]
         with one_thread():
             chosen = {scale: select(statistics, scale, kind) for scale in scales}
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
         give_back_scratch()
-        return cls(kind, list(statistics.materials), scales, stages, selections, calibrations)
+        return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations)
 
-    def judge(self, candidates: Sequence[str], means: Sequence[FloatArray], reached: int) -> Judgement:
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """The widths of windows, ascending."""
+        return self.reading.widths
+
+    def is_last(self, columns: int) -> bool:
+        """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
+        return min(len(self.reading.stages(columns)), len(self.calibrations)) == len(self.stages)
+
+    def needed(self, candidates: Sequence[str], columns: int) -> list[int]:
+        """The scales whose windows judging these candidates for a touch of so many columns takes."""
+        decided = self._decided(candidates, len(self.reading.stages(columns)))
+        return sorted({scale for stage, _ in decided for scale in self.stages[stage]})
+
+    def judge(
+        self,
+        candidates: Sequence[str],
+        means: Mapping[int, FloatArray],
+        columns: int,
+        tuned: Mapping[str, float] | None = None,
+    ) -> Judgement:
         """Weigh the candidates for a touch.
 
-        means: for each scale that fits the touch its mean codes, shape (d,). reached: how many stages it reached.
+        means: for each scale that is `needed` the mean codes of the touch's windows, shape (d,). columns: felt so far.
+        tuned: logits of f*, by material, in place of the last stage's scores.
 
         Materials that were felt at fewer scales are weighed against all others at the stage that they share; what
         these leave over is shared out among the others at the finer stages.
         """
-        reached = min(reached, len(self.calibrations))
-        projected = [
-            self.selections[scale].readout.project(mean)
-            for scale, mean in zip(self.scales, means, strict=False)
-            if scale in self.selections
-        ]
-        groups = [self._felt_at(scales, candidates) for scales in self.stages[:reached]]
+        reached = len(self.reading.stages(columns))
+        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
         probability, mass = np.ones(len(candidates)), 1.0
-        for at, members in enumerate(groups):
-            later = groups[at + 1] if at + 1 < reached else []
-            if len(later) < len(members):
-                shares = self._shares(at, projected, [candidates[place] for place in members])
-                probability[members] = shares * mass
-                mass = float(probability[later].sum())
+        decided = self._decided(candidates, reached)
+        for at, (stage, members) in enumerate(decided):
+            names = [candidates[place] for place in members]
+            last = tuned is not None and stage == len(self.stages) - 1
+            logits = np.array([tuned[name] for name in names]) if last and tuned else self._logits(stage, z, names)
+            chances = np.exp(logits - logits.max())
+            probability[members] = chances / chances.sum() * mass
+            later = decided[at + 1][1] if at + 1 < len(decided) else []
+            mass = float(probability[later].sum())
         best = int(np.argmax(probability))
-        stage = max(at for at, members in enumerate(groups) if best in members)
+        stage = max(stage for stage, members in decided if best in members)
         calibration = self.calibrations[stage]
-        distances = [
-            self._distance(scale, z, candidates) for scale, z in zip(self.stages[stage], projected, strict=False)
-        ]
+        distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
+
+    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
+        """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
+        groups = [self._felt_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
+        return [
+            (stage, members)
+            for stage, members in enumerate(groups)
+            if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
+        ]
 
     def _felt_at(self, scales: Sequence[int], candidates: Sequence[str]) -> list[int]:
         """The places of the candidates that were felt at all of these scales."""
         known = [self.selections[scale].places for scale in scales]
         return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
 
-    def _shares(self, stage: int, projected: Sequence[FloatArray], names: Sequence[str]) -> FloatArray:
+    def _logits(self, stage: int, z: Mapping[int, FloatArray], names: Sequence[str]) -> FloatArray:
         logits = np.zeros(len(names))
-        for scale, z, weight in zip(self.stages[stage], projected, self.calibrations[stage].weights, strict=False):
+        for scale, weight in zip(self.stages[stage], self.calibrations[stage].weights, strict=True):
             selection = self.selections[scale]
-            logits += weight * selection.readout.scores(z, self.kind)[[selection.places[name] for name in names]]
-        chances = np.exp(logits - logits.max())
-        shares: FloatArray = chances / chances.sum()
-        return shares
+            places = [selection.places[name] for name in names]
+            logits += weight * selection.readout.scores(z[scale], self.kind)[places]
+        return logits
 
     def _distance(self, scale: int, z: FloatArray, candidates: Sequence[str]) -> float:
         selection = self.selections[scale]

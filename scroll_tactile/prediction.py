@@ -39,6 +39,7 @@ class Prediction:
         then `material` is only what comes nearest.
     seconds: how much touch the answer rests on: the stream's length, or that of the longest touch learned where the
         stream is longer, for nothing was ever felt of how a material goes on after that.
+    tuned: whether f*, the fine-tuned model, gave the probabilities; f did otherwise. Novelty is always f's.
     """
 
     material: str | None
@@ -47,3 +48,4 @@ class Prediction:
     novelty: float
     known: bool
     seconds: float
+    tuned: bool = False

@@ -8,13 +8,26 @@ statistics of its own. A stream is known from its first 0.3 s on, and better wit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["MOST_WINDOWS", "Extent", "extent", "fitting", "milestones", "scales", "scored", "stages"]
+__all__ = [
+    "ENOUGH",
+    "MOST_WINDOWS",
+    "Extent",
+    "Reading",
+    "extent",
+    "fitting",
+    "milestones",
+    "scales",
+    "scored",
+    "stages",
+]
 
 SHORTEST = 0.3  # seconds
 LONGEST = 0.75  # of the usual duration: a usual touch has several windows of it
@@ -40,20 +53,23 @@ def scales(sensor: Sensor) -> tuple[int, ...]:
     return (shortest, longest) if two else (shortest,)
 
 
-def extent(columns: int, widths: tuple[int, ...]) -> Extent:
+def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> Extent:
     """The windows that are read of a touch of so many columns, at every scale that fits.
 
     The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
     rests on: their steps grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
     few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale, but not
-    much, is one window of it; of the shortest scale every touch is.
+    much, is one window of it, if windows may be `partial`; of the shortest scale every touch is.
     """
-    return {width: _starts(columns, width, dense=width == widths[0]) for width in fitting(columns, widths)}
+    return {
+        width: _starts(columns, width, dense=width == widths[0]) for width in fitting(columns, widths, partial=partial)
+    }
 
 
-def fitting(columns: int, widths: tuple[int, ...]) -> list[int]:
+def fitting(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
     """The widths of which a touch of so many columns has a window."""
-    return [width for width in widths if width == widths[0] or columns >= ENOUGH * width]
+    enough = ENOUGH if partial else 1.0
+    return [width for width in widths if width == widths[0] or columns >= enough * width]
 
 
 def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
@@ -71,7 +87,7 @@ def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
     return begin
 
 
-def scored(extent: Mapping[int, Sequence[int]], length: int) -> dict[int, list[int]]:
+def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
     """Width → places of the windows whose scores are averaged when the first `length` columns have been felt.
 
     Those that lie within it; of the shortest only such as begin at least half a width after the one before:
@@ -79,7 +95,7 @@ def scored(extent: Mapping[int, Sequence[int]], length: int) -> dict[int, list[i
     """
     widths = tuple(sorted(extent))
     chosen: dict[int, list[int]] = {}
-    for width in fitting(length, widths):
+    for width in fitting(length, widths, partial=partial):
         begin = extent[width]
         apart = width // 2 if width == widths[0] else 1
         places: list[int] = []
@@ -91,18 +107,63 @@ def scored(extent: Mapping[int, Sequence[int]], length: int) -> dict[int, list[i
     return chosen
 
 
-def milestones(widths: tuple[int, ...]) -> tuple[int, ...]:
+def milestones(widths: tuple[int, ...], *, partial: bool = True) -> tuple[int, ...]:
     """The lengths at which a touch reaches its stages: where a scale first fits, and halfway to the next (geometric).
 
     How far a scale is to be believed depends on how many of its windows there are, so calibration is measured at
     each: BioTac 30, 77 and 195 readings.
     """
-    fit = [widths[0], *(int(np.ceil(ENOUGH * width)) for width in widths[1:])]
+    fit = [widths[0], *(int(np.ceil((ENOUGH if partial else 1.0) * width)) for width in widths[1:])]
     between = [round(float(np.sqrt(low * high))) for low, high in pairwise(fit)]
     return tuple(sorted({*fit, *between}))
 
 
-def stages(columns: int, widths: tuple[int, ...]) -> list[int]:
+def stages(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
     """The lengths of a touch's stages: the milestones that it reached, the last replaced by its own length."""
-    reached = [length for length in milestones(widths) if length <= columns]
+    reached = [length for length in milestones(widths, partial=partial) if length <= columns]
     return [*reached[:-1], columns]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the touches of a sensor are read by an embedding: which windows, and which scales judge.
+
+    widths: the scales, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
+    judged: "all" scales that fit a touch, or the "widest" of them alone.
+    """
+
+    widths: tuple[int, ...]
+    partial: bool = True
+    judged: Literal["all", "widest"] = "all"
+
+    @classmethod
+    def of(cls, sensor: Sensor, embedding: object) -> Reading:
+        """As the embedding asks for by its attributes `partial_windows` and `judged_scales`, where it has them."""
+        partial = bool(getattr(embedding, "partial_windows", True))
+        return cls(scales(sensor), partial, getattr(embedding, "judged_scales", "all"))
+
+    def extent(self, columns: int) -> Extent:
+        """The windows that are read of a touch of so many columns."""
+        return extent(columns, self.widths, partial=self.partial)
+
+    def judging(self, length: int) -> list[int]:
+        """The scales that judge when so many columns have been felt."""
+        fit = fitting(length, self.widths, partial=self.partial)
+        return fit[-1:] if self.judged == "widest" else fit
+
+    def scored(self, columns: int, length: int) -> dict[int, list[int]]:
+        """Of a touch of so many columns: width → places of the windows that judge after the first `length`."""
+        places = scored(self.extent(columns), length, partial=self.partial)
+        return {width: places[width] for width in self.judging(length)}
+
+    def places(self, columns: int) -> dict[int, list[int]]:
+        """Of a touch of so many columns: width → places of the windows whose codes are averaged, at every scale."""
+        return scored(self.extent(columns), columns, partial=self.partial)
+
+    def milestones(self) -> tuple[int, ...]:
+        """The lengths at which a touch reaches its stages."""
+        return milestones(self.widths, partial=self.partial)
+
+    def stages(self, columns: int) -> list[int]:
+        """The lengths of a touch's stages, the last its own."""
+        return stages(columns, self.widths, partial=self.partial)

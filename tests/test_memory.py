@@ -9,10 +9,11 @@ from hypothesis.extra import numpy as arrays_of
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.memory import OBSERVE, Memory, pack_codes, unpack_codes
 from scroll_tactile.ridge.moments import MOST_ROWS, SecondMoment
-from scroll_tactile.windows import extent
+from scroll_tactile.windows import Reading, extent
 from store import Store
 
 DIMENSION, SCALES = 4, (6, 20)
+READING = Reading(SCALES)
 
 codes_of_scale = arrays_of.arrays(
     np.int32, st.tuples(st.integers(1, 9), st.integers(1, 5)), elements=st.integers(-(2**20), 2**20)
@@ -53,7 +54,7 @@ def touch(seed):
 
 
 def filled(seeds):
-    memory = Memory(DIMENSION, SCALES)
+    memory = Memory(DIMENSION, READING)
     for at, seed in enumerate(seeds, start=1):
         memory.add(*touch(seed), at)
     return memory
@@ -86,7 +87,7 @@ def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, up
             arrays, attributes = filled(range(upto)).to_arrays()
             store.commit(arrays, upto=upto, attributes=attributes)
     with Store.open(tmp_path / "s") as store:
-        memory = Memory.load(store, DIMENSION, SCALES)
+        memory = Memory.load(store, DIMENSION, READING)
         assert content(memory) == content(filled(range(12)))
         # And it goes on from there, with arrays of its own.
         for seed in range(12, 16):
@@ -94,7 +95,7 @@ def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, up
             memory.replay(record)
         assert content(memory) == content(filled(range(16)))
         store.commit(memory.to_arrays()[0], upto=16, attributes=memory.to_arrays()[1])
-        assert content(Memory.load(store, DIMENSION, SCALES)) == content(memory)
+        assert content(Memory.load(store, DIMENSION, READING)) == content(memory)
 
 
 def test_a_full_memory_refuses_and_stays_as_it_was():

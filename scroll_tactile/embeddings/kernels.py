@@ -14,6 +14,7 @@ import torch
 
 from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
 from scroll_tactile.embeddings.levels import triangle_features, window_statistics
+from scroll_tactile.windows import ENOUGH
 
 __all__ = ["Kernels"]
 
@@ -25,7 +26,6 @@ SHARE_IN_SHORT = 0.3
 REACH = 0.6  # of a window: a dilated kernel that spans more has too few positions left
 MOST_FEATURES = 8192  # the shortest windows have one dilation, whose bank has 378 kernels of 24 thresholds
 DEFAULT_SEED = 1  # measured with the seeds 0 to 5: BioTac-20 98.6 to 99.2 %, RoboSkin-20 97.6 to 98.3 %
-ENOUGH = 0.65  # of a width: more than REACH, so that every kernel of the width has positions left
 MOST_COLUMNS = 2048  # of a whole image convolved at once; longer ones are read window by window
 
 

@@ -46,6 +46,11 @@ class Cached:
         return getattr(self._embedding, name)
 
     @property
+    def plain(self) -> Embedding:
+        """The wrapped one, for images that will not be read again, such as augmented ones."""
+        return self._embedding
+
+    @property
     def name(self) -> str:
         """The wrapped embedding's."""
         return self._embedding.name

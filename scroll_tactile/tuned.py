@@ -1,0 +1,96 @@
+"""What a fine-tune leaves: f*, as arrays, and the word on whether it is used."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["TuneMode", "TuneReport", "Tuned"]
+
+TuneMode = Literal["head", "adapters", "network"]
+"""What is trained: the readout's weights alone, residual adapters too, or the whole network too."""
+
+
+@dataclass(frozen=True)
+class TuneReport:
+    """What came of a fine-tune.
+
+    kept: whether `predict(tuned=True)` answers with f*; f answers where it did worse on exemplars held out.
+    reason: why. mode: what was trained. exemplars: trained on. epochs: chosen on exemplars held out.
+    held_out: "f" and "f*" → {"loss": mean log loss, "wrong": share of wrong answers} on them; empty without any.
+    seconds: that it took. digest: hex of the SHA-256 of f*'s weights.
+    """
+
+    kept: bool
+    reason: str
+    mode: TuneMode
+    exemplars: int
+    epochs: int
+    held_out: dict[str, dict[str, float]]
+    seconds: float
+    digest: str
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """f*: a linear head over mean features of each scale, and the network's tensors that were trained.
+
+    names: the materials it tells apart, C of them. heads: width of windows → float64 (d, C), of features as shares of
+    the embedding's bound. bias: (C,). network: tensor name → float32, to be put over the embedding's own; empty
+    where only the head was trained. mode: see TuneMode. kept: whether it answers. report: of how it was made.
+    """
+
+    names: list[str]
+    heads: dict[int, npt.NDArray[np.float64]]
+    bias: npt.NDArray[np.float64]
+    network: dict[str, npt.NDArray[np.float32]]
+    mode: TuneMode
+    kept: bool
+    report: dict[str, Any] = field(default_factory=dict)
+
+    def digest(self) -> str:
+        """Hex of a SHA-256 over the materials and all weights: equal if and only if these are, byte for byte."""
+        digest = hashlib.sha256(repr((self.mode, self.names, sorted(self.heads), sorted(self.network))).encode())
+        for _, head in sorted(self.heads.items()):
+            digest.update(head.astype("<f8").tobytes())
+        digest.update(self.bias.astype("<f8").tobytes())
+        for _, tensor in sorted(self.network.items()):
+            digest.update(repr(tensor.shape).encode() + tensor.astype("<f4").tobytes())
+        return digest.hexdigest()
+
+    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """What a store keeps: arrays by name, and JSON beside them."""
+        arrays: dict[str, npt.NDArray[Any]] = {f"tuned-head-{scale}": head for scale, head in self.heads.items()}
+        arrays["tuned-bias"] = self.bias
+        arrays |= {f"tuned-net-{name}": tensor for name, tensor in self.network.items()}
+        about = {"names": self.names, "mode": self.mode, "kept": self.kept, "report": self.report}
+        return arrays, about
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> Tuned:
+        """The f* that `to_arrays` described."""
+
+        def named(prefix: str) -> dict[str, npt.NDArray[Any]]:
+            return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+        heads = {int(scale): head for scale, head in named("tuned-head-").items()}
+        network = named("tuned-net-")
+        return cls(
+            list(about["names"]),
+            heads,
+            arrays["tuned-bias"],
+            network,
+            about["mode"],
+            about["kept"],
+            dict(about["report"]),
+        )
+
+    @staticmethod
+    def described(report: TuneReport) -> dict[str, Any]:
+        """A report as JSON, without what differs between two runs that give the same bytes."""
+        return {name: value for name, value in asdict(report).items() if name not in ("seconds", "digest")}

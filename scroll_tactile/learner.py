@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self, cast
+from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,28 +16,26 @@ import numpy.typing as npt
 from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
 from scroll_tactile.errors import (
     EmbeddingError,
-    EmbeddingMismatchError,
     InputError,
     MaterialError,
     MismatchError,
     ScrollTactileError,
-    SensorMismatchError,
     UnknownMaterialError,
 )
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.finetune import fine_tune
+from scroll_tactile.identity import capacity_of, identity_of, kept_capacity, require_same
 from scroll_tactile.images import tactile_image
-from scroll_tactile.memory import OBSERVE, READINGS, Capacity, Memory, give_back_scratch, pack_codes
+from scroll_tactile.memory import OBSERVE, READINGS, Memory, give_back_scratch, pack_codes
 from scroll_tactile.model import Model
 from scroll_tactile.prediction import Prediction, Receipt
-from scroll_tactile.ridge.codes import BITS, to_codes
+from scroll_tactile.ridge.codes import to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
-from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
-from scroll_tactile.windows import Reading, scales
+from scroll_tactile.windows import Reading
 from store import Store, StoreClosedError, StoreError
 
 __all__ = ["TactileLearner"]
@@ -86,7 +84,7 @@ class TactileLearner:
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
         self._reading = Reading.of(sensor, self.embedding)
-        self._capacity = _capacity(exemplars, exemplar_bytes)
+        self._capacity = capacity_of(exemplars, exemplar_bytes)
         self._memory = Memory(self.embedding.dimension, self._reading, self._capacity)
         self._tuned_reader: TunedReader | None = None
         self._store: Store | None = None
@@ -122,15 +120,15 @@ class TactileLearner:
         chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        asked = _capacity(exemplars, exemplar_bytes)
-        identity = None if sensor is None else _identity(sensor, chosen, asked)
+        asked = capacity_of(exemplars, exemplar_bytes)
+        identity = None if sensor is None else identity_of(sensor, chosen, asked)
         store = Store.open(path, identity=identity, mode=mode)
         try:
             if "sensor" not in store.identity:
                 raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
             kept = Sensor.model_validate(store.identity["sensor"])
-            _require_same(store, kept, sensor, chosen)
-            capacity = _kept_capacity(store, asked, given=exemplars is not None or exemplar_bytes is not None)
+            require_same(store, kept, sensor, chosen)
+            capacity = kept_capacity(store, asked, given=exemplars is not None or exemplar_bytes is not None)
             learner = cls(
                 sensor=kept,
                 embedding=chosen,
@@ -411,70 +409,6 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _capacity(streams: int | None, nbytes: int | None) -> Capacity:
-    """The size of the buffer that was asked for. Raises InputError for one below 0."""
-    for what, size in (("exemplars", streams), ("exemplar_bytes", nbytes)):
-        if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 0):
-            raise InputError(f"expected {what} as a whole number of 0 or more; came {size!r}")
-    if streams is None and nbytes is None:
-        return Capacity()
-    return Capacity(0 if nbytes == 0 else streams, nbytes or None)
-
-
-def _kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
-    """The size of the buffer that a memory was made with. Raises MismatchError where another one was asked for."""
-    if "exemplars" not in store.identity:  # made before there were any: those felt from now on are kept
-        return asked
-    kept = Capacity(*cast(list[int | None], store.identity["exemplars"]))
-    if given and kept != asked:
-        raise MismatchError(
-            f"{store.path} was made with exemplars={kept.streams}, exemplar_bytes={kept.nbytes}; it was opened with "
-            f"{asked.streams} and {asked.nbytes}. What was not kept cannot be had back: leave them out"
-        )
-    return kept
-
-
-def _identity(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dict[str, Any]:
-    return {
-        "exemplars": [capacity.streams, capacity.nbytes],
-        "sensor": sensor.model_dump(mode="json"),
-        "embedding": {
-            "name": embedding.name,
-            "dimension": embedding.dimension,
-            "bound": embedding.bound,
-            "fingerprint": embedding.fingerprint,
-        },
-        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(scales(sensor))},
-    }
-
-
-def _require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: Embedding) -> None:
-    """Compare what a memory was made with to what it is opened with."""
-    if sensor is not None and sensor != kept:
-        differing = [
-            f"{name} {getattr(kept, name)!r} there, {getattr(sensor, name)!r} here"
-            for name in Sensor.model_fields
-            if getattr(kept, name) != getattr(sensor, name)
-        ]
-        raise SensorMismatchError(
-            f"{store.path} holds the memory of sensor {kept.name!r}; it was opened for {sensor.name!r} "
-            f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
-        )
-    mine = _identity(kept, embedding, Capacity())
-    if (theirs := cast(dict[str, Any], store.identity["embedding"])) != mine["embedding"]:
-        ours = mine["embedding"]
-        raise EmbeddingMismatchError(
-            f"{store.path} was made with embedding {theirs['name']!r} ({theirs['dimension']} features, fingerprint "
-            f"{theirs['fingerprint'][:12]}); it was opened with {ours['name']!r} ({ours['dimension']} features, "
-            f"fingerprint {ours['fingerprint'][:12]}). Features of one mean nothing to the other: open it with the "
-            "embedding that made it, or take another path"
-        )
-    if store.identity["grid"] != mine["grid"]:
-        raise MismatchError(
-            f"{store.path} was made with {store.identity['grid']}; this version works with {mine['grid']}"
-        )
 
 
 def _require_settings(readout: str, false_alarms: float) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors, finetune
+from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors, finetune, training
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.images import tactile_image
 from scroll_tactile.sensors import Sensor
@@ -168,7 +168,7 @@ def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
 def test_a_loss_that_is_not_finite_stops_and_says_where(monkeypatch):
     learner = taught("kernels")
     before = learner.fine_tune(epochs=1).digest
-    monkeypatch.setattr(finetune, "HEAD_RATE", float("inf"))
+    monkeypatch.setattr(training, "HEAD_RATE", float("inf"))
     for epochs, where in (
         (8, r"loss became nan in held out 1/3, epoch 2"),
         (1, "weights .* not finite after held out 1/3"),
@@ -184,7 +184,7 @@ def test_a_device_without_memory_left_is_told_as_such(monkeypatch):
     def full(*args, **kwargs):
         raise torch.OutOfMemoryError("tried to allocate 2 GiB")
 
-    monkeypatch.setattr(finetune.functional, "cross_entropy", full)
+    monkeypatch.setattr(training.functional, "cross_entropy", full)
     with pytest.raises(errors.FineTuneError, match="out of memory in held out 1/3, epoch 1"):
         learner.fine_tune(epochs=1)
     assert learner.tuned_digest() is None
@@ -261,7 +261,7 @@ def test_the_start_is_f_itself():
     for readout in ("lda", "ridge"):
         learner = taught("kernels", readout=readout)
         model = learner.model()
-        start = finetune._start(model, model.names)
+        start = training.start_of(model, model.names)
         features = TouchFeatures(learner.embedding, learner._reading)
         image = tactile_image(SCENE.touch(NAMES[3], 40))
         frozen = features.frozen(image)

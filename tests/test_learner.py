@@ -646,7 +646,7 @@ def test_a_memory_of_another_sensor_or_embedding_is_refused_and_named(tmp_path):
 def test_a_memory_of_another_grid_is_refused(tmp_path, monkeypatch):
     with opened(tmp_path / "m") as learner:
         feel(learner, 1)
-    monkeypatch.setattr("scroll_tactile.learner.FOLDS", 5)
+    monkeypatch.setattr("scroll_tactile.identity.FOLDS", 5)
     with pytest.raises(MismatchError, match="folds"):
         opened(tmp_path / "m")
 

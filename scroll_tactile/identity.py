@@ -43,6 +43,7 @@ def identity_of(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dic
     """What is written into a new memory for good, in JSON's types."""
     return {
         "exemplars": [capacity.streams, capacity.nbytes],
+        "reading": [getattr(embedding, "partial_windows", True), getattr(embedding, "judged_scales", "all")],
         "sensor": sensor.model_dump(mode="json"),
         "embedding": {
             "name": embedding.name,
@@ -74,6 +75,11 @@ def require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: E
             f"{theirs['fingerprint'][:12]}); it was opened with {ours['name']!r} ({ours['dimension']} features, "
             f"fingerprint {ours['fingerprint'][:12]}). Features of one mean nothing to the other: open it with the "
             "embedding that made it, or take another path"
+        )
+    if store.identity.get("reading", mine["reading"]) != mine["reading"]:
+        raise EmbeddingMismatchError(
+            f"{store.path} was made with an embedding whose partial_windows and judged_scales are "
+            f"{store.identity['reading']}; it was opened with one whose are {mine['reading']}. Open it with those"
         )
     if store.identity["grid"] != mine["grid"]:
         raise MismatchError(

@@ -15,7 +15,7 @@ from torch.nn import functional
 from scroll_tactile.embeddings import Embedding, embed_windows
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
-from scroll_tactile.embeddings.vision import TunableVision
+from scroll_tactile.embeddings.vision import TOGETHER, TunableVision
 from scroll_tactile.tuned import Tuned
 from scroll_tactile.windows import Reading
 
@@ -96,7 +96,8 @@ class TouchFeatures:
     """Mean features of touches, by scale, with the embedding's frozen parts and any network for the rest.
 
     Features are given as shares of the embedding's bound. Of several parts at most one, the first that has a
-    `network`, is tuned.
+    `network`, is tuned, and of the scales those whose windows share one pass; narrower windows stay as the embedding
+    reads them, each by itself.
     """
 
     def __init__(self, embedding: Embedding, reading: Reading) -> None:
@@ -111,8 +112,8 @@ class TouchFeatures:
 
     @property
     def tunable(self) -> bool:
-        """Whether there is a network to be trained."""
-        return self._at is not None
+        """Whether there is a network to be trained, and a scale that it reads."""
+        return self._at is not None and self.reading.judging(self.reading.milestones()[-1])[-1] >= TOGETHER
 
     def network(self) -> Backbone:
         """A new copy of the network, with the embedding's own weights."""
@@ -128,13 +129,14 @@ class TouchFeatures:
         }
 
     def frozen(self, image: npt.NDArray[np.float32]) -> dict[int, FloatArray]:
-        """Width → mean features (d,) of the frozen parts, zero in the place of the network's."""
+        """Width → mean features (d,) of all that no training changes, zero in the place of the network's."""
         windows = self.windows(image.shape[1])
         means = {width: np.zeros(self.dimension) for width in windows}
         first = 0
         for at, part in enumerate(self.parts):
-            if at != self._at:
-                for width, rows in embed_windows(part, image, windows).items():
+            fixed = {width: starts for width, starts in windows.items() if at != self._at or width < TOGETHER}
+            if fixed:
+                for width, rows in embed_windows(part, image, fixed).items():
                     means[width][first : first + part.dimension] = rows.mean(axis=0, dtype=np.float64) / part.bound
             first += part.dimension
         return means
@@ -148,7 +150,8 @@ class TouchFeatures:
         """
         scales = sorted(lessons[0].frozen)
         means = {s: torch.from_numpy(np.stack([one.frozen[s] for one in lessons])).to(device) for s in scales}
-        if self._at is None:
+        passed = [] if self._at is None else [scale for scale in scales if scale >= TOGETHER]
+        if not passed:
             return means
         sizes: dict[int, list[int]] = {}
         for at, lesson in enumerate(lessons):
@@ -156,12 +159,12 @@ class TouchFeatures:
         for columns, members in sizes.items():
             images = torch.from_numpy(np.stack([lessons[at].image for at in members]))
             windows = self.windows(columns)
-            spans = [(start, width) for width in scales for start in windows[width]]
+            spans = [(start, width) for width in passed for start in windows[width]]
             features = (
                 self._own()(images, spans).to(device) if net is None else net(images.to(device), spans)
             ).double()
             first = 0
-            for width in scales:
+            for width in passed:
                 mean = features[:, first : first + len(windows[width])].mean(dim=1)
                 first += len(windows[width])
                 padded = functional.pad(mean, (self._place.start, self.dimension - self._place.stop))

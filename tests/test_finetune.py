@@ -8,6 +8,7 @@ import torch
 
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors, finetune, training
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.vision import TOGETHER
 from scroll_tactile.images import tactile_image
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.tuning import Lesson, TouchFeatures, TunedReader, adapted
@@ -242,7 +243,9 @@ def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
     net = adapted(features.network())
     assert all("alpha" in name for name, p in net.named_parameters() if p.requires_grad)
     near = features.means(net, [Lesson("", b"", image, features.frozen(image))])
-    assert all(0 < (near[width] - means[width]).abs().max() < 1e-2 for width in means)
+    for width, mean in means.items():  # narrow windows stay as the embedding reads them
+        change = float((near[width] - mean).abs().max())
+        assert 0 < change < 1e-2 if width >= TOGETHER else change == 0
 
 
 def test_ridge_can_be_fine_tuned_too_and_the_whole_network(monkeypatch):

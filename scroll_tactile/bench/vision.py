@@ -20,6 +20,7 @@ import torch
 from scroll_tactile import sensors
 from scroll_tactile.bench.resnet import Plain
 from scroll_tactile.bench.timing import circumstances, take_turns
+from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.kernels import one_torch_thread
 from scroll_tactile.embeddings.resnet import ResNet
@@ -71,10 +72,18 @@ WAYS = [
 ]
 
 
-def run_vision(*, weights: Path | None = None, seed: int = 0, rounds: int = 30, note: Note = lambda _: None) -> Record:
+def run_vision(
+    *,
+    weights: Path | None = None,
+    data: Path | None = None,
+    seed: int = 0,
+    rounds: int = 30,
+    note: Note = lambda _: None,
+) -> Record:
     """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
 
     weights: of a ResNet, a random ResNet-18 where it is None: the cost is the same, the errors are not.
+    data: folder of BioTac_slide_20_50, for the accuracy on RoboSkin beside each runtime (a minute for each); or None.
     """
     net = ResNet.random(seed) if weights is None else load_network(weights)
     state = net.state_dict()
@@ -92,6 +101,9 @@ def run_vision(*, weights: Path | None = None, seed: int = 0, rounds: int = 30, 
         "threads": torch.get_num_threads(),
         "rounds": rounds,
         "records": records,
+        "accuracy": {}
+        if data is None
+        else _accuracies(data, state, [way for way in ways if way.stages == USUAL], note),
     }
 
 
@@ -158,6 +170,23 @@ def _predicting(scene: Scene, embedding: Vision, readings: npt.NDArray[np.float3
         for repetition in range(TOUCHES):
             learner.observe(name, scene.touch(name, repetition))
     return lambda: learner.predict(readings)
+
+
+def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], note: Note) -> dict[str, float]:
+    """Way → share of RoboSkin's first fold told apart rightly, learned from the other four."""
+    recordings = load(data, "roboskin", 0)
+    touches = list(zip(recordings.materials, recordings.streams, (recordings.fold == 0).tolist(), strict=True))
+    shares = {}
+    for way in (way for way in ways if way.stages == USUAL):
+        note(f"accuracy of {way.name}")
+        learner = TactileLearner(sensor=recordings.sensor, embedding=way.make(state), exemplars=0)
+        for material, stream, held_out in touches:
+            if not held_out:
+                learner.observe(material, stream)
+        asked = [(material, stream) for material, stream, held_out in touches if held_out]
+        right = [learner.predict(stream).material == material for material, stream in asked]
+        shares[way.name] = sum(right) / len(right)
+    return shares
 
 
 def _errors(embeddings: list[tuple[str, Vision]], image: Image) -> dict[str, float]:

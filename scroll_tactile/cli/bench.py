@@ -10,7 +10,7 @@ from rich.table import Table
 
 from scroll_tactile.bench.speed import run_speed
 from scroll_tactile.bench.vision import run_vision
-from scroll_tactile.cli.terminal import Commands, console, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 
 __all__ = ["bench"]
 
@@ -52,6 +52,9 @@ def vision(
     weights: Annotated[
         Path | None, typer.Option(help="A .safetensors or .pth file; random weights cost the same.")
     ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="BioTac_slide_20_50: also the accuracy of each runtime on RoboSkin. Minutes.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches and the random weights.")] = 0,
     quick: Annotated[bool, typer.Option(help="A few rounds: for a look, not for a report.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
@@ -59,7 +62,7 @@ def vision(
     """Time the vision embedding beside a bare forward pass of its network, in each runtime that is installed."""
     with progress_bar() as progress:
         result = run_vision(
-            weights=weights, seed=seed, rounds=5 if quick else 30, note=lambda what: progress(what, 0, 1)
+            weights=weights, data=data, seed=seed, rounds=5 if quick else 30, note=lambda what: progress(what, 0, 1)
         )
     table = Table("what", "image", "ms", "median", "ratio", "to one thread", "error of features")
     for record in result["records"]:
@@ -74,6 +77,8 @@ def vision(
             "" if error is None else f"{error:.1e}",
         )
     console().print(table)
+    for name, share in result["accuracy"].items():
+        say(f"RoboSkin-20, fold 0, {name}: {percent(share)}")
     if json is not None:
         write_json(json, result)
         say(f"written to {json}")

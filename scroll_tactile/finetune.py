@@ -27,7 +27,7 @@ from scroll_tactile.model import Model
 from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import validate
-from scroll_tactile.training import Progress, Trained, Trainer, repeatable, start_of
+from scroll_tactile.training import Progress, Trained, Trainer, repeatable, start_of, told_of_memory
 from scroll_tactile.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.tuning import Lesson, TouchFeatures
 
@@ -75,7 +75,7 @@ def fine_tune(
             f"are some of {names}. Observe longer touches, or more materials"
         )
     chosen = mode or _mode(touches, len(lessons))
-    with repeatable(device):
+    with repeatable(device), told_of_memory(device):
         spreads = touches.spreads(lessons)
         trainer = Trainer(touches, spreads, most, seed, torch.device(device), chosen, progress)
         best, temperature, scores = _best(*trainer.held_out(model, lessons), most)
@@ -89,18 +89,24 @@ def fine_tune(
 
 
 def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[str, Sequence[Exemplar]]) -> None:
-    if epochs < 1 or seed < 0:
-        raise InputError(f"expected 1 epoch or more and a seed of 0 or more; came {epochs} and {seed}")
+    for what, number, least in (("epochs", epochs, 1), ("seed", seed, 0)):
+        if isinstance(number, bool) or not isinstance(number, int) or number < least:
+            raise InputError(f"expected {what} as a whole number of {least} or more; came {number!r}")
     if sum(map(len, exemplars.values())) == 0:
-        raise InputError("expected exemplars to fine-tune on; the buffer is empty. Open the memory with exemplars > 0")
+        raise InputError(
+            "expected exemplars to fine-tune on; the buffer is empty. Open a memory with exemplars > 0, or, where "
+            "exemplar_bytes was given, with at least eight times the bytes of a touch's readings"
+        )
     if len(exemplars) < 2:
         raise InputError(
             f"expected at least two materials, to be told apart; the buffer has exemplars of {list(exemplars)} only"
         )
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"expected a device that torch can use, such as cpu; came {device!r}: {error}") from error
+        torch.zeros(1, dtype=torch.float64, device=device).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise InputError(
+            f"expected a device of torch's that computes in float64, such as cpu or cuda; came {device!r}: {error}"
+        ) from error
 
 
 def _mode(touches: TouchFeatures, count: int) -> TuneMode:
@@ -117,13 +123,15 @@ def _lessons(
     progress: Progress,
 ) -> Iterator[Lesson]:
     """The exemplars that reach the last stage, by material and rank."""
+    if len(model.calibrations) < len(model.stages):  # nothing was felt for long enough
+        return
     felt = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
     total, done = sum(map(len, exemplars.values())), 0
     for material, those in sorted(exemplars.items()):
         for one in those:
             image = tactile_image(validate(one.readings, sensor))
             columns = image.shape[1]
-            if material in felt and len(model.reading.stages(columns)) == len(model.stages):
+            if material in felt and model.is_last(columns) and touches.reads(columns):
                 yield Lesson(material, one.key, image, touches.frozen(image))
             done += 1
             progress("reading exemplars", done, total)
@@ -131,23 +139,26 @@ def _lessons(
 
 @dataclass(frozen=True)
 class _Score:
-    """Mean log loss at the best temperature, and share of wrong answers, of logits held out."""
+    """Mean log loss at the best temperature, and share of wrong answers, of logits held out; each touch's loss."""
 
     loss: float
     wrong: float
     temperature: float
+    losses: FloatArray
 
     @classmethod
     def of(cls, folds: Sequence[tuple[FloatArray, npt.NDArray[np.intp]]], temperatures: FloatArray) -> _Score:
-        count = sum(len(targets) for _, targets in folds)
-        losses = np.zeros(len(temperatures))
-        wrong = 0
-        for logits, targets in folds:
-            heated = temperatures[:, None, None] * logits
-            losses += (logsumexp(heated, axis=2) - heated[:, np.arange(len(targets)), targets]).sum(axis=1)
-            wrong += int((logits.argmax(axis=1) != targets).sum())
-        best = int(np.argmin(losses))
-        return cls(float(losses[best]) / count, wrong / count, float(temperatures[best]))
+        losses = np.concatenate([_losses(logits, targets, temperatures) for logits, targets in folds], axis=1)
+        wrong = sum(int((logits.argmax(axis=1) != targets).sum()) for logits, targets in folds)
+        best = int(np.argmin(losses.mean(axis=1)))
+        return cls(float(losses[best].mean()), wrong / losses.shape[1], float(temperatures[best]), losses[best])
+
+
+def _losses(logits: FloatArray, targets: npt.NDArray[np.intp], temperatures: FloatArray) -> FloatArray:
+    """Log loss (temperatures, touches)."""
+    heated = temperatures[:, None, None] * logits
+    losses: FloatArray = logsumexp(heated, axis=2) - heated[:, np.arange(len(targets)), targets]
+    return losses
 
 
 def _best(trials: list[Trained], before: list[Trained], most: int) -> tuple[int, float, dict[str, dict[str, float]]]:
@@ -161,6 +172,8 @@ def _best(trials: list[Trained], before: list[Trained], most: int) -> tuple[int,
     ]
     best = min(range(len(epochs)), key=lambda at: epochs[at].loss)
     scores = {name: {"loss": one.loss, "wrong": one.wrong} for name, one in (("f", f), ("f*", epochs[best]))}
+    gain = f.losses - epochs[best].losses
+    scores["f*"]["margin"] = float(gain.std() / np.sqrt(len(gain)))
     return best + 1, epochs[best].temperature, scores
 
 
@@ -169,6 +182,7 @@ def _verdict(scores: Mapping[str, Mapping[str, float]]) -> tuple[bool, str]:
         return False, "no exemplar could be held out to compare them: f answers"
     f, tuned = scores["f"], scores["f*"]
     told = f"log loss {tuned['loss']:.4f} against {f['loss']:.4f}, wrong {tuned['wrong']:.2%} against {f['wrong']:.2%}"
-    if tuned["wrong"] > f["wrong"] or tuned["loss"] >= f["loss"]:
+    # By more than a standard error: the epoch was chosen as the best on these same exemplars.
+    if tuned["wrong"] > f["wrong"] or tuned["loss"] + tuned["margin"] >= f["loss"]:
         return False, f"on exemplars held out f* is not better than f ({told}): f answers"
     return True, f"on exemplars held out f* is better than f ({told})"

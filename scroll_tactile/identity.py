@@ -28,9 +28,13 @@ def capacity_of(streams: int | None, nbytes: int | None) -> Capacity:
 
 def kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
     """The size of the buffer that a memory was made with. Raises MismatchError where another one was asked for."""
-    if "exemplars" not in store.identity:  # made before there were any: those felt from now on are kept
+    told = store.identity.get("exemplars")
+    if told is None:  # made before there were any: those felt since it was first opened with some are kept
+        generation = store.latest()
+        told = None if generation is None else generation.attributes.get("capacity")
+    if told is None:
         return asked
-    kept = Capacity(*cast(list[int | None], store.identity["exemplars"]))
+    kept = Capacity(*cast(list[int | None], told))
     if given and kept != asked:
         raise MismatchError(
             f"{store.path} was made with exemplars={kept.streams}, exemplar_bytes={kept.nbytes}; it was opened with "

@@ -36,7 +36,7 @@ from scroll_tactile.streams import Stream, validate
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
 from scroll_tactile.windows import Reading
-from store import Store, StoreClosedError, StoreError
+from store import ReadOnlyError, Store, StoreClosedError, StoreError
 
 __all__ = ["TactileLearner"]
 
@@ -202,7 +202,12 @@ class TactileLearner:
         places = self._reading.places(columns)
         means = {width: rows[places[width]].mean(axis=0) for width, rows in codes.items()}
         logits = None
-        if reader is not None and set(candidates) <= set(reader.tuned.names) and model.is_last(columns):
+        if (
+            reader is not None
+            and set(candidates) <= set(reader.tuned.names)
+            and model.is_last(columns)
+            and reader.reads(columns)
+        ):
             logits = reader.logits(image)
         judgement = model.judge(candidates, means, columns, logits)
         ranking = sorted(
@@ -291,12 +296,14 @@ class TactileLearner:
         """
         with self._lock:
             self._require_open()
+            self._require_writing()
             model, ranked = self.model(), self._ranked()
             without = sorted(set(model.names) - set(ranked))
         if without and ranked:
             raise InputError(
-                f"expected an exemplar of every material; the buffer of {self._capacity.streams} has none of "
-                f"{without[:10]}. Open a new memory with exemplars of at least {len(model.names)}"
+                f"expected an exemplar of every material; the buffer has none of {without[:10]} (it was made with "
+                f"exemplars={self._capacity.streams}, exemplar_bytes={self._capacity.nbytes}). Make a new memory with "
+                f"room for {len(model.names)} or more, or touch again what was felt before exemplars were kept"
             )
         told = progress or (lambda what, done, of: None)
         tuned, report = fine_tune(
@@ -309,7 +316,8 @@ class TactileLearner:
             try:
                 self._snapshot()
             except BaseException:
-                memory.tuned = before
+                # Ctrl-C may have come after the generation was current: closing writes the f* before again.
+                memory.tuned, self._saved = before, -1
                 raise
             self._tuned_reader = None
         return report
@@ -327,6 +335,17 @@ class TactileLearner:
         if self._tuned_reader is None or self._tuned_reader.tuned is not tuned:
             self._tuned_reader = TunedReader(self.embedding, self._reading, tuned)
         return self._tuned_reader
+
+    def _require_writing(self) -> None:
+        """Raise before anything is trained what would keep f* from being written."""
+        if self._store is None:
+            return
+        if self._store.mode == "read":
+            raise ReadOnlyError(f'{self._store.path} was opened with mode="read": open it to write, to fine-tune')
+        try:
+            self._store.flush()
+        except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
+            logger.warning("%s: no generation could be written: %s", self._store.path, error)
 
     def _require_open(self) -> None:
         if self._closed:

@@ -106,6 +106,7 @@ class Memory:
             "scales": list(self.statistics.scales),
             "materials": names,
             "pool": materials,
+            "capacity": [self.capacity.streams, self.capacity.nbytes],
         }
         arrays |= pooled
         for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):

@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from scroll_tactile.augment import Augmentation
 from scroll_tactile.embeddings.kernels import one_torch_thread
+from scroll_tactile.embeddings.runtimes import full_float32
 from scroll_tactile.errors import FineTuneError
 from scroll_tactile.model import Model
 from scroll_tactile.ridge.codes import BITS
@@ -23,7 +24,7 @@ from scroll_tactile.ridge.statistics import FOLDS, fold_of
 from scroll_tactile.tuned import TuneMode
 from scroll_tactile.tuning import Backbone, Lesson, TouchFeatures, adapted
 
-__all__ = ["Progress", "Start", "Trained", "Trainer", "repeatable", "start_of"]
+__all__ = ["Progress", "Start", "Trained", "Trainer", "repeatable", "start_of", "told_of_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], object]
@@ -97,9 +98,25 @@ def repeatable(device: str) -> Iterator[None]:
     """One thread, no shortened floats, no algorithm whose sums depend on timing."""
     with ExitStack() as stack:
         stack.enter_context(one_torch_thread())
+        stack.enter_context(full_float32())
         stack.enter_context(torch.autocast(torch.device(device).type, enabled=False))
         stack.enter_context(torch.backends.cudnn.flags(deterministic=True, benchmark=False, allow_tf32=False))
         yield
+
+
+@contextmanager
+def told_of_memory(device: str) -> Iterator[None]:
+    """Tell that a device has no memory left as the FineTuneError that it is."""
+    try:
+        yield
+    except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+        text = str(error)
+        if not isinstance(error, torch.OutOfMemoryError | MemoryError) and "alloc" not in text.casefold():
+            raise
+        raise FineTuneError(
+            f"{device} is out of memory: nothing was changed, and the f* before stays. Free some, or take "
+            f"device='cpu' ({text})"
+        ) from error
 
 
 class Trainer:
@@ -198,21 +215,15 @@ class Trainer:
         self, head: Head, net: Backbone | None, batch: list[Lesson], optimiser: torch.optim.Optimizer, where: str
     ) -> None:
         targets = torch.from_numpy(_targets(head, batch)).to(self.device)
-        try:
-            loss = functional.cross_entropy(head(self.touches.means(net, batch, self.device)), targets)
-            value = float(loss.detach())
-            if not np.isfinite(value):
-                raise FineTuneError(
-                    f"the loss became {value} in {where}: nothing was changed, and the f* before stays. Are the "
-                    "exemplars' readings sound? Another seed, or fewer epochs, may do"
-                )
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-        except torch.OutOfMemoryError as error:
+        loss = functional.cross_entropy(head(self.touches.means(net, batch, self.device)), targets)
+        value = float(loss.detach())
+        if not np.isfinite(value):
             raise FineTuneError(
-                f"{self.device} is out of memory in {where}: nothing was changed, and the f* before stays. Free some, "
-                f"or take device='cpu' ({error})"
-            ) from error
+                f"the loss became {value} in {where}: nothing was changed, and the f* before stays. Are the "
+                "exemplars' readings sound? Another seed, or fewer epochs, may do"
+            )
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
 
     def _judge(self, head: Head, net: Backbone | None, exam: list[Lesson]) -> FloatArray:

@@ -15,7 +15,7 @@ from torch.nn import functional
 from scroll_tactile.embeddings import Embedding, embed_windows
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
-from scroll_tactile.embeddings.vision import TOGETHER, TunableVision
+from scroll_tactile.embeddings.vision import MOST_COLUMNS, TOGETHER, TunableVision
 from scroll_tactile.tuned import Tuned
 from scroll_tactile.windows import Reading
 
@@ -75,7 +75,9 @@ class _Adapted(nn.Module):
     def __init__(self, conv: nn.Conv2d) -> None:
         super().__init__()
         self.conv = conv.requires_grad_(False)
-        self.alpha = nn.Parameter(ADAPTER * torch.eye(conv.out_channels, conv.in_channels)[:, :, None, None])
+        self.alpha = nn.Parameter(
+            ADAPTER * torch.eye(conv.out_channels, conv.in_channels, dtype=conv.weight.dtype)[:, :, None, None]
+        )
 
     def forward(self, planes: torch.Tensor) -> torch.Tensor:
         both: torch.Tensor = self.conv(planes) + functional.conv2d(planes, self.alpha, stride=self.conv.stride)
@@ -114,6 +116,10 @@ class TouchFeatures:
     def tunable(self) -> bool:
         """Whether there is a network to be trained, and a scale that it reads."""
         return self._at is not None and self.reading.judging(self.reading.milestones()[-1])[-1] >= TOGETHER
+
+    def reads(self, columns: int) -> bool:
+        """Whether a touch of so many columns is one pass of the network, or needs none."""
+        return not self.tunable or columns <= MOST_COLUMNS
 
     def network(self) -> Backbone:
         """A new copy of the network, with the embedding's own weights."""
@@ -200,6 +206,10 @@ class TunedReader:
                 self._net = adapted(self._net)
             self._net.put(tuned.network)
             self._net.requires_grad_(False)
+
+    def reads(self, columns: int) -> bool:
+        """Whether f* can answer for a touch of so many columns."""
+        return self._touches.reads(columns)
 
     def logits(self, image: npt.NDArray[np.float32]) -> dict[str, float]:
         """Material → logit, for a touch that reaches the last stage; image: (C, T) in [-1, 1]."""

@@ -1,5 +1,6 @@
 """Weights from files that are whole, damaged, hostile, another architecture's, or out of reach."""
 
+import contextlib
 import hashlib
 import os
 import pickle
@@ -242,3 +243,18 @@ def test_the_downloader_itself_is_asked_for_the_right_file(cache, monkeypatch):
     assert "no route to host" in refusal("resnet34")
     assert asked["url"] == weights.PUBLISHED["resnet34"]
     assert asked["path"] / asked["fname"] == cache / "resnet34-b627a593.pth"
+
+
+def test_a_file_with_any_byte_changed_is_refused_or_read_but_never_fails_otherwise(tmp_path):
+    rng = np.random.default_rng(0)
+    tensors = {"conv1.weight": torch.zeros(4, 3, 7, 7)}
+    for zipped in (True, False):
+        path = tmp_path / "some.pth"
+        torch.save(tensors, path, _use_new_zipfile_serialization=zipped)
+        whole = path.read_bytes()
+        for _ in range(300):
+            damaged = bytearray(whole)
+            damaged[rng.integers(min(len(whole), 600))] = rng.integers(256)
+            path.write_bytes(bytes(damaged))
+            with contextlib.suppress(WeightsError):
+                weights.read_tensors(path)

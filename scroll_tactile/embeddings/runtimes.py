@@ -19,7 +19,7 @@ from scroll_tactile.embeddings.onnx_graph import network_model
 from scroll_tactile.embeddings.resnet import ResNet, folded
 from scroll_tactile.errors import InputError
 
-__all__ = ["RUNTIMES", "Precision", "Run", "RuntimeName", "make_runtime", "steady", "version_of"]
+__all__ = ["RUNTIMES", "Precision", "Run", "RuntimeName", "full_float32", "make_runtime", "steady", "version_of"]
 
 FloatArray = npt.NDArray[np.float32]
 RuntimeName = Literal["torch", "onnxruntime", "openvino"]
@@ -66,12 +66,12 @@ def steady() -> Iterator[None]:
         stack.enter_context(torch.inference_mode())
         stack.enter_context(torch.autocast("cpu", enabled=False))
         stack.enter_context(one_torch_thread())
-        stack.enter_context(_full_float32())
+        stack.enter_context(full_float32())
         yield
 
 
 @contextmanager
-def _full_float32() -> Iterator[None]:
+def full_float32() -> Iterator[None]:
     """Keep float32 products at full precision where the caller's program allows shortened ones."""
     before = torch.get_float32_matmul_precision()
     if before == "highest":

@@ -102,7 +102,7 @@ def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[st
             f"expected at least two materials, to be told apart; the buffer has exemplars of {list(exemplars)} only"
         )
     try:
-        torch.zeros(1, dtype=torch.float64, device=device).item()
+        torch.zeros(1, dtype=torch.float64, device=torch.device(device)).item()
     except (RuntimeError, AssertionError, TypeError) as error:
         raise InputError(
             f"expected a device of torch's that computes in float64, such as cpu or cuda; came {device!r}: {error}"

@@ -69,3 +69,18 @@ def test_the_tables_come_from_the_results():
     table = README.split("<!-- speed -->")[1].split("<!-- /speed -->")[0]
     for record in speed["records"]:
         assert f"{record['ratio']:.2f}" in table
+
+
+def test_the_continual_and_vision_tables_come_from_their_results():
+    shown = README.split("<!-- continual -->")[1].split("<!-- /continual -->")[0]
+    for name in ("biotac-20", "roboskin-20"):
+        result = json.loads((ROOT / "examples" / "results" / f"{name}-continual.json").read_text())
+        for row in result["means"]:
+            if row["method"] in ("f", "streaming LDA") or (row["method"], row["size"]) == ("f*", "400"):
+                assert f"{100 * row['accuracy']['mean']:.1f} ± {100 * row['accuracy']['sd']:.1f}" in shown
+        assert {"command", "seed", "versions", "date"} <= result.keys()
+    vision = json.loads((ROOT / "examples" / "results" / "vision.json").read_text())
+    table = README.split("<!-- vision -->")[1].split("<!-- /vision -->")[0]
+    for record in vision["records"]:
+        if "400" in record["image"]:
+            assert f"| {record['case']} | {record['milliseconds']:.1f} | {record['ratio']:.2f} |" in table

@@ -204,7 +204,7 @@ def test_what_cannot_be_fine_tuned_says_why(tmp_path):
         learner.fine_tune()
     with pytest.raises(errors.InputError, match=r"buffer has none of .*exemplars=3.*room for 4 or more"):
         taught("kernels", exemplars=3).fine_tune()
-    with pytest.raises(errors.InputError, match="Open the memory with exemplars > 0"):
+    with pytest.raises(errors.InputError, match="with exemplars > 0"):
         taught("kernels", exemplars=0).fine_tune()
     full = taught("kernels")
     for settings in (

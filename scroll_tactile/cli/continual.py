@@ -76,7 +76,9 @@ def continual(
     json: Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw accuracy by buffer size and by materials met.")] = None,
     materials: Annotated[int, typer.Option(hidden=True, min=2)] = 20,
-    features: Annotated[int, typer.Option(hidden=True, min=64)] = 1008,
+    features: Annotated[
+        int | None, typer.Option(min=64, help="Of the kernels: 1008 alone and 1260 beside vision, unless given.")
+    ] = None,
 ) -> None:
     """Learn a recorded set in one pass, and measure f and f* for every size of the exemplar buffer.
 
@@ -85,7 +87,9 @@ def continual(
     """
     require_folders(json, plot)
     chosen_sizes = parse_sizes(sizes)
-    frozen = _embedding(embedding, weights, features)
+    # Beside vision 1260 kernels tell RoboSkin apart in 98.7 %, 1008 in 98.6; BioTac in 99.5 with both.
+    usual = 1260 if embedding is EmbeddingChoice.BOTH else 1008
+    frozen = _embedding(embedding, weights, features or usual)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = read(dataset, data, seed)
@@ -111,7 +115,7 @@ def continual(
     published = PUBLISHED.get(recordings.name) if materials == 20 else None
     _show(recordings, results, published)
     if json is not None:
-        command = _command(dataset, data, task, folds, embedding, weights)
+        command = _command(dataset, data, task, folds, embedding, weights, features or usual)
         rows = summary(results)
         write_json(json, origin(command, recordings) | task.plan | {"sizes": sizes, "means": rows, "folds": results})
         say(f"figures: {json}")
@@ -192,10 +196,17 @@ def _lines(published: tuple[float, float] | None) -> dict[str, float]:
 
 
 def _command(
-    dataset: Dataset, data: Path, task: Continual, folds: str, embedding: EmbeddingChoice, weights: str | None
+    dataset: Dataset,
+    data: Path,
+    task: Continual,
+    folds: str,
+    embedding: EmbeddingChoice,
+    weights: str | None,
+    features: int,
 ) -> str:
     words = ["scroll-tactile", "continual", dataset.value, "--data", str(data), "--embedding", embedding.value]
     words += ["--weights", weights] if weights is not None else []
+    words += ["--features", str(features)] if embedding is not EmbeddingChoice.VISION else []
     words += ["--schedule", task.schedule, "--sizes", ",".join(map(str, task.sizes)), "--folds", folds]
     words += ["--seed", str(task.seed), "--curve", str(task.curve), "--device", task.device]
     words += ["--epochs", str(task.epochs)] if task.epochs is not None else []

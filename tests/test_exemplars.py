@@ -355,3 +355,29 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
     assert found["live"].shared < 0.9
     assert found[f"pooled-{CANDIDATES}"].gap < 0.5 * found["random"].gap
     assert found["full"].to_full == 1 <= found[f"pooled-{CANDIDATES}"].to_full < 1.6
+
+
+def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
+    from scroll_tactile import Kernels
+    from scroll_tactile.bench.buffer_study import run_buffers
+    from scroll_tactile.datasets import Recordings
+    from scroll_tactile.datasets.simulator import Scene
+    from scroll_tactile.sensors import Sensor
+
+    pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
+    scene = Scene(sensor=pad)
+    labelled = [(name, at) for at in range(6) for name in scene.materials[:3]]
+    recordings = Recordings(
+        name="simulated",
+        sensor=pad,
+        streams=[scene.touch(name, at) for name, at in labelled],
+        materials=[name for name, _ in labelled],
+        repetition=np.array([at for _, at in labelled]),
+        fold=np.array([at % 3 for _, at in labelled]),
+        ordered=True,
+    )
+    result = run_buffers(recordings, Kernels(dimension=64), (6,))
+    ways = {record["way"]: record for record in result["records"]}
+    assert set(ways) == {"full", "pooled-2", "pooled-3", "pooled-4", "live", "random"}
+    assert ways["pooled-3"]["overlap"] == 1
+    assert all(0 <= record["tuned"] <= 1 and record["gap"] > 0 for record in ways.values())

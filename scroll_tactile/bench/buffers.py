@@ -94,11 +94,13 @@ class Choice:
 
     gap: ‖mean of the exemplars − class mean‖, averaged over the materials and two schedules, in units of the grid.
     to_full: the gap divided by that of `full`. shared: part of the exemplars that two schedules have in common.
+    buffer: material → keys of its exemplars, under the first order.
     """
 
     gap: float
     to_full: float
     shared: float
+    buffer: Buffer
 
 
 def mean_gap(buffer: Mapping[str, npt.NDArray[np.integer]], means: Mapping[str, IntArray]) -> float:
@@ -142,7 +144,8 @@ def compare(
         kept = [{key for those in buffer.values() for key in those} for buffer in buffers]
         gap = float(np.mean(gaps))
         full = choices["full"].gap if choices else gap
-        choices[way] = Choice(gap, gap / full if full else 1.0, len(kept[0] & kept[1]) / max(len(kept[0]), 1))
+        overlap = len(kept[0] & kept[1]) / max(len(kept[0]), 1)
+        choices[way] = Choice(gap, gap / full if full else 1.0, overlap, buffers[0])
     return choices
 
 

@@ -8,9 +8,13 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from scroll_tactile.bench.buffer_study import run_buffers
 from scroll_tactile.bench.speed import run_speed
 from scroll_tactile.bench.vision import run_vision
+from scroll_tactile.cli.results import Dataset
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.embeddings import Kernels
 
 __all__ = ["bench"]
 
@@ -79,6 +83,27 @@ def vision(
     console().print(table)
     for name, share in result["accuracy"].items():
         say(f"RoboSkin-20, fold 0, {name}: {percent(share)}")
+    if json is not None:
+        write_json(json, result)
+        say(f"written to {json}")
+
+
+@bench.command()
+def buffers(
+    dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
+    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
+    seed: Annotated[int, typer.Option(min=0, help="Draws the orders, the random buffer and BioTac's folds.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+) -> None:
+    """Compare ways of choosing exemplars: gap to the class means, overlap of two schedules, accuracy of f*."""
+    with progress_bar() as progress:
+        recordings = load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
+        result = run_buffers(recordings, Kernels(), seed=seed, note=lambda what: progress(what, 0, 1))
+    table = Table("exemplars", "way", "gap to full herding's", "overlap", "f*", "f", title=f"{recordings.name}, fold 0")
+    for record in result["records"]:
+        shares = [percent(record[name]) for name in ("overlap", "tuned", "f")]
+        table.add_row(str(record["capacity"]), record["way"], f"{record['ratio']:.3f}", *shares)
+    console().print(table)
     if json is not None:
         write_json(json, result)
         say(f"written to {json}")

@@ -24,7 +24,9 @@ __all__ = ["Backbone", "Lesson", "TouchFeatures", "TunedReader", "adapted"]
 FloatArray = npt.NDArray[np.float64]
 
 ADAPTER = 1e-4  # of the identity that an adapter begins as
-SPREAD_FLOOR = 1e-3  # of features that lie in [-1, 1]: one that hardly varies among the exemplars is not blown up
+# Of features that lie in [-1, 1]: one that hardly varies among the exemplars must not be blown up, or a touch in which
+# it does decides the answer. With 0.001 an f* of BioTac's kernels had 89.5 %, with 0.05 it has 98.5.
+SPREAD_FLOOR = 0.05
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ class TouchFeatures:
         return self._untouched
 
     def spreads(self, lessons: Sequence[Lesson]) -> dict[int, FloatArray]:
-        """Width → the standard deviation of each feature among lessons, (d,), no less than a thousandth."""
+        """Width → the standard deviation of each feature among lessons, (d,), no less than a twentieth."""
         with torch.no_grad():
             parts = [self.means(None, lessons[first : first + 32]) for first in range(0, len(lessons), 32)]
         return {

@@ -1,11 +1,11 @@
 """From f to f*: a pass over the exemplars alone that starts from the closed form and ends no worse than it.
 
 As in SCROLL (Wang et al. 2022, arXiv 2210.05561) f* restarts each time from the pre-trained weights with its head set
-from the readout, and is trained by cross-entropy on the buffer only. Small buffers train
-residual adapters (Li et al. 2022, arXiv 2107.00358), a 1 × 1 convolution beside each 3 × 3 one, and the head; larger
-ones the whole network. How long to train, and whether f* is used at all, is decided on the buffer's own folds: every
-exemplar is answered by an f* whose training did not see it, and which began from a readout that did not either. On
-these the temperature is learned, too: learned where f has been solved it only sharpens what is certain already.
+from the readout, and is trained by cross-entropy on the buffer only. Small buffers train residual adapters (Li et al.
+2022, arXiv 2107.00358), a 1 × 1 convolution beside each 3 × 3 one, and the head; larger ones the whole network. How
+long to train, and whether f* is used at all, is decided on the buffer's own folds: every exemplar is answered by an f*
+whose training did not see it, and which began from a readout that did not either. On these the temperature is learned,
+too: learned where f has been solved it only sharpens what is certain already.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from scroll_tactile.memory import Capacity
 from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.windows import scales
+from scroll_tactile.windows import Reading
 from store import Store
 
 __all__ = ["capacity_of", "identity_of", "kept_capacity", "require_same"]
@@ -45,9 +45,10 @@ def kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
 
 def identity_of(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dict[str, Any]:
     """What is written into a new memory for good, in JSON's types."""
+    reading = Reading.of(sensor, embedding)
     return {
         "exemplars": [capacity.streams, capacity.nbytes],
-        "reading": [getattr(embedding, "partial_windows", True), getattr(embedding, "judged_scales", "all")],
+        "reading": [reading.partial, reading.judged],
         "sensor": sensor.model_dump(mode="json"),
         "embedding": {
             "name": embedding.name,
@@ -55,7 +56,7 @@ def identity_of(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dic
             "bound": embedding.bound,
             "fingerprint": embedding.fingerprint,
         },
-        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(scales(sensor))},
+        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(reading.widths)},
     }
 
 

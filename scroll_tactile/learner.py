@@ -109,9 +109,8 @@ class TactileLearner:
     ) -> TactileLearner:
         """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
 
-        sensor: may be left out for a memory that is there, and so may the size of the buffer.
-        mode: "read" for one that another process writes;
-        it shows what was committed when it was opened.
+        sensor: may be left out for a memory that is there, and so may the size of the buffer. mode: "read" for one
+        that another process writes; it shows what was committed when it was opened.
 
         Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
         new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).

@@ -88,8 +88,10 @@ class Model:
         decided = self._decided(candidates, reached)
         for at, (stage, members) in enumerate(decided):
             names = [candidates[place] for place in members]
-            last = tuned is not None and stage == len(self.stages) - 1
-            logits = np.array([tuned[name] for name in names]) if last and tuned else self._logits(stage, z, names)
+            if tuned is not None and stage == len(self.stages) - 1:
+                logits = np.array([tuned[name] for name in names])
+            else:
+                logits = self._logits(stage, z, names)
             chances = np.exp(logits - logits.max())
             probability[members] = chances / chances.sum() * mass
             later = decided[at + 1][1] if at + 1 < len(decided) else []

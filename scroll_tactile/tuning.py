@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -168,9 +169,7 @@ class TouchFeatures:
             images = torch.from_numpy(np.stack([lessons[at].image for at in members]))
             windows = self.windows(columns)
             spans = [(start, width) for width in passed for start in windows[width]]
-            features = (
-                self._own()(images, spans).to(device) if net is None else net(images.to(device), spans)
-            ).double()
+            features = (self._own(images, spans).to(device) if net is None else net(images.to(device), spans)).double()
             first = 0
             for width in passed:
                 mean = features[:, first : first + len(windows[width])].mean(dim=1)
@@ -180,10 +179,9 @@ class TouchFeatures:
                 means[width] = means[width].index_add(0, place, padded)
         return means
 
+    @cached_property
     def _own(self) -> Backbone:
-        if not hasattr(self, "_untouched"):
-            self._untouched = self.network().requires_grad_(False)
-        return self._untouched
+        return self.network().requires_grad_(False)
 
     def spreads(self, lessons: Sequence[Lesson]) -> dict[int, FloatArray]:
         """Width → the standard deviation of each feature among lessons, (d,), no less than a twentieth."""

@@ -7,33 +7,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import refused, run
 
 from scroll_tactile import sensors
-from scroll_tactile.cli import app
 from scroll_tactile.datasets.simulator import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
 SMALL = ["--materials", "5", "--touches", "3", "--held-out", "2", "--features", "64"]
-
-
-def run(*words: object) -> Any:
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
-def refused(*words: object) -> str:
-    """The one red line of a command that must end with exit code 1."""
-    result = run(*words)
-    assert result.exit_code == 1, result.output
-    assert "Traceback" not in result.output
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("Error: ")
-    return lines[0]
 
 
 def digest_of(output: str) -> str:

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import refused, run
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.cli import app
 from scroll_tactile.cli.continual import parse_sizes
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.simulator import Scene
@@ -204,17 +203,6 @@ def test_the_ridge_floor_is_the_ridge_readout(recordings: Recordings, whole: lis
             learner.observe(name, stream)
     right = [learner.predict(stream).material == name for name, stream, fold in touches if fold == 0]
     assert whole[0]["ridge"] == np.mean(right)
-
-
-def run(*words: object) -> Any:
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
-def refused(*words: object) -> str:
-    result = run(*words)
-    assert result.exit_code == 1, result.output
-    assert "Traceback" not in result.output
-    return str(result.stderr)
 
 
 class TestCommand:

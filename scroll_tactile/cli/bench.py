@@ -11,9 +11,8 @@ from rich.table import Table
 from scroll_tactile.bench.buffer_study import run_buffers
 from scroll_tactile.bench.speed import run_speed
 from scroll_tactile.bench.vision import run_vision
-from scroll_tactile.cli.results import Dataset
+from scroll_tactile.cli.results import Dataset, read
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.embeddings import Kernels
 
 __all__ = ["bench"]
@@ -97,7 +96,7 @@ def buffers(
 ) -> None:
     """Compare ways of choosing exemplars: gap to the class means, overlap of two schedules, accuracy of f*."""
     with progress_bar() as progress:
-        recordings = load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
+        recordings = read(dataset, data, seed)
         result = run_buffers(recordings, Kernels(), seed=seed, note=lambda what: progress(what, 0, 1))
     table = Table("exemplars", "way", "gap to full herding's", "overlap", "f*", "f", title=f"{recordings.name}, fold 0")
     for record in result["records"]:

@@ -11,7 +11,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from scroll_tactile.cli.terminal import console, percent, say, verdict
-from scroll_tactile.pipelines import passes
 from scroll_tactile.pipelines.files import read_sensor, read_stream
 from scroll_tactile.pipelines.memories import open_memory
 
@@ -39,7 +38,7 @@ def observe(
     readings = read_stream(file)  # before a memory is made for a file that cannot be read
     chosen = None if sensor is None else read_sensor(sensor)
     with open_memory(memory, sensor=chosen) as learner:
-        receipt = passes.observe(learner, material, readings)
+        receipt = learner.observe(material, readings)
         felt = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     say(f"{escape(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")

@@ -14,6 +14,7 @@ import torch
 
 from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
 from scroll_tactile.embeddings.levels import triangle_features, window_statistics
+from scroll_tactile.embeddings.protocol import canary
 from scroll_tactile.windows import ENOUGH
 
 __all__ = ["Kernels"]
@@ -71,10 +72,7 @@ class Kernels:
         """A hash of the settings and of the features of three fixed images, made by the code that embeds."""
         digest = hashlib.sha256(f"kernels 1 {self.seed} {self.dimension} {LEVELS}".encode())
         for channels, readings in ((1, 9), (3, 30), (5, 300)):
-            place = np.arange(channels * readings).reshape(channels, readings)
-            # A sawtooth of integers: no sine, whose last bit differs between machines.
-            image = ((place * (place + 7) * 13 % 255) / 127.0 - 1).astype(np.float32)
-            digest.update(self.embed(image).astype("<f4").tobytes())
+            digest.update(self.embed(canary(channels, readings)).astype("<f4").tobytes())
         return digest.hexdigest()
 
     def embed(self, image: npt.NDArray[np.float32], width: int | None = None) -> npt.NDArray[np.float32]:

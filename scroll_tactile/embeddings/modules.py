@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal
 
@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
+from scroll_tactile.embeddings.protocol import canary
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.errors import EmbeddingError, InputError
 
@@ -81,7 +82,7 @@ class ModuleEmbedding:
             digest.update(f"\n{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
             digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
         read = 0
-        for image in self._canaries():
+        for image in (canary(channels, columns) for channels in self._channels for columns in COLUMNS):
             try:
                 features = self.embed(image)
             except (RuntimeError, ValueError, IndexError):  # what torch says of an image that does not fit
@@ -116,9 +117,3 @@ class ModuleEmbedding:
                 f"of {image.shape} is {largest}. Scale them, by tanh or by their norm, or give the bound that holds"
             )
         return features
-
-    def _canaries(self) -> Iterator[npt.NDArray[np.float32]]:
-        for channels in self._channels:
-            for columns in COLUMNS:
-                place = np.arange(channels * columns).reshape(channels, columns)
-                yield ((place * (place + 7) * 13 % 255) / 127.0 - 1).astype(np.float32)

@@ -6,15 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy.typing as npt
-
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy
-from scroll_tactile.prediction import Prediction, Receipt
+from scroll_tactile.prediction import Prediction
 from scroll_tactile.streams import Stream
 
-__all__ = ["Answers", "Labelled", "ask", "missing", "observe", "observe_all"]
+__all__ = ["Answers", "Labelled", "ask", "missing", "observe_all"]
 
 Labelled = tuple[str, Stream]
 """A material and how it felt."""
@@ -78,11 +76,6 @@ def missing(touches: Sequence[Labelled], felt: Mapping[str, int]) -> list[Labell
         else:
             remaining.append((name, stream))
     return remaining
-
-
-def observe(learner: TactileLearner, material: str, stream: Stream | npt.ArrayLike) -> Receipt:
-    """Observe one touch, as `TactileLearner.observe`, which is itself whole or not at all where ctrl-C comes."""
-    return learner.observe(material, stream)
 
 
 def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Callable[[], object] = lambda: None) -> int:

@@ -29,7 +29,7 @@ from scroll_tactile.images import tactile_image
 from scroll_tactile.memory import OBSERVE, READINGS, Memory, give_back_scratch, pack_codes
 from scroll_tactile.model import Model
 from scroll_tactile.prediction import Prediction, Receipt
-from scroll_tactile.ridge.codes import to_codes
+from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
@@ -165,7 +165,8 @@ class TactileLearner:
         _require_name(material)
         felt = validate(stream, self.sensor)
         image = tactile_image(felt)
-        columns, codes = image.shape[1], self._codes(image)
+        columns, bound = image.shape[1], self.embedding.bound
+        codes = {width: to_codes(rows, bound) for width, rows in self._features(image).items()}
         with self._lock:
             self._require_open()
             # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
@@ -197,9 +198,11 @@ class TactileLearner:
         felt = self._as_far_as_learned(felt, longest)
         image = tactile_image(felt)
         columns = image.shape[1]
-        codes = self._codes(image, model.needed(candidates, columns))
-        places = self._reading.places(columns)
-        means = {width: rows[places[width]].mean(axis=0) for width, rows in codes.items()}
+        places, features = self._reading.places(columns), self._features(image, model.needed(candidates, columns))
+        # Not rounded: the grid is for sums, and would only add its error to what is asked about.
+        means = {
+            width: in_units(rows[places[width]], self.embedding.bound).mean(axis=0) for width, rows in features.items()
+        }
         logits = None
         if (
             reader is not None
@@ -225,22 +228,21 @@ class TactileLearner:
         frame = self._reading.widths[0] if self.sensor.camera else 1
         return felt.first(longest // frame / self.sensor.rate)
 
-    def _codes(
+    def _features(
         self, image: npt.NDArray[np.float32], widths: Sequence[int] | None = None
-    ) -> dict[int, npt.NDArray[np.int32]]:
-        """The codes of a tactile image's windows, by scale: all, or those of some widths."""
+    ) -> dict[int, npt.NDArray[np.floating]]:
+        """The features of a tactile image's windows, (windows, d) by scale: all, or those of some widths."""
         windows = self._reading.extent(image.shape[1])
         if widths is not None:
             windows = {width: windows[width] for width in widths}
-        codes = {}
-        for width, features in embed_windows(self.embedding, image, windows).items():
+        read = embed_windows(self.embedding, image, windows)
+        for width, features in read.items():
             expected = (len(windows[width]), self.embedding.dimension)
             if features.shape != expected:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
                 )
-            codes[width] = to_codes(features, self.embedding.bound)
-        return codes
+        return read
 
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""

@@ -76,7 +76,7 @@ class Model:
     ) -> Judgement:
         """Weigh the candidates for a touch.
 
-        means: for each scale that is `needed` the mean codes of the touch's windows, shape (d,). columns: felt so far.
+        means: for each scale that is `needed` the touch's mean features in the codes' unit, (d,). columns: felt so far.
         tuned: logits of f*, by material, in place of the last stage's scores.
 
         Materials that were felt at fewer scales are weighed against all others at the stage that they share; what

@@ -48,10 +48,10 @@ def test_it_says_what_predict_says(sensor, readout, tmp_path):
         assert scores.dtype == np.float32
         said = dict(learner.predict(touch).ranking)
         for material, score in zip(materials, scores.tolist(), strict=True):
-            # Two float32 networks: on real touches and full memories 3e-5 was measured.
-            assert abs(math.exp(score) - said[material]) < 5e-5
+            # Two float32 networks: on real touches and full memories 8e-6 was measured, 4e-4 of the scores.
+            assert abs(math.exp(score) - said[material]) < 1e-5
             if said[material] > 0:
-                assert score == pytest.approx(math.log(said[material]), abs=5e-3)
+                assert score == pytest.approx(math.log(said[material]), abs=1e-3)
 
 
 def test_it_reads_no_further_than_was_learned(tmp_path):
@@ -60,7 +60,7 @@ def test_it_reads_no_further_than_was_learned(tmp_path):
     touch = scene.touch(scene.materials[1], 9)
     (scores,) = session.run(None, {"image": tactile_image(touch)})
     said = dict(learner.predict(touch).ranking)
-    assert np.allclose(np.exp(scores), [said[name] for name in learner.materials], atol=5e-5)
+    assert np.allclose(np.exp(scores), [said[name] for name in learner.materials], atol=1e-5)
 
 
 def test_the_file_says_where_it_comes_from(tmp_path):

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import EmbeddingError
 
-__all__ = ["BITS", "to_codes"]
+__all__ = ["BITS", "in_units", "to_codes"]
 
 BITS = 20  # the grid: bound · 2⁻²⁰. 2²⁰ · 2²⁰ · 8192 rows is 2⁵³, the last integer that float64 counts to
 
@@ -17,7 +17,13 @@ def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
 
     Raises EmbeddingError for features that are not finite or exceed the bound.
     """
-    scaled = np.multiply(features, 2.0**BITS / bound, dtype=np.float64)
+    codes: npt.NDArray[np.int32] = np.rint(in_units(features, bound)).astype(np.int32)
+    return codes
+
+
+def in_units(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np.float64]:
+    """Features in the codes' unit, bound · 2⁻²⁰, not rounded; float64 of the same shape. Raises as `to_codes`."""
+    scaled: npt.NDArray[np.float64] = np.multiply(features, 2.0**BITS / bound, dtype=np.float64)
     largest = np.abs(scaled).max(initial=0.0)
     if not largest <= 2.0**BITS:
         bad = np.argwhere(~(np.abs(scaled) <= 2.0**BITS))[0]
@@ -25,5 +31,4 @@ def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
             f"expected finite features of magnitude at most {bound}; feature {bad.tolist()} is "
             f"{features[tuple(bad)]}. The embedding's bound is wrong, or it divides by zero"
         )
-    codes: npt.NDArray[np.int32] = np.rint(scaled).astype(np.int32)
-    return codes
+    return scaled

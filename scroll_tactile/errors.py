@@ -11,14 +11,16 @@
     │   │   ├── NotFiniteError               NaN or infinity: leave the touch out, or repair the readings
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
     │   ├── MaterialError                    a material's name is not usable
-    │   └── UnknownMaterialError (KeyError)  a material that was never felt is asked for
+    │   ├── UnknownMaterialError (KeyError)  a material that was never felt is asked for
+    │   └── ObservationError (KeyError)      an observation that is not there, or can no longer be taken back
     ├── MismatchError                        two things that do not belong together: open the right one
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
     ├── EmbeddingError                       an embedding broke its promise: mend it before it is used
     ├── WeightsError                         a file of weights is damaged, another architecture's, or unreachable
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
-    ├── FineTuneError                    a fine-tune had to stop: the f* before it stays
+    ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
+    ├── SingularError (ArithmeticError)      what was felt, with this λ, does not determine the weights: raise λ
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
@@ -69,6 +71,13 @@ class UnknownMaterialError(InputError, KeyError):
         return Exception.__str__(self)
 
 
+class ObservationError(InputError, KeyError):
+    """An observation is not in the memory, was taken back already, or was compacted and can be taken back no more."""
+
+    def __str__(self) -> str:
+        return Exception.__str__(self)
+
+
 class MismatchError(ScrollTactileError):
     """Two things were brought together that do not belong together."""
 
@@ -95,6 +104,10 @@ class DatasetError(ScrollTactileError):
 
 class FineTuneError(ScrollTactileError):
     """A fine-tune had to stop, with a loss that is not finite or without memory; the f* before it stays."""
+
+
+class SingularError(ScrollTactileError, ArithmeticError):
+    """The rows, with this λ, do not determine the weights, or not in this arithmetic."""
 
 
 class CapacityError(ScrollTactileError, OverflowError):

@@ -8,7 +8,7 @@ against the exact mean that the statistics hold.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,6 +185,14 @@ class ExemplarPool:
     def add(self, exemplar: Exemplar) -> None:
         """Add a stream where it belongs in, and drop what falls out."""
         self._sample.add(*_entry(exemplar))
+
+    def depends_on(self, material: str, key: bytes) -> bool:
+        """Whether taking a stream that was felt out again can change the pool."""
+        return self._sample.depends_on(material, key)
+
+    def refill(self, felt: Iterable[tuple[str, bytes, int, int]], make: Callable[[str, bytes, int], Exemplar]) -> None:
+        """Add all streams felt; see `Sample.refill`."""
+        self._sample.refill(felt, make)
 
     def update(self, other: ExemplarPool) -> None:
         """Add all that another pool stands for: this one is then as if it had felt what both did.

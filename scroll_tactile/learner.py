@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
@@ -14,21 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
-from scroll_tactile.errors import (
-    EmbeddingError,
-    InputError,
-    MaterialError,
-    MismatchError,
-    ScrollTactileError,
-    UnknownMaterialError,
-)
+from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.finetune import fine_tune
+from scroll_tactile.following import Following
 from scroll_tactile.identity import capacity_of, identity_of, kept_capacity, require_same
 from scroll_tactile.images import tactile_image
-from scroll_tactile.memory import OBSERVE, READINGS, Memory, give_back_scratch, pack_codes
+from scroll_tactile.ledger import Ledger
+from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
-from scroll_tactile.prediction import Prediction, Receipt
+from scroll_tactile.prediction import Compacted, Merged, Prediction, Receipt
+from scroll_tactile.requests import candidates_of, require_name, require_settings
 from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.sensors import Sensor
@@ -36,7 +32,7 @@ from scroll_tactile.streams import Stream, validate
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
 from scroll_tactile.windows import Reading
-from store import ReadOnlyError, Store, StoreClosedError, StoreError
+from store import Store
 
 __all__ = ["TactileLearner"]
 
@@ -44,7 +40,6 @@ Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 
 logger = logging.getLogger(__name__)
 
-LONGEST_NAME = 200  # characters
 SNAPSHOT_EVERY = 1024  # observations between generations: replaying so many takes about a second on opening
 
 
@@ -62,6 +57,9 @@ class TactileLearner:
     sensor: whose streams it reads. embedding: the frozen features, `Kernels()` unless given.
     readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
     false_alarms: the share of touches of known materials that may be called unknown.
+    refit: the share by which the memory may grow before λ and the calibration are chosen again. 0: they are at each
+    change, and every answer is a function of the memory alone. With 0.1, say, a `predict` just after an `observe` is a
+    hundred times as fast: the readouts are of all that was felt, λ and the calibration of a little less.
     exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
     choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
 
@@ -75,24 +73,22 @@ class TactileLearner:
         embedding: Embedding | None = None,
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
+        refit: float = 0.0,
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
     ) -> None:
-        _require_settings(readout, false_alarms)
+        require_settings(readout, false_alarms, refit)
         self.sensor = sensor
         self.embedding: Embedding = Kernels() if embedding is None else embedding
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
+        self.refit = refit
         self._reading = Reading.of(sensor, self.embedding)
         self._capacity = capacity_of(exemplars, exemplar_bytes)
-        self._memory = Memory(self.embedding.dimension, self._reading, self._capacity)
+        self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
         self._tuned_reader: TunedReader | None = None
-        self._store: Store | None = None
-        self._saved = 0
-        self._closed = False
-        self._whole = True
-        self._model: Model | None = None
-        self._lock = threading.RLock()
+        self._model: tuple[int, Model] | None = None
+        self._following: tuple[int, Following] | None = None
 
     @classmethod
     def open(
@@ -103,6 +99,7 @@ class TactileLearner:
         embedding: Embedding | None = None,
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
+        refit: float = 0.0,
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
         mode: Literal["write", "read"] = "write",
@@ -115,7 +112,7 @@ class TactileLearner:
         Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
         new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
         """
-        _require_settings(readout, false_alarms)
+        require_settings(readout, false_alarms, refit)
         chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
@@ -133,26 +130,30 @@ class TactileLearner:
                 embedding=chosen,
                 readout=readout,
                 false_alarms=false_alarms,
+                refit=refit,
                 exemplars=capacity.streams,
                 exemplar_bytes=capacity.nbytes,
             )
-            learner._memory = Memory.load(store, chosen.dimension, learner._reading, capacity)
+            reading = learner._reading
+            learner._ledger = Ledger(lambda: Memory.load(store, chosen.dimension, reading, capacity), store)
         except BaseException:
             store.close()
             raise
-        learner._store = store
-        learner._saved = learner._memory.sequence
         return learner
 
+    @property
+    def _memory(self) -> Memory:
+        return self._ledger.memory
+
     def __repr__(self) -> str:
-        where = "in memory" if self._store is None else str(self._store.path)
+        where = "in memory" if self._ledger.store is None else str(self._ledger.store.path)
         return f"<TactileLearner {where}, {self.sensor.name}, {len(self.materials)} materials>"
 
     @property
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order."""
-        with self._lock:
-            return self._sound().statistics.materials
+        with self._ledger.lock:
+            return self._memory.statistics.materials
 
     def observe(self, material: str, stream: Readings) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
@@ -162,20 +163,82 @@ class TactileLearner:
 
         Raises StreamError, MaterialError (nothing was kept), CapacityError, or StoreError.
         """
-        _require_name(material)
+        require_name(material)
         felt = validate(stream, self.sensor)
         image = tactile_image(felt)
-        columns, bound = image.shape[1], self.embedding.bound
+        bound = self.embedding.bound
         codes = {width: to_codes(rows, bound) for width, rows in self._features(image).items()}
-        with self._lock:
-            self._require_open()
-            # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
-            self._sound().statistics.require_room(codes)
-            sequence = self._keep(material, felt, columns, codes)
-            self._model = None
-            if self._store is not None and sequence - self._saved >= SNAPSHOT_EVERY:
-                self._snapshot_later()
-        return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, self._store is not None)
+        return self._ledger.observe(material, felt, image.shape[1], codes)
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """Make what is observed, retracted or forgotten in the block durable together, when it ends.
+
+        For a bulk of touches: the disk is waited for once. If the process dies in the block none of it is kept. An
+        exception in the block ends it, and what came before it is kept. Other threads wait for the end of it; there is
+        no fine-tuning, merging, compacting or closing in it. In a memory without a path it does nothing.
+
+        Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
+        """
+        with self._ledger.batch():
+            yield
+
+    def retract(self, receipt: Receipt | int) -> None:
+        """Take one observation back, by its receipt or its sequence; durable when this returns.
+
+        Statistics, exemplars and readouts are then, to the bit, those of a memory that never had it; an f* that was
+        made from it is gone. Its features stay in the journal, unused, until `compact`.
+
+        Raises ObservationError (nothing was changed) for one that is not there, was taken back before or was
+        compacted, or for a receipt of another memory; InputError in a memory without a path; StoreError.
+        """
+        self._ledger.retract(receipt)
+
+    def forget(self, material: str) -> int:
+        """Take back all observations of a material, as `retract` does one; returns how many there were.
+
+        Raises UnknownMaterialError for a material never felt, and ObservationError (nothing was changed) where some
+        of them were compacted; InputError in a memory without a path; StoreError.
+        """
+        return self._ledger.forget(material)
+
+    def merge(
+        self,
+        other: TactileLearner | str | os.PathLike[str],
+        *,
+        shared: Literal["once", "twice"],
+        progress: Callable[[str, int, int], object] | None = None,
+    ) -> Merged:
+        """Make this memory the one that felt everything that both did; durable, whole, when this returns.
+
+        other: a memory with a path, or its path; it stays as it is. shared: whether a stream that both felt (one
+        material, one content hash) counts once or twice. Receipts of the other memory are not receipts of this one.
+
+        Raises MismatchError for a memory of another sensor, embedding or grid, ObservationError where shared streams
+        cannot be told apart any more, CapacityError, InputError, StoreError: nothing was changed then.
+        """
+        if shared not in ("once", "twice"):
+            raise InputError(f"expected shared as 'once' or 'twice'; came {shared!r}")
+        told = progress or (lambda what, done, of: None)
+        path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
+        return self._ledger.merge(path, shared, told)
+
+    def compact(self, *, keep: int = 0) -> Compacted:
+        """Give up the features and readings of old observations, for space; what was learned from them stays.
+
+        keep: how many of the newest observations can still be taken back afterwards, by `retract` and `forget`; the
+        older ones cannot any more. What was taken back before is gone from the disk, too.
+
+        Raises InputError for a keep below 0, in a batch, and in a memory without a path; StoreError.
+        """
+        return self._ledger.compact(keep)
+
+    def refresh(self) -> bool:
+        """In a memory opened to read, take in what was committed since; whether there was anything.
+
+        Raises StoreError; what was known before stays then.
+        """
+        return self._ledger.refresh()
 
     def predict(self, stream: Readings, *, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
         """Say what a stream feels like; the memory stays as it is.
@@ -188,11 +251,11 @@ class TactileLearner:
         empty one. Before anything was felt the answer is material None, known False.
         """
         felt = validate(stream, self.sensor)
-        with self._lock:
-            memory = self._sound()
-            model, longest = self.model(), memory.statistics.longest
+        with self._ledger.lock:
+            memory = self._memory
+            model, longest = self._present(), memory.statistics.longest
             reader = self._tuned() if tuned else None
-        candidates = model.names if scene is None else _candidates(scene, model.names)
+        candidates = model.names if scene is None else candidates_of(scene, model.names)
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
         felt = self._as_far_as_learned(felt, longest)
@@ -246,25 +309,39 @@ class TactileLearner:
 
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""
-        with self._lock:
-            memory = self._sound()
-            if self._model is None:
-                self._model = Model.of(memory, self.readout)
-            return self._model
+        with self._ledger.lock:
+            memory, version = self._memory, self._ledger.version
+            if self._model is None or self._model[0] != version:
+                self._model = version, Model.of(memory, self.readout)
+            return self._model[1]
+
+    def _present(self) -> Model:
+        """The model that predictions are made with: `model`, or one that follows it where `refit` allows."""
+        ledger = self._ledger
+        if not self.refit:
+            return self.model()
+        if self._following is not None and self._following[0] == ledger.version:
+            return self._following[1].model
+        following, added = self._following and self._following[1], ledger.added
+        if following is None or added is None or not following.follow(ledger.memory, added):
+            following = Following(self.model(), ledger.memory, self.refit)
+        self._following = ledger.version, following
+        ledger.follow, ledger.added = True, []
+        return following.model
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
-        with self._lock:
-            return self._sound().statistics.digest()
+        with self._ledger.lock:
+            return self._memory.statistics.digest()
 
     @property
     def exemplars(self) -> dict[str, list[bytes]]:
         """Material → content hashes of its exemplars, in rank order; materials in alphabetical order."""
-        with self._lock:
+        with self._ledger.lock:
             return {name: [one.key for one in those] for name, those in self._ranked().items()}
 
     def _ranked(self) -> dict[str, list[Exemplar]]:
-        memory = self._sound()
+        memory = self._memory
         if memory.exemplars is None:
             return {}
         statistics = memory.statistics
@@ -295,10 +372,10 @@ class TactileLearner:
         Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
         enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
         """
-        with self._lock:
-            self._require_open()
-            self._require_writing()
-            model, ranked = self.model(), self._ranked()
+        with self._ledger.lock:
+            self._ledger.require_writing()
+            model, ranked, memory = self.model(), self._ranked(), self._memory
+            upto, taken_back = memory.sequence, memory.taken_back
             without = sorted(set(model.names) - set(ranked))
         if without and ranked:
             raise InputError(
@@ -310,99 +387,22 @@ class TactileLearner:
         tuned, report = fine_tune(
             self.embedding, model, ranked, self.sensor, epochs=epochs, seed=seed, device=device, progress=told
         )
-        with self._lock:
-            self._require_open()
-            memory = self._sound()
-            before, memory.tuned = memory.tuned, tuned
-            try:
-                self._snapshot()
-            except BaseException:
-                # Ctrl-C may have come after the generation was current: closing writes the f* before again.
-                memory.tuned, self._saved = before, -1
-                raise
-            self._tuned_reader = None
+        self._ledger.keep_tuned(tuned, memory, upto, taken_back)
         return report
 
     def tuned_digest(self) -> str | None:
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
-        with self._lock:
-            tuned = self._sound().tuned
+        with self._ledger.lock:
+            tuned = self._memory.tuned
             return None if tuned is None else tuned.digest()
 
     def _tuned(self) -> TunedReader | None:
-        tuned = self._sound().tuned
+        tuned = self._memory.tuned
         if tuned is None or not tuned.kept:
             return None
         if self._tuned_reader is None or self._tuned_reader.tuned is not tuned:
             self._tuned_reader = TunedReader(self.embedding, self._reading, tuned)
         return self._tuned_reader
-
-    def _require_writing(self) -> None:
-        """Raise before anything is trained what would keep f* from being written."""
-        if self._store is None:
-            return
-        if self._store.mode == "read":
-            raise ReadOnlyError(f'{self._store.path} was opened with mode="read": open it to write, to fine-tune')
-        try:
-            self._store.flush()
-        except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
-            logger.warning("%s: no generation could be written: %s", self._store.path, error)
-
-    def _require_open(self) -> None:
-        if self._closed:
-            raise StoreClosedError(f"{self!r} is closed: open its path again")
-
-    def _keep(self, material: str, felt: Stream, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> int:
-        """Write an observation down, then add it; its sequence."""
-        sequence = self._memory.sequence + 1
-        wanted = self._memory.wants_readings(material, felt.key, felt.readings.nbytes)
-        readings = felt.readings if wanted else None
-        self._whole = False
-        if self._store is not None:
-            try:
-                arrays = pack_codes(codes) | ({READINGS: felt.readings} if wanted else {})
-                record = self._store.append(OBSERVE, material, felt.key, attributes={"columns": columns}, arrays=arrays)
-            except StoreError:
-                self._whole = True  # the journal refused it, and the memory never had it
-                raise
-            sequence = record.sequence
-        self._memory.add(material, felt.key, columns, codes, sequence, readings)
-        self._whole = True
-        return sequence
-
-    def _sound(self) -> Memory:
-        """The memory; read anew from the store where ctrl-C, say, came while an observation was being added.
-
-        Raises ScrollTactileError where there is no store to read it from.
-        """
-        if not self._whole:
-            if self._store is None:
-                raise ScrollTactileError(
-                    "an observation was interrupted while it was added, and a memory without a path has nothing to go "
-                    "back to: make a new one"
-                )
-            self._memory = Memory.load(self._store, self.embedding.dimension, self._reading, self._capacity)
-            self._model, self._whole = None, True
-        return self._memory
-
-    def _snapshot_later(self) -> None:
-        assert self._store is not None
-        arrays, attributes = self._memory.to_arrays()
-        try:
-            chunks = self._memory.chunks()
-            self._store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes, chunks=chunks)
-        except StoreError as error:
-            # The observation itself is durable; only the next opening has more to replay.
-            logger.warning("%s: no generation could be written: %s", self._store.path, error)
-        self._saved = self._memory.sequence
-        del arrays
-        give_back_scratch()
-
-    def _snapshot(self) -> None:
-        if self._store is not None:
-            arrays, attributes = self._memory.to_arrays()
-            self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
-            self._store.commit(arrays, upto=self._saved, attributes=attributes, chunks=self._memory.chunks())
 
     def close(self) -> None:
         """Write what opening again would have to replay, and let go of the files; a second call does nothing.
@@ -410,17 +410,7 @@ class TactileLearner:
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
-        with self._lock:
-            store, self._closed = self._store, True
-            if store is None:
-                return
-            try:
-                # Half an observation is never saved: the journal has the whole of it, or nothing.
-                if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
-                    self._snapshot()
-            finally:
-                store.close()
-                give_back_scratch()
+        self._ledger.close()
 
     def __enter__(self) -> Self:
         return self
@@ -429,34 +419,3 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _require_settings(readout: str, false_alarms: float) -> None:
-    if readout not in ("lda", "ridge"):
-        raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
-    if not 0 < false_alarms < 1:
-        raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
-
-
-def _require_name(material: str) -> None:
-    if not isinstance(material, str):
-        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
-    if not material or len(material) > LONGEST_NAME:
-        raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
-    if not material.isprintable():
-        raise MaterialError(f"expected a name of printable characters; came {material!r}")
-
-
-def _candidates(scene: Sequence[str], names: list[str]) -> list[str]:
-    if isinstance(scene, str):
-        raise InputError(f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]")
-    wanted = list(dict.fromkeys(scene))
-    if not wanted:
-        raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
-    felt = set(names)
-    missing = [name for name in wanted if name not in felt]
-    if missing:
-        raise UnknownMaterialError(
-            f"the scene names {missing}, which were never felt; felt were {names if len(names) <= 30 else len(names)}"
-        )
-    return sorted(wanted)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -14,17 +14,37 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.exemplars import Exemplar, ExemplarPool
+from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.tuned import Tuned
 from scroll_tactile.windows import Reading
-from store import Record, Store
+from store import CompactedError, Record, Store
 
-__all__ = ["OBSERVE", "READINGS", "Capacity", "Memory", "give_back_scratch", "pack_codes", "unpack_codes"]
+__all__ = [
+    "FELT",
+    "MERGE",
+    "OBSERVE",
+    "READINGS",
+    "RETRACT",
+    "Capacity",
+    "Memory",
+    "give_back_scratch",
+    "pack_codes",
+    "spans",
+    "unpack_codes",
+    "unspanned",
+]
 
 logger = logging.getLogger(__name__)
 
-OBSERVE = "observe"  # the kind of a journal row
+# The kinds of journal rows.
+OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kept, its readings are the arrays
+RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
+MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
+FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
+ATTEMPTS = 5
+LARGE = 2**13  # codes
 READINGS = "readings"  # the array of a row that keeps a stream raw
 Codes = dict[int, npt.NDArray[np.int32]]
 
@@ -45,7 +65,11 @@ class Memory:
     """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
 
     dimension: d. reading: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
-    tuned: f*, of the last fine-tune; None before one.
+    tuned: f*, of the last fine-tune; None before one, or where what it was made from was taken back.
+    tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
+    excluded: of a base, the sequences up to it that had been taken back when it was made.
+    taken_back: how often anything was, since it was loaded.
+    base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
     """
 
     def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
@@ -55,11 +79,14 @@ class Memory:
         self.pool = Pool()
         self.exemplars = self.capacity.pool()
         self.tuned: Tuned | None = None
+        self.tuned_upto = 0
+        self.withdrawn: set[int] = set()
+        self.excluded: set[int] = set()
+        self.base = 0
+        self.generation: int | None = None
         self.sequence = 0
-
-    def wants_readings(self, material: str, key: bytes, nbytes: int) -> bool:
-        """Whether a stream's readings, of so many bytes, are to be kept as an exemplar's."""
-        return self.exemplars is not None and self.exemplars.wants(material, key, nbytes)
+        self.taken_back = 0
+        self._stale = False
 
     def add(
         self,
@@ -78,27 +105,97 @@ class Memory:
         if self.pool.wants(material, key):
             scored_at = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
             self.pool.add(material, key, Touch.of(scored_at, codes))
-        if readings is not None and self.wants_readings(material, key, readings.nbytes):
-            assert self.exemplars is not None
+        if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key, readings.nbytes):
             self.exemplars.add(Exemplar.of(material, key, readings, codes))
         self.sequence = sequence
 
-    def replay(self, record: Record) -> None:
-        """Add the observation of a journal row, without embedding anything again.
+    def replay(self, record: Record, store: Store) -> None:
+        """Do again what a journal row tells, without embedding anything again.
 
-        Raises MismatchError for a row of a kind that this version does not know.
+        After the last row `refill` has to be called. Raises MismatchError for a row of a kind that this version
+        does not know.
         """
-        if record.kind != OBSERVE:
+        if record.kind == OBSERVE:
+            columns = cast(int, record.attributes["columns"])
+            codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
+            self.add(record.label, record.key, columns, codes, record.sequence, readings)
+        elif record.kind == RETRACT:
+            for sequence in unspanned(record.attributes["sequences"]):
+                if sequence > self.base:
+                    self.withdraw(store.record(sequence))
+                elif sequence not in self.excluded:  # not by `compact`, which leaves them out: by a repair
+                    logger.warning(
+                        "%s: observation %d was taken back by row %d, and is still in: its features were lost to "
+                        "damage. Only a copy from before the damage can be without it",
+                        store.path,
+                        sequence,
+                        record.sequence,
+                    )
+        elif record.kind == MERGE:
+            self._join(record.arrays, cast(dict[str, Any], record.attributes))
+        elif record.kind != FELT:
             raise MismatchError(
-                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows {OBSERVE!r} "
-                "only. Open the memory with the version that wrote it, or a newer one"
+                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
+                f"{[OBSERVE, RETRACT, MERGE, FELT]}. Open the memory with the version that wrote it, or a newer one"
             )
-        columns = cast(int, record.attributes["columns"])
-        codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
-        self.add(record.label, record.key, columns, codes, record.sequence, readings)
+        self.sequence = record.sequence
 
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a generation."""
+    def withdraw(self, record: Record) -> None:
+        """Take an observation out of the sums; `refill` then mends the pools."""
+        material, key = record.label, record.key
+        columns = cast(int, record.attributes["columns"])
+        self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), columns)
+        self.withdrawn.add(record.sequence)
+        self.taken_back += 1
+        if self.pool.depends_on(material, key) or (self.exemplars and self.exemplars.depends_on(material, key)):
+            self._stale = True
+        if record.sequence <= self.tuned_upto:
+            self.tuned = None
+
+    def refill(self, store: Store) -> None:
+        """Choose pool and exemplars again, as if what was withdrawn had never been felt, where that can matter."""
+        if not self._stale:
+            return
+        touches = {(material, key): touch for material, key, touch in self.pool}
+        kept = {(one.material, one.key): one for one in self.exemplars or ()}
+        fresh = Memory(self.statistics.dimension, self.reading, self.capacity)
+        if (base := store.base()) is not None:
+            fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
+        for head in store.heads(after=self.base, kind=MERGE):
+            record = store.record(head.sequence)
+            fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
+        heads = [one for one in store.heads(self.base, kind=OBSERVE) if one.sequence not in self.withdrawn]
+        felt = [(one.label, one.key, cast(int, one.attributes.get("nbytes", 0)), one.sequence) for one in heads]
+
+        def touch(material: str, key: bytes, sequence: int) -> Touch:
+            return touches.get((material, key)) or self._touch(store.record(sequence))
+
+        def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
+            return kept.get((material, key)) or _exemplar(store.record(sequence))
+
+        fresh.pool.refill(felt, touch)
+        self.pool = fresh.pool
+        if fresh.exemplars is not None:
+            fresh.exemplars.refill((one for one in felt if one[2]), exemplar)
+            self.exemplars = fresh.exemplars
+        self._stale = False
+
+    def _touch(self, record: Record) -> Touch:
+        columns = cast(int, record.attributes["columns"])
+        stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
+        return Touch.of(stages, unpack_codes(record.arrays))
+
+    def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+        """Add all that another memory of the same making held: arrays and attributes of one of its generations."""
+        other = Memory(self.statistics.dimension, self.reading, self.capacity)
+        other._take(arrays, attributes)
+        self.statistics = self.statistics + other.statistics
+        self.pool.update({}, ((material, key, touch, 0) for material, key, touch in other.pool))
+        if self.exemplars is not None and other.exemplars is not None:
+            self.exemplars.update(other.exemplars)
+
+    def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be taken back."""
         arrays, names = self.statistics.to_arrays()
         pooled, materials = self.pool.to_arrays()
         attributes: dict[str, Any] = {
@@ -107,8 +204,13 @@ class Memory:
             "materials": names,
             "pool": materials,
             "capacity": [self.capacity.streams, self.capacity.nbytes],
+            "tuned_upto": self.tuned_upto,
         }
         arrays |= pooled
+        # A base is gone on from with the rows behind it, which tell again what of them was taken back.
+        gone = sorted(self.withdrawn if base_at is None else ())
+        out = [sequence for sequence in sorted(self.withdrawn) if base_at is not None and sequence <= base_at]
+        arrays["withdrawn"], arrays["excluded"] = np.array(gone, dtype=np.int64), np.array(out, dtype=np.int64)
         for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
             if part is not None:
                 its_arrays, attributes[name] = part.to_arrays()
@@ -123,21 +225,53 @@ class Memory:
     @classmethod
     def load(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None = None) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return cls._loaded(store, dimension, reading, capacity)
+            except CompactedError:  # a writer compacted it between two looks of this reader
+                continue
+        return cls._loaded(store, dimension, reading, capacity)
+
+    @classmethod
+    def _loaded(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None) -> Memory:
         memory = cls(dimension, reading, capacity)
-        generation = store.latest()
+        memory.base = store.compacted
+        # Where no generation verifies the base's own error says what is lost; without one all rows are there.
+        generation = store.latest() or store.base()
         if generation is not None:
             memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
-            memory.sequence = generation.upto
-        replayed = 0
-        for record in store.records(after=memory.sequence):
-            memory.replay(record)
-            replayed += 1
+            memory.sequence, memory.generation = generation.upto, generation.number
+        replayed = memory.catch_up(store)
         logger.info(
-            "%s: generation %s, %d observations replayed",
+            "%s: generation %s, %d rows of the journal replayed, %d compacted",
             store.path,
-            generation and generation.number,
+            memory.generation,
             replayed,
+            memory.base,
         )
+        return memory
+
+    def catch_up(self, store: Store) -> int:
+        """Replay the journal's rows that came since; how many there were."""
+        replayed = 0
+        for record in store.records(after=self.sequence):
+            self.replay(record, store)
+            replayed += 1
+        self.refill(store)
+        return replayed
+
+    def until(self, store: Store, upto: int) -> Memory:
+        """The memory of the observations up to `upto` that were not taken back since: what a base there holds."""
+        memory = Memory(self.statistics.dimension, self.reading, self.capacity)
+        memory.base, memory.sequence = self.base, self.base
+        if (base := store.base()) is not None:
+            memory._take(base.arrays, cast(dict[str, Any], base.attributes))
+        for record in store.records(after=self.base):
+            if record.sequence > upto:
+                break
+            if record.kind != RETRACT and record.sequence not in self.withdrawn:
+                memory.replay(record, store)
+        memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
         return memory
 
     def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
@@ -148,8 +282,29 @@ class Memory:
             self.exemplars = ExemplarPool.from_arrays(
                 arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
             )
+        self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
         if "tuned" in attributes:
-            self.tuned = Tuned.from_arrays(arrays, attributes["tuned"])
+            self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+
+
+def spans(sequences: Iterable[int]) -> list[list[int]]:
+    """Whole numbers as [first, last] pairs of those that follow each other: 1, 2, 3, 7 → [[1, 3], [7, 7]]."""
+    pairs: list[list[int]] = []
+    for sequence in sorted(sequences):
+        if pairs and pairs[-1][1] == sequence - 1:
+            pairs[-1][1] = sequence
+        else:
+            pairs.append([sequence, sequence])
+    return pairs
+
+
+def unspanned(pairs: Any) -> list[int]:
+    """The numbers that `spans` made pairs of."""
+    return [sequence for first, last in pairs for sequence in range(first, last + 1)]
+
+
+def _exemplar(record: Record) -> Exemplar:
+    return Exemplar.of(record.label, record.key, record.arrays[READINGS], unpack_codes(record.arrays))
 
 
 def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
@@ -160,7 +315,7 @@ def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDAr
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     for scale, rows in codes.items():
-        values, places = np.unique(rows, return_inverse=True)
+        values, places = _distinct(rows)
         if 4 * len(values) > rows.size and rows.size > 2**8:
             arrays[f"codes-{scale}"] = rows
             continue
@@ -169,6 +324,20 @@ def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDAr
         # Feature by feature: one feature's values in neighbouring windows are alike.
         arrays[f"places-{scale}"] = np.ascontiguousarray(places.reshape(rows.shape).T.astype(kind))
     return arrays
+
+
+def _distinct(rows: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.integer]]:
+    """The distinct codes, ascending, and for each of the rows' codes its place among them."""
+    if rows.size < LARGE:
+        return np.unique(rows, return_inverse=True)
+    # By a table of all codes there can be, not by sorting: a third of the time for a touch of BioTac.
+    at = rows + np.int32(2**BITS)
+    there = np.zeros(2 ** (BITS + 1) + 1, dtype=bool)
+    there[at] = True
+    values = np.flatnonzero(there)
+    table = np.empty(len(there), dtype=np.uint32)
+    table[values] = np.arange(len(values), dtype=np.uint32)
+    return (values - 2**BITS).astype(np.int32), table[at]
 
 
 def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:

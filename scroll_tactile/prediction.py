@@ -1,10 +1,10 @@
-"""What `observe` and `predict` give back."""
+"""What a learner gives back."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Prediction", "Receipt"]
+__all__ = ["Compacted", "Merged", "Prediction", "Receipt"]
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Receipt:
     sequence: its place in the memory's journal, from 1; in a memory without a store, the count of observations.
     material: what it was said to be. key: hash of the stream's content, 32 bytes.
     seconds: the stream's length. clipped: values that lay outside the sensor's range.
-    durable: whether it is on disk; False only in a memory without a store.
+    durable: whether it is on disk; False in a memory without a store, and in a batch, which is when it ends.
     """
 
     sequence: int
@@ -23,6 +23,29 @@ class Receipt:
     seconds: float
     clipped: int
     durable: bool
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What a merge brought.
+
+    observations: that came in. shared: streams, of one material, that both memories had felt.
+    """
+
+    observations: int
+    shared: int
+
+
+@dataclass(frozen=True)
+class Compacted:
+    """What a compaction did.
+
+    upto: the last row of the journal whose features were given up. bytes_before, bytes_after: of the memory on disk.
+    """
+
+    upto: int
+    bytes_before: int
+    bytes_after: int
 
 
 @dataclass(frozen=True)

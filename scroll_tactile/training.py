@@ -30,9 +30,9 @@ FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], object]
 
 BATCH = 32
-# Larger rates train faster away from what f has solved. Held out, with 400 exemplars of RoboSkin, f's log loss is 0.171;
-# f*'s is 0.151 with adapters' rates of 5e-6 and 5e-5, 0.159 with 1e-6. BioTac tells them apart: f 0.060, f* 0.060 at
-# 5e-6 and 0.073 at 5e-5, which had 92.0 % on the touches of the test where f has 99.5.
+# Larger rates train faster away from what f has solved. Held out, with 400 exemplars of RoboSkin, f's log loss is
+# 0.171; f*'s is 0.151 with adapters' rates of 5e-6 and 5e-5, 0.159 with 1e-6. BioTac tells them apart: f 0.060, f*
+# 0.060 at 5e-6 and 0.073 at 5e-5, which had 92.0 % on the touches of the test where f has 99.5.
 RATES: dict[TuneMode, float] = {"head": 0.0, "adapters": 5e-6, "network": 3e-6}
 HEAD_RATE = 3e-5  # in units of a feature's spread
 # A tenth of the touches is augmented, gently: at the strengths of offline training, where nothing else is known, f*

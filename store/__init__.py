@@ -5,11 +5,15 @@ generations: snapshots of arrays that are replaced as a whole. It knows nothing 
 mean. FORMAT.md beside this file describes every byte of it.
 
     with Store.open(path, identity={"made for": "this"}) as store:
-        record = store.append("add", "a label", key, arrays={"codes": codes})
-        store.commit({"sums": sums}, upto=record.sequence)
+        head = store.append("add", "a label", key, arrays={"codes": codes})
+        store.commit({"sums": sums}, upto=head.sequence)
+
+`check_store` verifies all of one, and `repair_store` keeps of a damaged one what verifies.
 """
 
+from store.check import Problem, check_store
 from store.errors import (
+    CompactedError,
     DamageError,
     LockedError,
     NotAStoreError,
@@ -20,21 +24,28 @@ from store.errors import (
     StoreFullError,
     VersionError,
 )
-from store.records import JSON, Generation, Record
+from store.records import JSON, Generation, Head, Record
+from store.repair import Repair, repair_store
 from store.store import Store
 
 __all__ = [
     "JSON",
+    "CompactedError",
     "DamageError",
     "Generation",
+    "Head",
     "LockedError",
     "NotAStoreError",
+    "Problem",
     "ReadOnlyError",
     "Record",
     "RecordError",
+    "Repair",
     "Store",
     "StoreClosedError",
     "StoreError",
     "StoreFullError",
     "VersionError",
+    "check_store",
+    "repair_store",
 ]

@@ -5,7 +5,8 @@ Exception
     ├── LockedError        another writer holds the store: close that one, or open with mode="read"
     ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
     ├── VersionError       a newer release wrote it: upgrade; nothing was touched
-    ├── DamageError        bytes on the disk are not those that were written: go on from what verifies
+    ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
+    ├── CompactedError     a row's arrays were given up when the store was compacted: go on from its base
     ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
     ├── ReadOnlyError      the store, or its folder, may not be written from here
     ├── StoreClosedError   the store was closed, or belongs to the process that forked this one
@@ -17,6 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 
 __all__ = [
+    "CompactedError",
     "DamageError",
     "LockedError",
     "NotAStoreError",
@@ -49,13 +51,18 @@ class DamageError(StoreError):
     """Bytes on the disk are not those that were written.
 
     `path` is the damaged file or array folder. `sequence` is the row of the journal that is damaged,
-    when it is one: `records(after=sequence)` goes on behind it.
+    when it is one: `records(after=sequence)` goes on behind it. `check_store` names all that is damaged,
+    and `repair_store` keeps what verifies.
     """
 
     def __init__(self, message: str, *, path: Path, sequence: int | None = None) -> None:
         super().__init__(message)
         self.path = path
         self.sequence = sequence
+
+
+class CompactedError(StoreError):
+    """The arrays of this row were given up, on purpose, when the store was compacted; the row itself is there."""
 
 
 class StoreFullError(StoreError):

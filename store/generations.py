@@ -1,25 +1,31 @@
-"""Generations: zarr groups that are written whole, made durable and verified when they are read."""
+"""Generations: zarr groups that are written whole and made durable before they count."""
 
 from __future__ import annotations
 
-import errno
+import hashlib
+import json
 import logging
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from store.arrays import array_digest, chunk_digest, flat_bytes
-from store.errors import DamageError, RecordError, StoreError, VersionError
 from store.files import remove_tree, sync_folder, sync_tree
 from store.records import JSON
 from store.reporting import reported
 
-if TYPE_CHECKING:
-    import zarr
-
-__all__ = ["folder_name", "highest_number", "read_generation", "read_rows", "remove_others", "write_generation"]
+__all__ = [
+    "GROUP_VERSION",
+    "PARTIAL",
+    "folder_name",
+    "highest_number",
+    "numbers",
+    "own_digest",
+    "remove_others",
+    "write_generation",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -29,10 +35,6 @@ PARTIAL = ".partial"
 # Pieces of a large array: small enough to be compressed in cache-sized steps and on several
 # threads, large enough that a hundred megabytes are some tens of files to make durable.
 CHUNK_BYTES = 4 * 2**20
-
-# What a reader may meet when a file is not there or is not a file; other failures of the system
-# (no permission, too many open files) say nothing against the generation.
-GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
 
 
 def folder_name(number: int) -> str:
@@ -47,12 +49,14 @@ def write_generation(
     arrays: Mapping[str, np.ndarray],
     attributes: Mapping[str, JSON],
     chunks: Mapping[str, int],
+    identity: Mapping[str, JSON],
 ) -> dict[str, Any]:
     """Write checked arrays as a durable zarr group in `parent` and return what must be read back.
 
     That is the group's format and, for each array, its dtype, shape and sha256, and for one that is in
-    `chunks` (name → rows) a digest of each chunk, as JSON. On any error nothing is left behind. Raises
-    StoreFullError, ReadOnlyError or StoreError.
+    `chunks` (name → rows) a digest of each chunk, as JSON. The group says the same of itself, and what
+    store it is of, so that it can be verified without the journal. On any error nothing is left behind.
+    Raises StoreFullError, ReadOnlyError or StoreError.
     """
     described = {name: _describe(array, chunks.get(name)) for name, array in arrays.items()}
     content = {"format": GROUP_VERSION, "arrays": described}
@@ -62,8 +66,8 @@ def write_generation(
         with reported(draft, f"writing generation {number}"):
             parent.mkdir(exist_ok=True)
             remove_tree(draft)
-            known = {"format": GROUP_VERSION, "number": number, "upto": upto, "attributes": attributes}
-            _write_group(draft, known, arrays, chunks)
+            known = {"number": number, "upto": upto, "attributes": attributes, "identity": identity, **content}
+            _write_group(draft, known | {"sha256": own_digest(known)}, arrays, chunks)
             sync_tree(draft)
             draft.rename(final)
             sync_folder(parent)
@@ -72,6 +76,11 @@ def write_generation(
         remove_tree(final)
         raise
     return content
+
+
+def own_digest(known: Mapping[str, Any]) -> str:
+    """Return the sha256, in hexadecimal, over a group's other attributes, as compact JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
 def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
@@ -132,113 +141,18 @@ def _chunks(array: np.ndarray) -> tuple[int, ...]:
     return tuple(chunks)
 
 
-def read_generation(path: Path, number: int, content: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the arrays of the generation in folder `path`, each verified against `content`.
-
-    They are writable and the caller's own. Raises DamageError naming the file or folder, the array and
-    the generation, and VersionError for a group of a newer format.
-    """
-    group = _opened(path, number, content["format"])
-    arrays = {}
-    for name, description in content["arrays"].items():
-        folder = path / name
-        what = f"array {name!r} of generation {number} in {folder}"
-        array = _read(group, name, what, folder, description, slice(None))
-        if array is None or array_digest(array) != description["sha256"]:
-            raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
-        arrays[name] = array
-    return arrays
-
-
-def read_rows(path: Path, number: int, content: Mapping[str, Any], name: str, first: int, last: int) -> np.ndarray:
-    """Return rows `first` to before `last` of an array that the generation in folder `path` keeps in chunks.
-
-    Only the chunks that hold them are read and verified. The rows are writable and the caller's own.
-    Raises RecordError for an array that is not there or not in chunks and for rows that it has not,
-    otherwise as `read_generation`; DamageError names the file and the chunk.
-    """
-    description = content["arrays"].get(name)
-    if description is None or "rows" not in description:
-        kept = sorted(one for one, described in content["arrays"].items() if "rows" in described)
-        raise RecordError(f"generation {number} in {path} keeps {kept} in chunks, not {name!r}: read it as a whole")
-    length, step = description["shape"][0], description["rows"]
-    if not 0 <= first <= last <= length:
-        raise RecordError(f"array {name!r} of generation {number} has rows 0 to {length}, not {first} to {last}")
-    group = _opened(path, number, content["format"])
-    file = path / name / "c" / "/".join("0" * (len(description["shape"]) + (description["dtype"][1] == "U")))
-    pieces = [np.empty((0, *description["shape"][1:]), description["dtype"])]
-    for chunk in range(first // step, -(-last // step) if last > first else 0):
-        begin, end = chunk * step, min(length, (chunk + 1) * step)
-        what = f"chunk {chunk} (rows {begin} to {end}) of array {name!r} of generation {number} in {file}"
-        shape = [end - begin, *description["shape"][1:]]
-        piece = _read(group, name, what, file, {**description, "shape": shape}, slice(begin, end))
-        if piece is None or chunk_digest(piece) != description["chunks"][chunk]:
-            raise DamageError(f"{what} is not what was written: its digest differs", path=file)
-        pieces.append(piece[max(first - begin, 0) : last - begin])
-    return np.concatenate(pieces)
-
-
-def _read(
-    group: zarr.Group, name: str, what: str, path: Path, description: Mapping[str, Any], rows: slice
-) -> np.ndarray | None:
-    import zarr
-
-    try:
-        node = group[name]
-        return _read_array(node, description, rows) if isinstance(node, zarr.Array) else None
-    except Exception as error:
-        raise _unreadable(error, what, path) from error
-
-
-def _opened(path: Path, number: int, version: int) -> zarr.Group:
-    if version > GROUP_VERSION:
-        raise VersionError(
-            f"{path} is written in format {version}; this release reads generations up to format "
-            f"{GROUP_VERSION}: upgrade it; nothing was changed"
-        )
-    import zarr
-    from zarr.storage import LocalStore
-
-    header = path / "zarr.json"
-    try:
-        group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r", zarr_format=3)
-        found = group.attrs.get("format")
-    except Exception as error:
-        raise _unreadable(error, f"generation {number} in {header}", header) from error
-    if found != version:
-        raise DamageError(f"generation {number} in {header} claims format {found!r}, not {version}", path=header)
-    return group
-
-
-def _read_array(node: zarr.Array[Any], description: Mapping[str, Any], rows: slice) -> np.ndarray | None:
-    shape, dtype = tuple(description["shape"]), np.dtype(description["dtype"])
-    # zarr gives a scalar for a 0-d array, which has no rows to choose from.
-    plain = np.asarray(node[rows] if shape else node[...])
-    if dtype.kind == "U":
-        expected: tuple[int, ...] = (*shape, dtype.itemsize // 4)
-        if plain.shape != expected or plain.dtype != np.dtype("<u4"):
-            return None
-        array = np.empty(shape, dtype)
-        flat_bytes(array)[:] = flat_bytes(np.asarray(plain, order="C"))
-        return array
-    if plain.shape != shape or plain.dtype != dtype:
-        return None
-    return np.require(plain, requirements=["C", "W"])
-
-
-def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
-    other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
-    if other or isinstance(error, MemoryError):
-        return StoreError(f"{what} could not be read: {error}")
-    return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
-
-
 def highest_number(parent: Path) -> int:
     """Return the highest number of a generation's folder in `parent`, finished or not; 0 for none."""
+    return max(numbers(parent, unfinished=True), default=0)
+
+
+def numbers(parent: Path, *, unfinished: bool = False) -> list[int]:
+    """Return the numbers of the generations' folders in `parent`, ascending; finished ones unless told otherwise."""
     if not parent.is_dir():
-        return 0
-    stems = (entry.name.removesuffix(PARTIAL) for entry in parent.iterdir())
-    return max((int(stem) for stem in stems if stem.isascii() and stem.isdigit()), default=0)
+        return []
+    names = (entry.name for entry in parent.iterdir())
+    stems = {name.removesuffix(PARTIAL) if unfinished else name for name in names}
+    return sorted(int(stem) for stem in stems if stem.isascii() and stem.isdigit())
 
 
 def remove_others(parent: Path, kept: Collection[int]) -> None:

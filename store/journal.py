@@ -2,58 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import os
+import logging
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from store.arrays import decode_payload
-from store.errors import DamageError, StoreClosedError, StoreError
-from store.records import JSON, Record, from_json
+from store.connection import connect, roll_back
+from store.errors import CompactedError, DamageError, StoreClosedError, StoreError
+from store.records import JSON, Head, Record, from_json
 from store.reporting import reported
-from store.schema import checksum
+from store.rows import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, lost_heads, read_head, read_meta, uncovered
+from store.schema import checksum, has_our_schema, payload_digest
 
-__all__ = ["GenerationRow", "Journal"]
+__all__ = ["Journal"]
 
-# Seconds for another program, such as a backup, to leave a transaction before it is reported.
-PATIENCE = 5.0
+logger = logging.getLogger(__name__)
 
-RECORD_COLUMNS = "sequence, kind, label, key, time, attributes, payload, checksum"
-GENERATION_COLUMNS = "number, upto, time, attributes, content, checksum"
-
-
-@dataclass(frozen=True)
-class GenerationRow:
-    """What the journal knows of a generation; `content` is what `write_generation` returned, as JSON."""
-
-    number: int
-    upto: int
-    time: float
-    attributes: bytes
-    content: bytes
-    checksum: bytes
-
-    @classmethod
-    def of(cls, number: int, upto: int, time: float, attributes: str, content: dict[str, Any]) -> GenerationRow:
-        """Return the row with its checksum."""
-        texts = attributes.encode(), json.dumps(content, separators=(",", ":")).encode()
-        return cls(number, upto, time, *texts, checksum("generation", number, upto, time, *texts))
-
-    def verified(self, journal: Path) -> tuple[dict[str, JSON], dict[str, Any]]:
-        """Return the attributes and the content; raise DamageError if they are not as written."""
-        try:
-            expected = checksum("generation", self.number, self.upto, self.time, self.attributes, self.content)
-            if expected == self.checksum:
-                return from_json(self.attributes.decode()), dict(from_json(self.content.decode()))
-        except (TypeError, ValueError, AttributeError):
-            # A flipped bit can also change a value's type.
-            pass
-        raise DamageError(f"the row of generation {self.number} in {journal} fails its checksum", path=journal)
+# Rows read at once where their arrays are not: a reader that pauses must hold no transaction open,
+# for that would keep the write-ahead log from ever being emptied.
+TOGETHER = 4096
 
 
 class Journal:
@@ -63,8 +34,9 @@ class Journal:
         self.path = path
         self._guard = threading.RLock()
         self._connection: sqlite3.Connection | None = None
+        self._batch = False
         with reported(path, "opening the journal"):
-            self._connection = _connect(path, write=write)
+            self._connection = connect(path, write=write)
         try:
             self.identity = self._read_identity()
             self._last = self.last() if write else 0
@@ -81,60 +53,184 @@ class Journal:
 
     def _read_identity(self) -> dict[str, JSON]:
         with self._using("reading what the store is for") as connection:
-            rows = connection.execute("SELECT key, value, checksum FROM meta").fetchall()
+            if not has_our_schema(connection):
+                raise DamageError(
+                    f"the tables of {self.path} are not where and what they were made as: repair the store "
+                    "(repair_store)",
+                    path=self.path,
+                )
+            meta = read_meta(connection.execute("SELECT key, value, checksum FROM meta").fetchall())
+        self._lost = lost_heads(meta)
         try:
-            meta = {key: value for key, value, check in rows if checksum("meta", key, value) == check}
-            return from_json(meta[b"identity"].decode())
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DamageError(f"the identity in {self.path}, table meta, fails its checksum", path=self.path) from error
+            return from_json(meta["identity"])
+        except (KeyError, ValueError) as error:
+            raise DamageError(
+                f"the identity in {self.path}, table meta, fails its checksum: repair the store (repair_store), "
+                "which takes it from a generation",
+                path=self.path,
+            ) from error
 
     def last(self) -> int:
         """Return the sequence of the last row, or the last that a generation contains, if later; or 0."""
-        # The second only when rows were lost: their numbers must not be given out again.
+        # Payloads and generations count only when rows were lost: then their numbers must not be given out
+        # again, and who reads on to the last must meet the gap.
         query = (
             "SELECT max(coalesce((SELECT max(sequence) FROM record), 0),"
-            " coalesce((SELECT max(upto) FROM generation), 0))"
+            " coalesce((SELECT max(sequence) FROM payload), 0)), (SELECT max(upto) FROM generation)"
         )
         with self._using("looking for the last row") as connection:
-            return int(connection.execute(query).fetchone()[0])
+            last, upto = connection.execute(query).fetchone()
+        if upto is None or (isinstance(upto, int) and upto <= last):
+            return int(last)
+        return max([int(last), *(row.upto for row in self.generations() if row.sound)])
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """Make the rows inserted in the block durable together, at its end, or none of them.
+
+        Other threads wait for the end. After a failed insert the rest of the block's are refused.
+        """
+        with self._guard:
+            self.refuse_in_batch("beginning a batch")
+            with self._using("beginning a batch") as connection:
+                connection.execute("BEGIN IMMEDIATE")
+            self._batch = True
+            # Not inside `_using`: what the block itself raises is not the store's to tell.
+            try:
+                yield
+                with self._using("making a batch durable"):
+                    if not connection.in_transaction:
+                        raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
+                    connection.execute("COMMIT")
+            except BaseException:
+                self._take_back(connection)
+                raise
+            finally:
+                self._batch = False
+
+    def _take_back(self, connection: sqlite3.Connection) -> None:
+        try:
+            with self._using("taking a batch back"):
+                roll_back(connection)
+                self._last = self.last()
+        except StoreError as error:
+            # What ended the batch is what the caller has to hear of; the next insert tries this again.
+            logger.warning("%s: a batch could not be taken back yet: %s", self.path, error)
+
+    def refuse_in_batch(self, doing: str) -> None:
+        """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
+        with self._guard:
+            if self._batch:
+                raise StoreError(f"{doing} is not possible in a batch of {self.path}: end it first")
 
     def insert(self, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes) -> int:
-        """Add a row and return its sequence once it is durable; after any error the row is not there."""
+        """Add a row and return its sequence once it is durable, or, in a batch, once it is written.
+
+        After any error the row is not there, nor any other of its batch.
+        """
         with self._using("appending a row") as connection:
+            if self._batch and not connection.in_transaction:
+                raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
             sequence = self._last + 1
-            fields = (sequence, kind.encode(), label.encode(), key, time, attributes.encode(), payload)
-            values = (sequence, kind, label, key, time, attributes, payload, checksum("record", *fields))
+            digest = payload_digest(payload)
+            fields = (sequence, kind.encode(), label.encode(), key, time, attributes.encode(), len(payload), digest)
+            values = (sequence, kind, label, key, time, attributes, len(payload), digest, checksum("record", *fields))
             try:
-                connection.execute(f"INSERT INTO record ({RECORD_COLUMNS}) VALUES (?,?,?,?,?,?,?,?)", values)
-            except sqlite3.Error:
-                _roll_back(connection)
+                if not self._batch:
+                    connection.execute("BEGIN IMMEDIATE")
+                connection.execute(f"INSERT INTO record ({HEAD_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?)", values)
+                connection.execute("INSERT INTO payload (sequence, bytes) VALUES (?,?)", (sequence, payload))
+                if not self._batch:
+                    connection.execute("COMMIT")
+            except BaseException:
+                roll_back(connection)
                 # A failed sync may have left the row in place: then its number is taken.
                 self._last = self.last()
                 raise
             self._last = sequence
             return sequence
 
-    def row_after(self, after: int) -> Record | None:
-        """Return the verified row that follows sequence `after`, None when that was the last.
+    def heads(self, after: int, last: int, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+        """Yield the verified rows behind `after` up to `last`, of one kind or label only where it is given.
 
-        Raises DamageError when the row fails its checksum or is missing.
+        Raises DamageError at the first of them that fails its checksum or, where all are asked for, is missing.
         """
-        query = f"SELECT {RECORD_COLUMNS} FROM record WHERE sequence > ? ORDER BY sequence LIMIT 1"
+        chosen = [f"{column} = ?" for column, value in (("kind", kind), ("label", label)) if value is not None]
+        values = [value for value in (kind, label) if value is not None]
+        where = " AND ".join(["sequence > ?", "sequence <= ?", *chosen])
+        query = f"SELECT {HEAD_COLUMNS} FROM record WHERE {where} ORDER BY sequence LIMIT {TOGETHER}"
+        while after < last:
+            with self._using(f"reading rows behind {after}") as connection:
+                rows = connection.execute(query, (after, last, *values)).fetchall()
+            for row in rows:
+                if not chosen:
+                    self._require_next(after, row[0])
+                yield self._head(row)[0]
+                after = row[0]
+            if len(rows) < TOGETHER:
+                if not chosen:
+                    self._require_next(after, last + 1)
+                return
+
+    def _require_next(self, after: int, sequence: int) -> None:
+        for first, last in uncovered(after + 1, sequence - 1, self._lost):
+            raise self._damage(f"rows {first} to {last} are missing from", last)
+
+    def _head(self, row: tuple[Any, ...]) -> tuple[Head, bytes]:
+        """The verified row, and the digest of its payload."""
+        found = read_head(row)
+        if found is None:
+            raise self._damage(f"row {row[0]} fails its checksum in", row[0])
+        return found
+
+    def row_after(self, after: int) -> Record | None:
+        """Return the verified row that follows sequence `after`, with its arrays; None when that was the last.
+
+        Raises DamageError when the row or its arrays fail their checksums or are missing, and CompactedError
+        where a base has the arrays' place.
+        """
+        columns = ", ".join(f"record.{column}" for column in HEAD_COLUMNS.split(", "))
+        query = (
+            f"SELECT {columns}, payload.bytes FROM record LEFT JOIN payload ON payload.sequence = record.sequence"
+            " WHERE record.sequence > ? ORDER BY record.sequence LIMIT 1"
+        )
         with self._using(f"reading row {after + 1}") as connection:
             row = connection.execute(query, (after,)).fetchone()
             missing_to = self.last() if row is None else row[0] - 1
         if missing_to > after:
-            raise self._damage(f"rows {after + 1} to {missing_to} are missing from", missing_to)
+            for first, last in uncovered(after + 1, missing_to, self._lost):
+                raise self._damage(f"rows {first} to {last} are missing from", last)
+            raise self._given_up(after + 1)
         if row is None:
             return None
-        *fields, stored = row
+        *fields, payload = row
+        head, digest = self._head(tuple(fields))
+        if payload is None:
+            if head.sequence <= self.compacted():
+                raise self._given_up(head.sequence)
+            raise self._damage(f"the arrays of row {head.sequence} are missing from", head.sequence)
         try:
-            if checksum("record", *fields) == stored:
-                return _record(*fields)
-        except (TypeError, ValueError, AttributeError):
-            # A flipped bit can also change a value's type.
+            if payload_digest(payload) == digest:
+                return Record(
+                    head.sequence, head.kind, head.label, head.key, head.time, head.attributes, decode_payload(payload)
+                )
+        except (TypeError, ValueError):
             pass
-        raise self._damage(f"row {row[0]} fails its checksum in", row[0])
+        raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)
+
+    def _given_up(self, sequence: int) -> CompactedError:
+        return CompactedError(
+            f"the arrays of row {sequence} of {self.path} were given up when rows 1 to {self.compacted()} were "
+            "compacted"
+        )
+
+    def compacted(self) -> int:
+        """Return the last row that has given up its arrays for a base, 0 where none has."""
+        query = f"SELECT {GENERATION_COLUMNS} FROM generation WHERE base"
+        with self._using("looking for a base") as connection:
+            rows = [GenerationRow(*row) for row in connection.execute(query).fetchall()]
+        # One that fails its checksum does not count: then the rows themselves say that their arrays are missing.
+        return max((row.upto for row in rows if row.sound), default=0)
 
     def _damage(self, what: str, sequence: int) -> DamageError:
         query = "SELECT number, upto FROM generation WHERE upto >= ? ORDER BY number DESC LIMIT 1"
@@ -154,22 +250,47 @@ class Journal:
 
     def generations(self) -> list[GenerationRow]:
         """Return the rows of the committed generations, the newest first, not yet verified."""
-        query = f"SELECT {GENERATION_COLUMNS} FROM generation ORDER BY number DESC"
+        query = f"SELECT {GENERATION_COLUMNS} FROM generation ORDER BY upto DESC, number DESC"
         with self._using("looking for generations") as connection:
             return [GenerationRow(*row) for row in connection.execute(query).fetchall()]
 
+    def newest(self) -> int | None:
+        """Return the number of the newest generation, None when there is none."""
+        query = "SELECT number FROM generation ORDER BY upto DESC, number DESC LIMIT 1"
+        with self._using("looking for the newest generation") as connection:
+            row = connection.execute(query).fetchone()
+        return None if row is None else int(row[0])
+
     def make_current(self, row: GenerationRow, *, forget: Iterable[int]) -> None:
-        """In one transaction make `row` the newest generation and drop the rows numbered in `forget`."""
-        values = (row.number, row.upto, row.time, row.attributes.decode(), row.content.decode(), row.checksum)
-        with self._using(f"making generation {row.number} current") as connection:
+        """In one transaction make `row` a generation and drop the rows numbered in `forget`.
+
+        Where it is a base the rows up to its `upto` give up their arrays in the same transaction.
+        """
+        with self._using(f"committing generation {row.number}") as connection:
+            self.refuse_in_batch("committing a generation")
             try:
                 connection.execute("BEGIN IMMEDIATE")
-                connection.execute(f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?)", values)
+                connection.execute(
+                    f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?,?)", row.values()
+                )
                 connection.executemany("DELETE FROM generation WHERE number = ?", [(old,) for old in forget])
+                if row.base:
+                    connection.execute("DELETE FROM payload WHERE sequence <= ?", (row.upto,))
                 connection.execute("COMMIT")
             except BaseException:
-                _roll_back(connection)
+                roll_back(connection)
                 raise
+
+    def shrink(self) -> None:
+        """Give the space of what was dropped back to the disk; needs as much again meanwhile.
+
+        Raises StoreError where that is not to be had, or where a reader is in the file just now.
+        """
+        with self._using("giving back space") as connection:
+            connection.execute("VACUUM")
+            (busy, *_) = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+            if busy:
+                raise StoreError(f"{self.path} is being read just now; it shrinks when the store is closed")
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -177,56 +298,3 @@ class Journal:
             if self._connection is not None:
                 connection, self._connection = self._connection, None
                 connection.close()
-
-
-def _connect(path: Path, *, write: bool) -> sqlite3.Connection:
-    options = "mode=rw" if write else "mode=ro"
-    if not write and _is_still(path):
-        options = "immutable=1"
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?{options}",
-        uri=True,
-        timeout=PATIENCE,
-        isolation_level=None,
-        check_same_thread=False,
-    )
-    try:
-        # Bytes, because damaged text need not be UTF-8, and the checksum is over the bytes.
-        connection.text_factory = bytes
-        if write:
-            connection.execute("PRAGMA synchronous = FULL")
-            # On a Mac a plain fsync stops at the drive's cache.
-            connection.execute("PRAGMA fullfsync = 1")
-            connection.execute("PRAGMA checkpoint_fullfsync = 1")
-            (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
-            if mode != b"wal":
-                raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _is_still(path: Path) -> bool:
-    # Without a log, in a folder where SQLite could not make one, it refuses to read unless told
-    # that nothing changes: an archive on a read-only disk.
-    return not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists()
-
-
-def _roll_back(connection: sqlite3.Connection) -> None:
-    if connection.in_transaction:
-        connection.execute("ROLLBACK")
-
-
-def _record(
-    sequence: int, kind: bytes, label: bytes, key: bytes, time: float, attributes: bytes, payload: bytes
-) -> Record:
-    return Record(
-        sequence,
-        kind.decode(),
-        label.decode(),
-        key,
-        time,
-        from_json(attributes.decode()),
-        decode_payload(payload),
-    )

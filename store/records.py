@@ -12,21 +12,34 @@ import numpy as np
 
 from store.errors import RecordError
 
-__all__ = ["JSON", "Generation", "Record", "check_key", "check_text", "check_time", "from_json", "to_json"]
+__all__ = ["JSON", "Generation", "Head", "Record", "check_key", "check_text", "check_time", "from_json", "to_json"]
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 
 LONGEST_KEY = 64  # bytes: the longest digest in common use (sha512, blake2b)
 
 
+@dataclass(frozen=True)
+class Head:
+    """One durable row of the journal without its arrays, which may have been compacted away.
+
+    `sequence` counts 1, 2, 3 … without gaps. `key` is a content hash of at most 64 bytes and `time`
+    is in Unix seconds. `size` is that of the payload in bytes.
+    """
+
+    sequence: int
+    kind: str
+    label: str
+    key: bytes
+    time: float
+    attributes: Mapping[str, JSON]
+    size: int
+
+
 # Without eq: comparing arrays element by element has no single truth value.
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One durable row of the journal.
-
-    `sequence` counts 1, 2, 3 … without gaps. `key` is a content hash of at most 64 bytes and `time`
-    is in Unix seconds. The arrays are fresh copies, the caller's to change.
-    """
+    """One durable row of the journal, as `Head`; the arrays are fresh copies, the caller's to change."""
 
     sequence: int
     kind: str

@@ -17,7 +17,7 @@ from store.errors import (
     StoreFullError,
 )
 
-__all__ = ["reported"]
+__all__ = ["SQLITE_ERRORS", "from_sqlite", "is_damage", "reported"]
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
@@ -26,16 +26,19 @@ FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 IOERR_SHMSIZE = 10 | (19 << 8)
 IOERR_SHORT_READ = 10 | (2 << 8)
 
+# The second where a message quotes damaged text: Python cannot tell it.
+SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+
 
 @contextmanager
 def reported(path: Path, doing: str) -> Iterator[None]:
-    """Run the block, telling an OSError or sqlite3.Error in it as the StoreError that it amounts to.
+    """Run the block, telling an OSError or an error of SQLite in it as the StoreError that it amounts to.
 
     `path` is the file or folder concerned and `doing` completes "while …" in the message.
     """
     try:
         yield
-    except sqlite3.Error as error:
+    except SQLITE_ERRORS as error:
         raise from_sqlite(error, path, doing) from error
     except OSError as error:
         raise from_system(error, path, doing) from error
@@ -51,17 +54,29 @@ def from_system(error: OSError, path: Path, doing: str) -> StoreError:
     return StoreError(f"{where}: {error.strerror or error} while {doing}")
 
 
-def from_sqlite(error: sqlite3.Error, path: Path, doing: str) -> StoreError:
+def is_damage(error: sqlite3.Error | UnicodeDecodeError) -> bool:
+    """Return whether the error says that the file is not as SQLite, or the store, wrote it."""
+    if isinstance(error, UnicodeDecodeError):
+        return True
+    extended: int = getattr(error, "sqlite_errorcode", -1)
+    code = extended & 0xFF
+    if code == sqlite3.SQLITE_ERROR:
+        # Of statements that are right: tables or columns are not there, or their description is not to be read.
+        return str(error).startswith(("no such", "malformed", "unsupported file format"))
+    return code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or extended == IOERR_SHORT_READ
+
+
+def from_sqlite(error: sqlite3.Error | UnicodeDecodeError, path: Path, doing: str) -> StoreError:
     """Return the StoreError for a failed call of SQLite, by its result code."""
     # Errors that Python itself raises, such as text that is not UTF-8, carry no code.
     extended: int = getattr(error, "sqlite_errorcode", -1)
     code = extended & 0xFF
     if code == sqlite3.SQLITE_FULL or extended == IOERR_SHMSIZE:
         return StoreFullError(f"no space left for {path} while {doing}: free some space and call again")
-    if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or extended == IOERR_SHORT_READ:
+    if is_damage(error):
         return DamageError(
-            f"{path} is damaged ({error}) while {doing}: copy the folder before anything else, then "
-            "go on from the newest generation, if one still loads",
+            f"{path} is damaged ({error}) while {doing}: copy the folder before anything else, then repair the "
+            "store (repair_store)",
             path=path,
         )
     if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import struct
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +15,27 @@ from store.files import remove_tree, sync_file, sync_folder
 from store.lock import HOLDER_FILE, LOCK_FILE
 from store.reporting import reported
 
-__all__ = ["GENERATIONS", "JOURNAL_FILE", "checksum", "create_journal", "holds_store"]
+__all__ = [
+    "DAMAGED_FILE",
+    "DRAFT_FILE",
+    "FORMAT_VERSION",
+    "GENERATIONS",
+    "HEADER_LENGTH",
+    "JOURNAL_FILE",
+    "LOG",
+    "PAGE_BYTES",
+    "REPAIRED_FILE",
+    "SIDES",
+    "build_journal",
+    "checksum",
+    "create_journal",
+    "has_our_schema",
+    "holds_store",
+    "is_our_header",
+    "new_meta",
+    "payload_digest",
+    "remove_drafts",
+]
 
 FORMAT_VERSION = 1
 APPLICATION_ID = 0x41725263  # "ArRc": arrays and records
@@ -23,15 +44,22 @@ GENERATIONS = "generations"
 
 # A draft is renamed when it is complete, so a file of the final name is never half made.
 DRAFT_FILE = JOURNAL_FILE + ".new"
-OURS = frozenset(
-    {LOCK_FILE, HOLDER_FILE, HOLDER_FILE + ".new", GENERATIONS}
-    | {DRAFT_FILE + suffix for suffix in ("", "-journal", "-wal", "-shm")}
-)
+# The journal that a repair has made, complete, until it is put in the place of the damaged one.
+REPAIRED_FILE = JOURNAL_FILE + ".repaired"
+# What a repair calls the damaged one (and, after it, .damaged-2, .damaged-3 …).
+DAMAGED_FILE = JOURNAL_FILE + ".damaged"
+# What SQLite keeps beside a file: the write-ahead log holds rows, the shared memory nothing of worth.
+LOG = "-wal"
+SIDES = (LOG, "-shm")
 
+
+
+STRICT = " STRICT"
 SQLITE_MAGIC = b"SQLite format 3\0"
 # The places of user_version and application_id in the header of every SQLite file.
 USER_VERSION_AT, APPLICATION_ID_AT, HEADER_LENGTH = 60, 68, 100
-
+# Part of the format, so that a damaged first page can be made anew: with TABLES it is always the same.
+PAGE_BYTES = 4096
 TABLES = (
     """CREATE TABLE meta (
     key TEXT PRIMARY KEY NOT NULL,
@@ -45,17 +73,35 @@ TABLES = (
     key BLOB NOT NULL,
     time REAL NOT NULL,
     attributes TEXT NOT NULL,
-    payload BLOB NOT NULL,
+    size INTEGER NOT NULL,
+    digest BLOB NOT NULL,
     checksum BLOB NOT NULL
+)""",
+    # Beside the rows and not in them: compaction takes payloads away, and reading rows without their
+    # payloads has to pass over small pages only.
+    """CREATE TABLE payload (
+    sequence INTEGER PRIMARY KEY,
+    bytes BLOB NOT NULL
 )""",
     """CREATE TABLE generation (
     number INTEGER PRIMARY KEY,
     upto INTEGER NOT NULL,
+    base INTEGER NOT NULL,
     time REAL NOT NULL,
     attributes TEXT NOT NULL,
     content TEXT NOT NULL,
     checksum BLOB NOT NULL
 )""",
+)
+
+# In the order of TABLES each gets the next page of a new file, and again when SQLite writes it anew. A
+# number that changed would make one table pass for another, or for a shorter one.
+ROOTS = (
+    (b"table", b"meta", 2),
+    (b"index", b"sqlite_autoindex_meta_1", 3),
+    (b"table", b"record", 4),
+    (b"table", b"payload", 5),
+    (b"table", b"generation", 6),
 )
 
 
@@ -78,62 +124,9 @@ def checksum(table: str, *fields: int | float | bytes) -> bytes:
     return digest.digest()
 
 
-def holds_store(folder: Path) -> bool:
-    """Return whether `folder` holds a store that this release reads; False when one may be made there.
-
-    Only looks. Raises NotAStoreError for a file, for a folder with other things in it and for another
-    program's database, VersionError for a newer format, and DamageError for a journal whose first
-    bytes are gone while its generations are still there.
-    """
-    with reported(folder, "looking for a store"):
-        if not folder.exists():
-            return False
-        if not folder.is_dir():
-            raise NotAStoreError(f"{folder} is a file; a store is a folder")
-        journal = folder / JOURNAL_FILE
-        if journal.is_file():
-            with journal.open("rb") as file:
-                _check_header(journal, file.read(HEADER_LENGTH))
-            return True
-        _refuse_foreign(folder)
-        return False
-
-
-def _refuse_foreign(folder: Path) -> None:
-    generations = folder / GENERATIONS
-    if generations.is_dir() and any(generations.iterdir()):
-        raise DamageError(
-            f"{folder} has generations but no {JOURNAL_FILE}: put the journal back from a copy; "
-            "the generations alone do not say which of them is current",
-            path=folder / JOURNAL_FILE,
-        )
-    if foreign := sorted(entry.name for entry in folder.iterdir() if entry.name not in OURS):
-        raise NotAStoreError(
-            f"{folder} holds no {JOURNAL_FILE} but other things ({', '.join(foreign[:3])}"
-            f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
-        )
-
-
-def _check_header(journal: Path, header: bytes) -> None:
-    if len(header) < HEADER_LENGTH or not header.startswith(SQLITE_MAGIC):
-        if (journal.parent / GENERATIONS).is_dir():
-            raise DamageError(
-                f"{journal} does not begin as a SQLite file: put it back from a copy of the folder",
-                path=journal,
-            )
-        raise NotAStoreError(f"{journal} is not a SQLite file; nothing was written")
-    (application,) = struct.unpack_from(">I", header, APPLICATION_ID_AT)
-    (version,) = struct.unpack_from(">I", header, USER_VERSION_AT)
-    if application != APPLICATION_ID:
-        raise NotAStoreError(
-            f"{journal} is another program's database (application id {application:#010x}, not "
-            f"{APPLICATION_ID:#010x}); nothing was written"
-        )
-    if version > FORMAT_VERSION:
-        raise VersionError(
-            f"{journal} is written in format {version}; this release reads up to format {FORMAT_VERSION}: "
-            "upgrade it, or open the store with the release that wrote it; nothing was changed"
-        )
+def payload_digest(payload: bytes) -> bytes:
+    """Return the 16-byte BLAKE2b over the bytes of a payload."""
+    return hashlib.blake2b(payload, digest_size=16).digest()
 
 
 def create_journal(folder: Path, identity: str) -> None:
@@ -141,32 +134,63 @@ def create_journal(folder: Path, identity: str) -> None:
 
     `identity` is JSON. The caller holds the writer's lock.
     """
-    draft = folder / DRAFT_FILE
-    for suffix in ("", "-journal", "-wal", "-shm"):
-        remove_tree(folder / (DRAFT_FILE + suffix))
     (folder / GENERATIONS).mkdir(exist_ok=True)
-    with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("BEGIN")
-        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        connection.execute(f"PRAGMA user_version = {FORMAT_VERSION}")
-        # STRICT refuses a value of a wrong type; SQLite knows it since 3.37.
-        strict = " STRICT" if sqlite3.sqlite_version_info >= (3, 37) else ""
-        for table in TABLES:
-            connection.execute(table + strict)
-        connection.executemany("INSERT INTO meta VALUES (?, ?, ?)", _meta_rows(identity))
-        connection.execute("COMMIT")
-        connection.execute("PRAGMA journal_mode = WAL")
-    sync_file(draft)
-    draft.rename(folder / JOURNAL_FILE)
+    build_journal(folder / DRAFT_FILE, new_meta(identity))
+    (folder / DRAFT_FILE).rename(folder / JOURNAL_FILE)
     sync_folder(folder)
     sync_folder(folder.parent)
 
 
-def _meta_rows(identity: str) -> list[tuple[str, str, bytes]]:
-    values = {
-        "format": str(FORMAT_VERSION),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "identity": identity,
-    }
-    return [(key, value, checksum("meta", key.encode("utf-8"), value.encode("utf-8"))) for key, value in values.items()]
+def new_meta(identity: str) -> dict[str, str]:
+    """Return what table meta of a new journal holds; `identity` is JSON."""
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"format": str(FORMAT_VERSION), "created": created, "identity": identity}
+
+
+def build_journal(
+    draft: Path, meta: Mapping[str, str], fill: Callable[[sqlite3.Connection], None] | None = None
+) -> None:
+    """Make the durable file `draft` a journal in which table meta holds `meta`, in place of any that is there.
+
+    fill: called with the connection, to add rows in the transaction that makes the tables.
+    """
+    for suffix in ("", "-journal", *SIDES):
+        remove_tree(draft.with_name(draft.name + suffix))
+    with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
+        connection.execute("PRAGMA synchronous = FULL")
+        for setting in (f"page_size = {PAGE_BYTES}", "auto_vacuum = NONE", "encoding = 'UTF-8'"):
+            connection.execute(f"PRAGMA {setting}")
+        connection.execute("BEGIN")
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {FORMAT_VERSION}")
+        # STRICT refuses a value of a wrong type; SQLite knows it since 3.37.
+        strict = STRICT if sqlite3.sqlite_version_info >= (3, 37) else ""
+        for table in TABLES:
+            connection.execute(table + strict)
+        rows = [(key, value, checksum("meta", key.encode(), value.encode())) for key, value in meta.items()]
+        connection.executemany("INSERT INTO meta VALUES (?, ?, ?)", rows)
+        if fill is not None:
+            fill(connection)
+        connection.execute("COMMIT")
+        connection.execute("PRAGMA journal_mode = WAL")
+    sync_file(draft)
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what a repair left that did not end; the caller holds the writer's lock, and a journal is in place."""
+    for name in (REPAIRED_FILE, *(DRAFT_FILE + suffix for suffix in ("", "-journal", *SIDES))):
+        remove_tree(folder / name)
+
+
+def has_our_schema(connection: sqlite3.Connection) -> bool:
+    """Return whether the tables are those of TABLES, to the letter, and in their places in the file.
+
+    The connection gives text as bytes. Raises sqlite3.Error where the schema cannot even be read.
+    """
+    found = {tuple(row) for row in connection.execute("SELECT type, name, rootpage, sql FROM sqlite_master")}
+    meta, *rest = (table.encode() for table in TABLES)
+    for strict in (b"", STRICT.encode()):
+        texts = [meta + strict, None, *(table + strict for table in rest)]
+        if {(*root, text) for root, text in zip(ROOTS, texts, strict=True)} <= found:
+            return True
+    return False

@@ -7,16 +7,17 @@ import os
 import threading
 import time as clock
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
 
-from store.arrays import check_arrays, check_chunks, decode_payload, encode_payload
+from store.arrays import check_arrays, check_chunks, encode_payload
 from store.background import Background
 from store.errors import (
+    CompactedError,
     DamageError,
     NotAStoreError,
     ReadOnlyError,
@@ -25,27 +26,17 @@ from store.errors import (
     StoreError,
 )
 from store.files import file_size, sync_folder, tree_size
-from store.generations import (
-    folder_name,
-    highest_number,
-    read_generation,
-    read_rows,
-    remove_others,
-    write_generation,
-)
-from store.journal import GenerationRow, Journal
+from store.journal import Journal
 from store.lock import WriterLock
-from store.records import JSON, Generation, Record, check_key, check_text, check_time, from_json, to_json
+from store.log import damaged_frame, log_text
+from store.records import JSON, Generation, Head, Record, check_key, check_text, check_time, from_json, to_json
 from store.reporting import reported
-from store.schema import GENERATIONS, JOURNAL_FILE, create_journal, holds_store
+from store.schema import GENERATIONS, JOURNAL_FILE, LOG, create_journal, holds_store, remove_drafts
+from store.snapshots import Snapshots
 
-__all__ = ["KEPT_GENERATIONS", "Store"]
+__all__ = ["Store"]
 
 logger = logging.getLogger(__name__)
-
-# The current one, and the one before it in case a disk error spoils the current: then only the
-# journal's rows since then have to be gone through again. More would only cost space.
-KEPT_GENERATIONS = 2
 
 
 class Store:
@@ -93,23 +84,20 @@ class Store:
         self._closing = threading.Lock()
         self._closed = False
         self._lock: WriterLock | None = None
-        self._committing = threading.Lock()
         self._background = Background(f"store commit {folder.name}")
-        # Numbers of generations that failed to verify: they do not count as a fallback.
-        self._spoilt: set[int] = set()
         with ExitStack() as undo:
             if mode == "write":
                 self._make_folder()
                 self._lock = WriterLock(folder)
                 undo.callback(self._lock.release)
                 self._make_journal(identity)
+            self._require_whole_log()
             self._journal = Journal(folder / JOURNAL_FILE, write=mode == "write")
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
+            self._snapshots = Snapshots(folder / GENERATIONS, self._journal)
             if mode == "write":
-                kept = [row.number for row in self._journal.generations()]
-                with reported(folder, "removing unfinished generations"):
-                    remove_others(folder / GENERATIONS, kept)
+                self._snapshots.remove_unfinished()
             undo.pop_all()
 
     def _make_folder(self) -> None:
@@ -125,6 +113,17 @@ class Store:
                 raise NotAStoreError(f"{self.path} holds no store; give an identity to make one")
             with reported(self.path, "making the store"):
                 create_journal(self.path, identity)
+        with reported(self.path, "removing what an interrupted repair left"):
+            # Or, were the journal lost later, the rows appended from now on would be lost with it.
+            remove_drafts(self.path)
+
+    def _require_whole_log(self) -> None:
+        # Before SQLite sees it, which takes a damaged frame for its end and writes over the rows behind it.
+        log = self.path / (JOURNAL_FILE + LOG)
+        with reported(log, "reading the write-ahead log"):
+            frame = damaged_frame(log)
+        if frame is not None:
+            raise DamageError(f"{log_text(log, frame)}: repair the store (repair_store)", path=log)
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -154,8 +153,8 @@ class Store:
         attributes: Mapping[str, JSON] | None = None,
         arrays: Mapping[str, np.ndarray] | None = None,
         time: float | None = None,
-    ) -> Record:
-        """Add a record and return it, as it will be read back, once it is durable.
+    ) -> Head:
+        """Add a record and return its head once it is durable; in a batch, once it is written.
 
         `time` is in Unix seconds, now when not given. Raises RecordError for what cannot be kept,
         StoreFullError, ReadOnlyError or another StoreError; after any of them the store goes on.
@@ -168,17 +167,65 @@ class Store:
         text = to_json("attributes", attributes)
         payload = encode_payload(check_arrays(arrays))
         sequence = self._journal.insert(kind, label, key, seconds, text, payload)
-        return Record(sequence, kind, label, key, seconds, from_json(text), decode_payload(payload))
+        return Head(sequence, kind, label, key, seconds, from_json(text), len(payload))
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """Make the records appended in the block durable together, when it ends, or none of them.
+
+        That is one wait for the disk in place of one for each. After an exception in the block, or an
+        append that failed on the disk, none is kept; one that was refused with RecordError was never part of
+        it. Other threads that append or read wait meanwhile. In the block nothing can be committed, flushed
+        or closed, nor another batch begun: StoreError. Raises StoreFullError, ReadOnlyError or another StoreError.
+        """
+        self._check_open(write=True)
+        self._journal.refuse_in_batch("beginning a batch")
+        self._background.wait()
+        with self._journal.batch():
+            yield
+
+    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+        """Yield the records behind sequence `after` without their arrays, up to the last at the start.
+
+        `kind`, `label`: those of one only. They are there for compacted records, too, but for those that a
+        repair named as lost. Raises DamageError at the first that is damaged or, where all are asked for,
+        missing; where they are chosen, one whose kind or label is damaged is passed over.
+        """
+        self._check_open()
+        if after < 0:
+            raise ValueError(f"after must not be negative, not {after}")
+        for what, text in (("the kind", kind), ("the label", label)):
+            if text is not None:
+                check_text(what, text)
+        return self._journal.heads(after, self._journal.last(), kind=kind, label=label)
+
+    def record(self, sequence: int) -> Record:
+        """Return the record of this sequence.
+
+        Raises RecordError where there is none, CompactedError where its arrays were given up, DamageError.
+        """
+        self._check_open()
+        if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= self._journal.last():
+            raise RecordError(f"{self.path} has records 1 to {self._journal.last()}, not {sequence!r}")
+        record = self._journal.row_after(sequence - 1)
+        assert record is not None
+        return record
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
 
         One is in memory at a time. Raises DamageError at the first that is damaged or missing; its
-        `sequence` is the `after` with which to go on behind it.
+        `sequence` is the `after` with which to go on behind it. Raises CompactedError where the first
+        are compacted: `base` has their place, and its `upto` is the `after` to go on with.
         """
         self._check_open()
         if after < 0:
             raise ValueError(f"after must not be negative, not {after}")
+        if after < self._journal.compacted():
+            raise CompactedError(
+                f"the arrays of records 1 to {self._journal.compacted()} of {self.path} were given up when it was "
+                "compacted: begin with base(), and go on behind its upto"
+            )
         return self._walk(after, self._journal.last())
 
     def _walk(self, after: int, last: int) -> Iterator[Record]:
@@ -199,24 +246,27 @@ class Store:
         Raises VersionError for a generation of a newer format.
         """
         self._check_open()
-        passed: set[int] = set()
-        while True:
-            row = next((row for row in self._journal.generations() if row.number not in passed), None)
-            if row is None:
-                return None
-            passed.add(row.number)
-            try:
-                return self._load(row)
-            except DamageError as damage:
-                # A writer may have replaced and removed it while it was read: no damage.
-                if row.number in {row.number for row in self._journal.generations()}:
-                    self._spoilt.add(row.number)
-                    logger.warning("%s; falling back to an older generation", damage)
+        return self._snapshots.latest()
 
-    def _load(self, row: GenerationRow) -> Generation:
-        attributes, content = row.verified(self._journal.path)
-        folder = self.path / GENERATIONS / folder_name(row.number)
-        return Generation(row.number, row.upto, attributes, read_generation(folder, row.number, content))
+    @property
+    def newest(self) -> int | None:
+        """The number of the newest committed generation, None when there is none; `latest` may pass it over."""
+        self._check_open()
+        return self._journal.newest()
+
+    @property
+    def compacted(self) -> int:
+        """The last record that has given up its arrays for a base, 0 where none has."""
+        self._check_open()
+        return self._journal.compacted()
+
+    def base(self) -> Generation | None:
+        """Return the generation that stands for the compacted records, None when there are none.
+
+        Raises DamageError where it does not verify, and VersionError for a newer format.
+        """
+        self._check_open()
+        return self._snapshots.base()
 
     def read_rows(self, name: str, first: int, last: int, *, generation: int | None = None) -> np.ndarray:
         """Return rows `first` to before `last` of an array that was committed with `chunks`, and read no others.
@@ -229,18 +279,7 @@ class Store:
         names file, array and chunk, VersionError, and StoreError where the generation is not there.
         """
         self._check_open()
-        while True:
-            row = next((row for row in self._journal.generations() if generation in (None, row.number)), None)
-            if row is None:
-                wanted = "no generation" if generation is None else f"generation {generation} no longer"
-                raise StoreError(f"{self.path} has {wanted}: look at the newest again, with latest()")
-            folder = self.path / GENERATIONS / folder_name(row.number)
-            try:
-                return read_rows(folder, row.number, row.verified(self._journal.path)[1], name, first, last)
-            except DamageError:
-                # A writer may have replaced and removed it while it was read: no damage.
-                if row.number in {row.number for row in self._journal.generations()}:
-                    raise
+        return self._snapshots.read_rows(name, first, last, generation)
 
     def commit(
         self,
@@ -253,6 +292,7 @@ class Store:
         """Write a generation that contains the records up to `upto`, make it current, return its number.
 
         chunks: name → rows of a chunk, for arrays of which `read_rows` is to read a part. Each is one file.
+        The one with the highest `upto` is current, and of several with the same the last committed.
         A background commit is waited for first, and its failure is raised here in place of committing.
         Raises RecordError for arrays, attributes, chunks or an `upto` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the generation before then stays current.
@@ -260,7 +300,39 @@ class Store:
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._background.wait()
         self._background.check()
-        return self._commit(checked, upto, text, pieces)
+        return self._snapshots.commit(checked, upto, text, pieces)
+
+    def compact(
+        self,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        upto: int,
+        attributes: Mapping[str, JSON] | None = None,
+        chunks: Mapping[str, int] | None = None,
+    ) -> None:
+        """Let a base stand for the records up to `upto`: their arrays are given up, their heads stay.
+
+        The base is a generation like others, but kept until the next one; whoever goes through the
+        records begins with it. It takes effect whole or not at all. A generation with all records has to
+        be committed before, so that one damaged file cannot take everything: RecordError otherwise, and as
+        `commit`. The space is given back to the disk where there is room to do so; a warning is logged
+        where there is not.
+        """
+        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
+        self._background.wait()
+        self._background.check()
+        newest = self._snapshots.latest()
+        if newest is None or newest.upto != self._journal.last():
+            there = "there is none" if newest is None else f"the newest has those up to {newest.upto}"
+            raise RecordError(
+                f"{self.path} can be compacted only beside a generation with all {self._journal.last()} records; "
+                f"{there}: commit one first"
+            )
+        self._snapshots.commit(checked, upto, text, pieces, base=True)
+        try:
+            self._journal.shrink()
+        except StoreError as error:
+            logger.warning("%s: the space was not given back yet: %s", self.path, error)
 
     def commit_later(
         self,
@@ -278,7 +350,7 @@ class Store:
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._background.check()
-        self._background.submit(lambda: self._commit(checked, upto, text, pieces))
+        self._background.submit(lambda: self._snapshots.commit(checked, upto, text, pieces))
 
     def _check_commit(
         self,
@@ -288,36 +360,22 @@ class Store:
         chunks: Mapping[str, int] | None,
     ) -> tuple[dict[str, np.ndarray], str, dict[str, int]]:
         self._check_open(write=True)
-        if isinstance(upto, bool) or not isinstance(upto, int) or not 0 <= upto <= self._journal.last():
-            raise RecordError(f"upto must be a sequence from 0 to the last, {self._journal.last()}, not {upto!r}")
+        # The rows of a batch may yet be taken back.
+        self._journal.refuse_in_batch("committing a generation")
+        first, last = self._journal.compacted(), self._journal.last()
+        if isinstance(upto, bool) or not isinstance(upto, int) or not first <= upto <= last:
+            # One before the base could not be gone on from: the arrays of the rows behind it were given up.
+            raise RecordError(
+                f"upto must be a sequence from {first}, the last that was compacted, to {last}, the last that there "
+                f"is, not {upto!r}"
+            )
         checked = check_arrays(arrays)
         return checked, to_json("attributes", attributes), check_chunks(chunks, checked)
-
-    def _commit(self, arrays: dict[str, np.ndarray], upto: int, attributes: str, chunks: dict[str, int]) -> int:
-        parent = self.path / GENERATIONS
-        with self._committing:
-            earlier = [row.number for row in self._journal.generations()]
-            number = 1 + max([highest_number(parent), *earlier])
-            content = write_generation(parent, number, upto, arrays, from_json(attributes), chunks)
-            fallback = [old for old in earlier if old not in self._spoilt][: KEPT_GENERATIONS - 1]
-            row = GenerationRow.of(number, upto, clock.time(), attributes, content)
-            try:
-                self._journal.make_current(row, forget=set(earlier) - set(fallback))
-            finally:
-                # Those that the journal names, whether the transaction went through or not.
-                self._remove_unnamed(parent)
-            return number
-
-    def _remove_unnamed(self, parent: Path) -> None:
-        try:
-            remove_others(parent, [row.number for row in self._journal.generations()])
-        except (StoreError, OSError) as error:
-            # The commit itself stands; the next one, or the next open, removes what is left.
-            logger.warning("%s: old generations could not be removed: %s", parent, error)
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
         self._check_open()
+        self._journal.refuse_in_batch("waiting for the background commit")
         self._background.wait()
         self._background.check()
 
@@ -331,11 +389,14 @@ class Store:
     def close(self) -> None:
         """Wait for the background commit, let go of the files and the lock; a second call does nothing.
 
-        Raises the failure of a background commit, after everything was let go.
+        Raises the failure of a background commit, after everything was let go, and StoreError in a batch.
         """
+        # What a fork inherited belongs to the parent: closing SQLite there can undo its locks.
+        if os.getpid() != self._process:
+            return
+        self._journal.refuse_in_batch("closing the store")
         with self._closing:
-            # What a fork inherited belongs to the parent: closing SQLite there can undo its locks.
-            if self._closed or os.getpid() != self._process:
+            if self._closed:
                 return
             self._background.wait()
             self._closed = True

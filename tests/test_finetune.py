@@ -122,7 +122,7 @@ def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
         learner.observe(NAMES[0], SCENE.touch(NAMES[0], at))
     expected = (learner.exemplars, learner.digest(), digest)
     answer = kept(learner).predict(SCENE.touch(NAMES[1], 70), tuned=True)
-    learner._store.close()  # as if the power failed: no generation is written
+    learner._ledger.store.close()  # as if the power failed: no generation is written
     for _ in range(2):
         with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS[kind]()) as again:
             assert (again.exemplars, again.digest(), again.tuned_digest()) == expected
@@ -133,10 +133,10 @@ def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
 def test_one_exemplar_is_one_read_of_the_store(tmp_path):
     with taught("kernels", path=tmp_path / "m") as learner:
         learner.fine_tune(epochs=1)
-        stored, lengths = learner._store.latest(), []
+        stored, lengths = learner._ledger.store.latest(), []
         for one in learner._memory.exemplars:
             first = sum(lengths)
-            rows = learner._store.read_rows(
+            rows = learner._ledger.store.read_rows(
                 "exemplar-readings", first, first + len(one.readings), generation=stored.number
             )
             assert rows.tobytes() == one.readings.tobytes()
@@ -159,7 +159,7 @@ def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
             raise StoreError("no space left")
 
         with monkeypatch.context() as patched:
-            patched.setattr(learner._store, "commit", full)
+            patched.setattr(learner._ledger.store, "commit", full)
             with pytest.raises(StoreError, match="space"):
                 learner.fine_tune(epochs=1, seed=2)
         assert learner.tuned_digest() == before
@@ -305,14 +305,14 @@ def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):
 def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, monkeypatch, stop):
     learner = taught("kernels", path=tmp_path / "m")
     before = learner.fine_tune(epochs=1, seed=1).digest
-    commit = learner._store.commit
+    commit = learner._ledger.store.commit
 
     def late(*args, **kwargs):
         commit(*args, **kwargs)
         raise stop
 
     with monkeypatch.context() as patched:
-        patched.setattr(learner._store, "commit", late)
+        patched.setattr(learner._ledger.store, "commit", late)
         with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else StoreError):
             learner.fine_tune(epochs=1, seed=2)
     assert learner.tuned_digest() == before

@@ -549,10 +549,10 @@ def test_what_was_not_closed_is_replayed(tmp_path):
 
 
 def test_a_generation_is_written_while_observing(tmp_path, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.learner.SNAPSHOT_EVERY", 3)
+    monkeypatch.setattr("scroll_tactile.ledger.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
-    learner._store.flush()
+    learner._ledger.store.flush()
     with Store.open(tmp_path / "m", mode="read") as reader:
         assert reader.latest().upto in range(3, 21)
     with opened(tmp_path / "m", mode="read") as reader:
@@ -576,9 +576,9 @@ def test_closing_twice_and_an_untouched_memory(tmp_path):
 CHILD = """
 import sys
 import numpy as np
-from scroll_tactile import Kernels, Sensor, TactileLearner, learner
+from scroll_tactile import Kernels, Sensor, TactileLearner, ledger
 
-learner.SNAPSHOT_EVERY = 7
+ledger.SNAPSHOT_EVERY = 7
 pad = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=1.0, unit="N", duration=1.0)
 memory = TactileLearner.open(sys.argv[1], sensor=pad, embedding=Kernels(seed=0, dimension=64))
 while True:
@@ -694,7 +694,7 @@ def test_a_full_disk_keeps_memory_and_journal_alike(tmp_path, monkeypatch):
         raise StoreError("no space left")
 
     with monkeypatch.context() as broken:
-        broken.setattr(learner._store, "append", full)
+        broken.setattr(learner._ledger.store, "append", full)
         for _ in range(2):
             with pytest.raises(StoreError, match="space"):
                 learner.observe("wool", touch("wool", 9))
@@ -715,7 +715,7 @@ def test_a_failing_snapshot_loses_nothing(tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise StoreError("no space left")
 
-    monkeypatch.setattr(learner._store, "commit", full)
+    monkeypatch.setattr(learner._ledger.store, "commit", full)
     with pytest.raises(StoreError, match="space"):
         learner.close()
     learner.close()
@@ -748,9 +748,9 @@ def test_what_a_full_memory_refuses_is_not_in_the_journal_either(tmp_path):
         fill(learner)
         with pytest.raises(CapacityError):
             learner.observe("wool", touch("wool", 9))
-        last = learner._store.last
+        last = learner._ledger.store.last
         sequence = learner._memory.sequence
-        learner._saved = sequence  # what was faked must not be written
+        learner._ledger._saved = sequence  # what was faked must not be written
     assert last == sequence == 8
     with opened(tmp_path / "m") as learner:
         assert learner.digest() == digest

@@ -1,22 +1,38 @@
 """Random histories of a learner against a list of touches that cannot go wrong."""
 
+import itertools
 import shutil
 import tempfile
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.errors import ObservationError, StreamError, UnknownMaterialError
+from scroll_tactile.ridge.pool import Pool
 from scroll_tactile.ridge.statistics import Statistics
 
 SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
 
 materials = st.sampled_from(["a", "b", "c", "ü"])
 touches = st.tuples(st.integers(0, 5), st.sampled_from([5, 9, 15, 16, 25, 40, 90]))
+histories = st.lists(st.tuples(materials, touches), max_size=6)
+
+
+class SmallPool(Pool):
+    """A pool that is soon full, so that what was left out of it has to come back."""
+
+    def __init__(self, capacity=5):
+        super().__init__(capacity)
 
 
 def stream(touch):
@@ -25,38 +41,149 @@ def stream(touch):
 
 
 def fed(felt):
-    learner = TactileLearner(sensor=PAD, embedding=SMALL)
+    learner = TactileLearner(**SETTINGS)
     for material, touch in felt:
         learner.observe(material, stream(touch))
     return learner
 
 
+def require_same(learner, felt):
+    """All that is kept of what was felt is, to the byte, what a memory keeps that felt it in another order."""
+    whole = fed(sorted(felt))
+    whole.readout = learner.readout
+    assert learner.digest() == whole.digest()
+    assert learner.exemplars == whole.exemplars
+    ours, theirs = (
+        [(material, key, touch.sums.tobytes(), touch.pairs.tobytes()) for material, key, touch in one._memory.pool]
+        for one in (learner, whole)
+    )
+    assert ours == theirs
+    for touch in ((7, 25), (8, 6), (9, 60)):
+        assert learner.predict(stream(touch)) == whole.predict(stream(touch))
+
+
+@dataclass(frozen=True)
+class Felt:
+    """An observation of the model; fixed: it can no longer be taken back."""
+
+    sequence: int
+    material: str
+    touch: tuple
+    fixed: bool = False
+
+    @property
+    def pair(self):
+        return self.material, self.touch
+
+
 class History(RuleBasedStateMachine):
-    """The model: what was observed, in a list."""
+    """The model: what was observed and not taken back, in a list."""
 
     def __init__(self):
         super().__init__()
         self.home = Path(tempfile.mkdtemp())
-        self.lives = 0
-        self.felt = []
+        self.names = (str(number) for number in itertools.count())
+        self.felt: list[Felt] = []
+        self.last = 0
+        self.pools = mock.patch("scroll_tactile.memory.Pool", SmallPool)
+        self.pools.start()
 
-    def open(self, readout="lda"):
-        return TactileLearner.open(self.home / str(self.lives), sensor=PAD, embedding=SMALL, readout=readout)
+    def open(self, path, readout="lda", mode="write"):
+        return TactileLearner.open(path, readout=readout, mode=mode, **SETTINGS)
 
     @initialize()
     def create(self):
-        self.learner = self.open()
+        self.path = self.home / next(self.names)
+        self.learner = self.open(self.path)
+        self.reader = self.open(self.path, mode="read")
+
+    def note(self, receipt, material, touch):
+        self.last += 1
+        assert receipt.sequence == self.last
+        self.felt.append(Felt(self.last, material, touch))
 
     @rule(material=materials, touch=touches)
     def observe(self, material, touch):
         receipt = self.learner.observe(material, stream(touch))
-        self.felt.append((material, touch))
         assert receipt.durable
-        assert receipt.sequence == len(self.felt)
+        self.note(receipt, material, touch)
+
+    @rule(felt=histories, fails=st.booleans())
+    def observe_together(self, felt, fails):
+        receipts = []
+        try:
+            with self.learner.batch():
+                receipts += [self.learner.observe(name, stream(touch)) for name, touch in felt]
+                if fails:
+                    self.learner.observe("a", [])
+        except StreamError:
+            assert fails
+        assert not any(receipt.durable for receipt in receipts)
+        for receipt, one in zip(receipts, felt, strict=True):
+            self.note(receipt, *one)
+
+    @rule(data=st.data())
+    @precondition(lambda self: any(not one.fixed for one in self.felt))
+    def retract(self, data):
+        one = data.draw(st.sampled_from([one for one in self.felt if not one.fixed]))
+        self.learner.retract(one.sequence)
+        self.felt.remove(one)
+        self.last += 1
+        with pytest.raises(ObservationError, match="already"):
+            self.learner.retract(one.sequence)
+
+    @rule(material=materials)
+    def forget(self, material):
+        before = [one for one in self.felt if one.material == material]
+        if not before or any(one.fixed for one in before):
+            with pytest.raises(ObservationError if before else UnknownMaterialError):
+                self.learner.forget(material)
+            return
+        assert self.learner.forget(material) == len(before)
+        self.felt = [one for one in self.felt if one.material != material]
+        self.last += 1
+
+    @rule(keep=st.integers(0, 4))
+    def compact(self, keep):
+        self.learner.compact(keep=keep)
+        loose = [one for one in self.felt if not one.fixed]
+        upto = self.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
+        self.felt = [replace(one, fixed=one.fixed or one.sequence <= upto) for one in self.felt]
+        for one in self.felt:
+            if one.fixed:
+                with pytest.raises(ObservationError):
+                    self.learner.retract(one.sequence)
+
+    @rule(felt=histories, taken=st.sets(st.integers(0, 5)), keep=st.none() | st.integers(0, 3), once=st.booleans())
+    def merge(self, felt, taken, keep, once):
+        """Another memory, which takes some back and may be compacted, comes in."""
+        with self.open(self.home / next(self.names)) as other:
+            receipts = [other.observe(name, stream(touch)) for name, touch in felt]
+            for at in sorted(taken):
+                if at < len(felt):
+                    other.retract(receipts[at])
+            left = [one for at, one in enumerate(felt) if at not in taken]
+            if keep is not None:
+                other.compact(keep=keep)
+            fixed = len(left) if keep == 0 else 0 if keep is None else max(0, len(left) - keep)
+            based = other._ledger.memory.base > 0
+            ours = {one.pair for one in self.felt}
+            shared = [at for at, one in enumerate(left) if one in ours]
+            if once and any(at < fixed for at in shared):
+                with pytest.raises(ObservationError, match="cannot be counted once"):
+                    self.learner.merge(other, shared="once")
+                return
+            merged = self.learner.merge(other, shared="once" if once else "twice")
+        coming = [at for at in range(len(left)) if not (once and at in shared)]
+        assert (merged.observations, merged.shared) == (len(coming), len(shared))
+        self.last += based
+        for at in coming:
+            self.last += 1
+            self.felt.append(Felt(self.last, *left[at], fixed=at < fixed))
 
     @rule(touch=touches, scene=st.none() | st.lists(materials, min_size=1))
     def predict(self, touch, scene):
-        felt = {material for material, _ in self.felt}
+        felt = {one.material for one in self.felt}
         scene = scene and [name for name in scene if name in felt]
         prediction = self.learner.predict(stream(touch), scene=scene or None)
         assert {name for name, _ in prediction.ranking} == set(scene or felt)
@@ -76,22 +203,30 @@ class History(RuleBasedStateMachine):
     @rule(readout=st.sampled_from(["lda", "ridge"]))
     def reopen(self, readout):
         self.learner.close()
-        self.learner = self.open(readout)
+        self.learner = self.open(self.path, readout)
+        require_same(self.learner, [one.pair for one in self.felt])
 
     @rule(readout=st.sampled_from(["lda", "ridge"]))
     def abandon(self, readout):
         """Leave the memory as it lies on the disk, as a kill would, and go on from there."""
-        before = self.home / str(self.lives)
-        self.lives += 1
-        shutil.copytree(before, self.home / str(self.lives), ignore=shutil.ignore_patterns("*-shm", "lock"))
+        before, self.path = self.path, self.home / next(self.names)
+        shutil.copytree(before, self.path, ignore=shutil.ignore_patterns("*-shm", "lock"))
         self.learner.close()
-        self.learner = self.open(readout)
+        self.reader.close()
+        self.learner = self.open(self.path, readout)
+        self.reader = self.open(self.path, mode="read")
+
+    @rule()
+    def refresh(self):
+        self.reader.refresh()
+        require_same(self.reader, [one.pair for one in self.felt])
+        assert not self.reader.refresh()
 
     @rule(data=st.data())
-    def split_and_merge(self, data):
-        """Two memories that share the touches make, together, the one that felt them all."""
+    def split_and_add(self, data):
+        """The statistics of two memories that share the touches are, together, those of the one that felt all."""
         sides = [data.draw(st.booleans()) for _ in self.felt]
-        parts = [fed([one for one, side in zip(self.felt, sides, strict=True) if side == part]) for part in (0, 1)]
+        parts = [fed(one.pair for one, side in zip(self.felt, sides, strict=True) if side == part) for part in (0, 1)]
         ours, theirs = (part._memory.statistics for part in parts)
         whole = self.learner._memory.statistics
         assert ours + theirs == whole
@@ -101,22 +236,17 @@ class History(RuleBasedStateMachine):
     @invariant()
     @precondition(lambda self: hasattr(self, "learner"))
     def agrees(self):
-        counts = {}
-        for material, _ in sorted(self.felt):
-            counts[material] = counts.get(material, 0) + 1
-        assert self.learner.materials == counts
+        assert self.learner.materials == dict(sorted(Counter(one.material for one in self.felt).items()))
 
     def teardown(self):
         if hasattr(self, "learner"):
-            whole = fed(sorted(self.felt))
             for _ in range(2):
-                assert self.learner.digest() == whole.digest()
-                whole.readout = self.learner.readout
-                for touch in ((7, 25), (8, 6), (9, 60)):
-                    assert self.learner.predict(stream(touch)) == whole.predict(stream(touch))
+                require_same(self.learner, [one.pair for one in self.felt])
                 self.learner.close()
-                self.learner = self.open(self.learner.readout)
+                self.learner = self.open(self.path, self.learner.readout)
             self.learner.close()
+            self.reader.close()
+        self.pools.stop()
         shutil.rmtree(self.home)
 
 

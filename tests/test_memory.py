@@ -92,7 +92,7 @@ def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, up
         # And it goes on from there, with arrays of its own.
         for seed in range(12, 16):
             record = append(store, seed)
-            memory.replay(record)
+            memory.replay(store.record(record.sequence), store)
         assert content(memory) == content(filled(range(16)))
         store.commit(memory.to_arrays()[0], upto=16, attributes=memory.to_arrays()[1])
         assert content(Memory.load(store, DIMENSION, READING)) == content(memory)

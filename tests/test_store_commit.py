@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import store.generations
-import store.store
+import store.reading
+import store.snapshots
 from store import DamageError, Store, StoreError
 
 ONE = {"x": np.arange(10)}
@@ -30,8 +31,8 @@ class Gate:
 
     def __init__(self, monkeypatch):
         self.open, self.reached, self.uptos = threading.Event(), threading.Event(), []
-        self.write = store.store.write_generation
-        monkeypatch.setattr(store.store, "write_generation", self)
+        self.write = store.snapshots.write_generation
+        monkeypatch.setattr(store.snapshots, "write_generation", self)
 
     def __call__(self, parent, number, upto, *rest):
         self.uptos.append(upto)
@@ -116,7 +117,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr(store.store, "write_generation", fail)
+    monkeypatch.setattr(store.snapshots, "write_generation", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, upto=0)
         raise KeyError
@@ -125,7 +126,7 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
 def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
     opened = Store.open(tmp_path, identity={})
     with monkeypatch.context() as broken:
-        broken.setattr(store.store, "write_generation", fail)
+        broken.setattr(store.snapshots, "write_generation", fail)
         opened.commit_later(ONE, upto=0)
         with pytest.raises(StoreError, match="background commit failed"):
             opened.close()
@@ -191,7 +192,7 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
     def starve(*_):
         raise MemoryError
 
-    monkeypatch.setattr(store.generations, "_read_array", starve)
+    monkeypatch.setattr(store.reading, "_read_array", starve)
     with pytest.raises(StoreError) as caught:
         opened.latest()
     assert not isinstance(caught.value, DamageError)

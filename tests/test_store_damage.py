@@ -64,8 +64,8 @@ def test_a_flipped_bit_in_a_row_is_named_and_gone_around(path, row, covered):
         "time = time + 1",
         "attributes = '{\"a\":1}'",
         "attributes = ''",
-        "payload = x''",
-        "payload = substr(payload, 1, 20)",
+        "size = size + 1",
+        "digest = x''",
         "checksum = x''",
     ],
 )
@@ -73,8 +73,31 @@ def test_every_column_is_under_the_checksum(path, assignment):
     change(path, f"UPDATE record SET {assignment} WHERE sequence = 3")
     with Store.open(path, mode="read") as opened:
         assert [row.sequence for row in islice(opened.records(), 2)] == [1, 2]
-        with pytest.raises(DamageError, match="row 3"):
-            list(opened.records())
+        assert [head.sequence for head in islice(opened.heads(), 2)] == [1, 2]
+        for read in (lambda: list(opened.records()), lambda: list(opened.heads()), lambda: opened.record(3)):
+            with pytest.raises(DamageError, match="row 3 fails its checksum") as caught:
+                read()
+            assert caught.value.sequence == 3
+
+
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("UPDATE payload SET bytes = x'' WHERE sequence = 3", "fail their checksum"),
+        ("UPDATE payload SET bytes = substr(bytes, 1, 20) WHERE sequence = 3", "fail their checksum"),
+        ("UPDATE payload SET bytes = (SELECT bytes FROM payload WHERE sequence = 4) WHERE sequence = 3", "fail their"),
+        ("DELETE FROM payload WHERE sequence = 3", "are missing"),
+    ],
+)
+def test_the_arrays_of_a_row_are_under_its_digest_and_its_head_is_not_lost_with_them(path, statement, said):
+    change(path, statement)
+    with Store.open(path, mode="read") as opened:
+        for read in (lambda: list(opened.records()), lambda: opened.record(3)):
+            with pytest.raises(DamageError, match=f"the arrays of row 3 {said}") as caught:
+                read()
+            assert caught.value.sequence == 3
+        assert [row.sequence for row in opened.records(3)] == [4, 5, 6]
+        assert [head.sequence for head in opened.heads()] == list(range(1, ROWS + 1))
 
 
 def test_exchanged_rows_are_found(path):
@@ -88,10 +111,16 @@ def test_exchanged_rows_are_found(path):
 def test_missing_rows_are_named_and_their_numbers_not_given_again(path):
     change(path, "DELETE FROM record WHERE sequence IN (2, 3)")
     with Store.open(path) as opened:
-        with pytest.raises(DamageError, match="rows 2 to 3 are missing") as caught:
-            list(opened.records())
-        assert [row.sequence for row in opened.records(caught.value.sequence)] == [4, 5, 6]
+        for read in (opened.records, opened.heads):
+            with pytest.raises(DamageError, match="rows 2 to 3 are missing") as caught:
+                list(read())
+            assert [row.sequence for row in read(caught.value.sequence)] == [4, 5, 6]
+    # One table betrays what the other lost at its end.
+    change(path, "DELETE FROM record WHERE sequence > 5")
+    with Store.open(path) as opened, pytest.raises(DamageError, match="rows 6 to 6 are missing"):
+        list(opened.heads(5))
     change(path, "DELETE FROM record WHERE sequence > 1")
+    change(path, "DELETE FROM payload WHERE sequence > 1")
     with Store.open(path) as opened:
         assert opened.last == 4
         with pytest.raises(DamageError, match="rows 2 to 4 are missing"):

@@ -1,7 +1,9 @@
 """Random histories of a store against a list that cannot go wrong."""
 
 import shutil
+import sqlite3
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -9,45 +11,87 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from store import RecordError, Store
+from store import CompactedError, RecordError, Store, check_store, repair_store
 
 labels = st.text("aé\U0001f9f6'\" ", max_size=4)
+arrays = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=5).map(lambda values: np.array(values, "<i8"))
+
+
+class Undone(Exception):
+    """Ends a batch."""
 
 
 class History(RuleBasedStateMachine):
-    """The model: every row that was acknowledged, and the generation that was committed last."""
+    """The model: every row that was acknowledged, the generation that is current, and the base."""
 
     def __init__(self):
         super().__init__()
         self.home = Path(tempfile.mkdtemp())
         self.lives = 0
         self.rows: list[tuple[str, bytes]] = []
-        self.current: tuple[int, int, bytes] | None = None
+        self.number = 0
+        self.current: tuple[int, int, bytes] | None = None  # upto, number, content
+        self.base: tuple[int, int, bytes] | None = None
 
     @initialize()
     def create(self):
         self.store = Store.open(self.home / "0", identity={"lives": 9})
 
-    @rule(label=labels, values=st.lists(st.integers(-(2**63), 2**63 - 1), max_size=5))
-    def append(self, label, values):
-        array = np.array(values, "<i8")
+    @property
+    def compacted(self):
+        return self.base[0] if self.base else 0
+
+    def put(self, label, array):
         assert self.store.append("a", label, b"key", arrays={"x": array}).sequence == len(self.rows) + 1
         self.rows.append((label, array.tobytes()))
 
+    @rule(label=labels, array=arrays)
+    def append(self, label, array):
+        self.put(label, array)
+
+    @rule(several=st.lists(st.tuples(labels, arrays), max_size=5), undone=st.booleans())
+    def batch(self, several, undone):
+        before = list(self.rows)
+        try:
+            with self.store.batch():
+                for label, array in several:
+                    self.put(label, array)
+                assert self.store.last == len(self.rows)
+                if undone:
+                    raise Undone
+        except Undone:
+            self.rows = before
+
+    def made(self, upto, array):
+        self.number += 1
+        made = (upto, self.number, array.tobytes())
+        self.current = max(self.current or made, made)
+        return made
+
     @rule(where=st.floats(0, 1), value=st.integers(0, 255), later=st.booleans())
     def commit(self, where, value, later):
-        upto = int(where * len(self.rows))
+        upto = self.compacted + int(where * (len(self.rows) - self.compacted))
         array = np.full((2, 3), value, "|u1")
         (self.store.commit_later if later else self.store.commit)({"x": array}, upto=upto)
         self.store.flush()
-        number = 1 + (self.current[0] if self.current else 0)
-        self.current = (number, upto, array.tobytes())
+        self.made(upto, array)
+
+    @rule(where=st.floats(0, 1), value=st.integers(0, 255))
+    def compact(self, where, value):
+        self.commit(1.0, value, later=False)
+        upto = self.compacted + int(where * (len(self.rows) - self.compacted))
+        array = np.full((3, 2), value, "|u1")
+        self.store.compact({"x": array}, upto=upto)
+        self.base = self.made(upto, array)
 
     @rule()
     def refuse(self):
-        for wrong in (lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, upto=10**6)):
+        wrong = [lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, upto=10**6)]
+        if self.compacted:
+            wrong.append(lambda: self.store.commit({}, upto=self.compacted - 1))
+        for call in wrong:
             try:
-                wrong()
+                call()
             except RecordError:
                 continue
             raise AssertionError("not refused")
@@ -60,25 +104,59 @@ class History(RuleBasedStateMachine):
     @rule(partial=st.booleans())
     def crash(self, partial):
         """Abandon the store as it lies on the disk, perhaps within a commit, and go on from a copy."""
-        self.lives += 1
-        copy = self.home / str(self.lives)
-        shutil.copytree(self.store.path, copy, ignore=shutil.ignore_patterns("*-shm"))
-        self.store.close()
+        copy = self.copied()
         if partial:
             (copy / "generations" / "00000099.partial" / "x").mkdir(parents=True)
         self.store = Store.open(copy)
         assert not (copy / "generations" / "00000099.partial").exists()
+
+    def copied(self):
+        self.lives += 1
+        copy = self.home / str(self.lives)
+        shutil.copytree(self.store.path, copy, ignore=shutil.ignore_patterns("*-shm"))
+        self.store.close()
+        return copy
+
+    @precondition(lambda self: len(self.rows) > max(self.compacted, self.current[0] if self.current else 0))
+    @rule(where=st.floats(0, 0.99))
+    def lose_a_row(self, where):
+        """Behind the current generation: then a repair keeps those before it."""
+        copy = self.copied()
+        first = (self.current[0] if self.current else 0) + 1
+        lost = first + int(where * (len(self.rows) - first + 1))
+        with closing(sqlite3.connect(copy / "journal.sqlite")) as connection, connection:
+            connection.execute("DELETE FROM payload WHERE sequence = ?", (lost,))
+        assert repair_store(copy).kept == lost - 1
+        self.rows = self.rows[: lost - 1]
+        self.store = Store.open(copy)
+
+    @rule()
+    def check(self):
+        for path in (self.store.path, self.copied()):
+            assert {one.kind for one in check_store(path)} <= {"leftover"}
+        self.store = Store.open(self.home / str(self.lives))
 
     @invariant()
     @precondition(lambda self: hasattr(self, "store"))
     def agrees(self):
         with Store.open(self.store.path, mode="read") as reader:
             for opened in (self.store, reader):
-                found = [(row.label, row.arrays["x"].tobytes()) for row in opened.records()]
-                assert (opened.last, found, opened.identity) == (len(self.rows), self.rows, {"lives": 9})
-            latest = reader.latest()
-        now = latest and (latest.number, latest.upto, latest.arrays["x"].tobytes())
-        assert now == self.current
+                found = [(row.label, row.arrays["x"].tobytes()) for row in opened.records(self.compacted)]
+                assert found == self.rows[self.compacted :]
+                assert [head.label for head in opened.heads()] == [label for label, _ in self.rows]
+                assert (opened.last, opened.identity) == (len(self.rows), {"lives": 9})
+                assert opened.compacted == self.compacted
+            latest, base, newest = reader.latest(), reader.base(), reader.newest
+            if self.compacted:
+                try:
+                    reader.record(self.compacted)
+                except CompactedError:
+                    pass
+                else:
+                    raise AssertionError("not compacted")
+        assert (latest and (latest.upto, latest.number, latest.arrays["x"].tobytes())) == self.current
+        assert (base and (base.upto, base.number, base.arrays["x"].tobytes())) == self.base
+        assert newest == (self.current and self.current[1])
 
     def teardown(self):
         if hasattr(self, "store"):

@@ -11,6 +11,7 @@ from scroll_tactile.cli.memory import inspect, observe, predict
 from scroll_tactile.cli.replay import replay
 from scroll_tactile.cli.schedules import schedules
 from scroll_tactile.cli.terminal import Commands
+from scroll_tactile.cli.upkeep import memory
 
 __all__ = ["app"]
 
@@ -24,4 +25,5 @@ app = typer.Typer(
 )
 for command in (demo, observe, predict, inspect, replay, continual, schedules):
     app.command()(command)
+app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")

@@ -9,11 +9,16 @@ import typer
 from rich.table import Table
 
 from scroll_tactile.bench.buffer_study import run_buffers
+from scroll_tactile.bench.interleaved import run_interleaved
+from scroll_tactile.bench.numerics import find_nist, run_numerics
 from scroll_tactile.bench.speed import run_speed
+from scroll_tactile.bench.timing import circumstances
 from scroll_tactile.bench.vision import run_vision
-from scroll_tactile.cli.results import Dataset, read
+from scroll_tactile.cli.numerics import show_numerics
+from scroll_tactile.cli.results import Dataset, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.embeddings import Kernels
+from scroll_tactile.plots_numerics import draw_numerics
 
 __all__ = ["bench"]
 
@@ -105,4 +110,73 @@ def buffers(
     console().print(table)
     if json is not None:
         write_json(json, result)
+        say(f"written to {json}")
+
+
+@bench.command()
+def interleaved(
+    streams: Annotated[int, typer.Option(min=100, help="Learned before anything is timed.")] = 2000,
+    pairs: Annotated[int, typer.Option(min=10, help="Of an observation and a prediction, timed.")] = 300,
+    interleavings: Annotated[int, typer.Option(min=100, help="Of the run that shows that nothing drifts.")] = 100_000,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the streams.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+) -> None:
+    """Time observing and asking in turns, 50 materials and 512 features, beside other learners."""
+    with progress_bar() as progress:
+        result = run_interleaved(
+            streams=streams,
+            pairs=pairs,
+            interleavings=interleavings,
+            seed=seed,
+            note=lambda what: progress(what, 0, 1),
+        )
+    table = Table("learner", "ms a pair", "times ours", "wrong", title=f"{streams} streams, 50 materials, 512 features")
+    for record in result["records"]:
+        if not record["measured"]:
+            table.add_row(record["learner"], "", "", f"not measured: {record['why']}")
+            continue
+        table.add_row(
+            record["learner"],
+            f"{record['milliseconds']:.2f}",
+            f"{record['times_ours']:.1f}",
+            percent(record["wrong"]),
+        )
+    console().print(table)
+    drift = result["drift"]
+    say(
+        f"after {drift['interleavings']} interleavings the weights differ from those solved anew by "
+        f"{drift['largest_relative_difference']:.0e} at most"
+    )
+    if json is not None:
+        write_json(json, result)
+        say(f"written to {json}")
+
+
+@bench.command()
+def numerics(
+    json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw speed against error into this file.")] = None,
+    quick: Annotated[bool, typer.Option(help="Every case and method, small: under a minute.")] = False,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with biotac_slide_20_50: also cases of real features.")
+    ] = None,
+    nist: Annotated[
+        Path | None, typer.Option(help="NIST's linear regressions, nist_strd.json; looked for with the data.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the made-up cases, batches and schedules.")] = 0,
+) -> None:
+    """Compare the exact form with RLS, QR and plain sums on hard cases: errors in weights against the truth, and time.
+
+    The whole takes some minutes.
+    """
+    require_folders(json, plot)
+    with progress_bar() as progress:
+        result = run_numerics(seed=seed, quick=quick, data=data, nist=nist or find_nist(data), progress=progress)
+    show_numerics(result)
+    if plot is not None:
+        draw_numerics(plot, result["records"], title=f"Speed against error, seed {seed}{', quick' * quick}")
+        say(f"drawn to {plot}")
+    if json is not None:
+        options = f"{' --quick' * quick}{f' --data {data}' if data else ''} --seed {seed}"
+        write_json(json, {"command": f"scroll-tactile bench numerics{options}", **circumstances(seed), **result})
         say(f"written to {json}")

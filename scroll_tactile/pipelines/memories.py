@@ -3,15 +3,49 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
-from scroll_tactile.embeddings import Kernels
-from scroll_tactile.errors import InputError
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from store import NotAStoreError, Store
 
-__all__ = ["open_memory"]
+__all__ = ["open_for_upkeep", "open_memory"]
+
+
+class Unneeded:
+    """Stands for the embedding that a memory was made with, where nothing is to be embedded."""
+
+    def __init__(self, made: dict[str, Any], reading: list[Any] | None) -> None:
+        self.name: str = made["name"]
+        self.dimension: int = made["dimension"]
+        self.bound: float = made["bound"]
+        self.fingerprint: str = made["fingerprint"]
+        self.partial_windows, self.judged_scales = reading or [True, "all"]
+
+    def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        """Raise MismatchError: there is nothing to embed with."""
+        raise MismatchError(
+            f"the memory was opened without its embedding {self.name!r}, to look after it only: open it with "
+            "TactileLearner.open(path, embedding=...)"
+        )
+
+
+def open_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
+    """Open a memory of any embedding for all that needs none: taking back, merging, compacting, writing out.
+
+    Raises what `TactileLearner.open` raises.
+    """
+    with Store.open(path, mode="read") as store:
+        identity = cast(dict[str, Any], store.identity)
+    if "embedding" not in identity:
+        raise MismatchError(f"{path} is a store, but holds no memory of touch")
+    embedding: Embedding = Unneeded(identity["embedding"], identity.get("reading"))
+    return TactileLearner.open(path, embedding=embedding, mode=mode)
 
 
 def open_memory(

@@ -8,7 +8,7 @@ for exemplars are another.
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -105,6 +105,19 @@ class Sample(Generic[T]):
         if self.wants(material, key, size):
             self._insert(material, key, item, size)
             self._cut()
+
+    def depends_on(self, material: str, key: bytes) -> bool:
+        """Whether taking a stream that was felt out again can change it: where it holds it, or has a limit."""
+        return self.limit is not None or (material, key) in self._items
+
+    def refill(self, felt: Iterable[tuple[str, bytes, int, int]], make: Callable[[str, bytes, int], T]) -> None:
+        """Add all streams felt: (material, key, bytes, place); `make(material, key, place)` makes those that stay."""
+        marks: Sample[int] = Sample(self.capacity, self.limit)
+        marks.update(self.notes(), ((material, key, -1, 0) for material, key, _ in self))
+        for material, key, size, place in felt:
+            marks.add(material, key, place, size)
+        chosen = ((material, key, make(material, key, at), 0) for material, key, at in marks if at >= 0)
+        self.update(marks.notes(), chosen)
 
     def update(self, notes: Mapping[str, Sequence[Any]], items: Iterable[tuple[str, bytes, T, int]]) -> None:
         """Add all that another sample of the same capacity and limit stands for: its `notes` and (…, size) it holds."""

@@ -38,7 +38,7 @@ class Task:
     covariance: S_w / N of scaled features, shape (d, d), upper triangle in Fortran's order.
     means: class means about the mean of all rows, scaled, shape (C, d).
     center: mean of all rows, shape (d,), and scale: total standard deviation (1 where it is 0), both in codes.
-    shares: p_y, shape (C,).
+    shares: p_y, shape (C,). rows: N.
     """
 
     covariance: FloatArray
@@ -46,6 +46,7 @@ class Task:
     center: FloatArray
     scale: FloatArray
     shares: FloatArray
+    rows: int
 
     @classmethod
     def of(cls, scatter: FloatArray, counts: IntArray, sums: IntArray) -> Task:
@@ -61,10 +62,9 @@ class Task:
         constant = variance < 0.25 / total
         scale = np.sqrt(np.where(constant, 1.0, variance))
         means[:, constant] = 0.0
-        scatter *= 1.0 / total
-        scatter /= scale[:, None]
-        scatter /= scale
-        return cls(scatter, means / scale, center.astype(np.float64), scale, shares)
+        scatter *= (1.0 / (total * scale))[:, None]
+        scatter *= 1.0 / scale
+        return cls(scatter, means / scale, center.astype(np.float64), scale, shares, total)
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ class Readout:
     center: mean of all rows, in codes, shape (d,).
     weights: W in codes, shape (d, C); z = (x − center) @ weights for codes x.
     gram: G, shape (C, C). ridge: H, shape (C, C). shares: p_y, shape (C,).
+    penalties: N λ v, v the features' variances, in codes², shape (d,): what is added to S_w to solve for W.
     """
 
     penalty: float
@@ -83,6 +84,7 @@ class Readout:
     gram: FloatArray
     ridge: FloatArray
     shares: FloatArray
+    penalties: FloatArray
 
     def project(self, codes: npt.NDArray[np.floating]) -> FloatArray:
         """z of codes of shape (…, d), shape (…, C): all that any answer needs."""
@@ -123,4 +125,5 @@ def fit_readout(task: Task, penalty: float) -> Readout:
     gram = (gram + gram.T) / 2
     weights = solved / task.scale[:, None]
     ridge = np.linalg.inv(np.diag(1.0 / task.shares) + gram)
-    return Readout(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares)
+    penalties = task.rows * penalty * np.square(task.scale)
+    return Readout(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares, penalties)

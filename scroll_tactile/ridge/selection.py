@@ -12,13 +12,14 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.blas import dsymm
 from scipy.special import log_ndtr, logsumexp
 
 from scroll_tactile.ridge.moments import within_scatter
 from scroll_tactile.ridge.readouts import Readout, ReadoutName, Task, fit_readout
 from scroll_tactile.ridge.statistics import FOLDS, Statistics
 
-__all__ = ["PENALTIES", "Selection", "select"]
+__all__ = ["DEFAULT", "PENALTIES", "Selection", "select", "task_of"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class _Trial:
     task: Task
     counts: npt.NDArray[np.int64]
     means: FloatArray  # held-out class means, about the task's center, in codes
-    scatter: FloatArray  # held-out scatter within classes, full, in codes²
+    scatter: FloatArray  # held-out scatter within classes, upper triangle, in codes²
 
 
 def select(statistics: Statistics, scale: int, kind: ReadoutName) -> Selection | None:
@@ -76,10 +77,16 @@ def select(statistics: Statistics, scale: int, kind: ReadoutName) -> Selection |
             losses[penalty] = sum(_loss(trials[fold], readout, kind) for fold, readout in fitted[penalty].items())
     # Ties go to the larger λ, the tamer readout.
     chosen = min(reversed(PENALTIES), key=losses.__getitem__) if losses else DEFAULT
-    scatter = within_scatter(total, counts.sum(axis=1), sums.sum(axis=1))
-    readout = fit_readout(Task.of(scatter, counts.sum(axis=1), sums.sum(axis=1)), chosen)
+    readout = fit_readout(task_of(statistics, scale), chosen)
     held_out = {fold: (trial.known, fitted[chosen][fold]) for fold, trial in trials.items()}
     return Selection(names, readout, held_out, losses)
+
+
+def task_of(statistics: Statistics, scale: int) -> Task:
+    """The task of all that was felt at a scale."""
+    names = statistics.names(scale)
+    counts, sums = statistics.counts(scale, names).sum(axis=1), statistics.sums(scale, names).sum(axis=1)
+    return Task.of(within_scatter(statistics.total_second(scale), counts, sums), counts, sums)
 
 
 def _trial(
@@ -99,14 +106,13 @@ def _trial(
     other_sums = sums.sum(axis=1) - sums[:, fold]
     task = Task.of(within_scatter(total - held, theirs, other_sums), theirs[known], other_sums[known])
     scatter = within_scatter(held, counts[:, fold], sums[:, fold])
-    scatter += np.triu(scatter, 1).T
     in_fold = counts[known, fold]
     means = sums[known, fold] / np.maximum(in_fold, 1)[:, None] - task.center
     return _Trial(known, task, in_fold, means, scatter)
 
 
 def _loss(trial: _Trial, readout: Readout, kind: ReadoutName) -> float:
-    spread = readout.weights.T @ trial.scatter @ readout.weights
+    spread = readout.weights.T @ dsymm(1.0, trial.scatter, readout.weights, lower=0)
     at = trial.means @ readout.weights
     if kind == "ridge":
         return _squared_error(trial, readout, at, spread)

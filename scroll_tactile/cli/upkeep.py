@@ -1,0 +1,127 @@
+"""`scroll-tactile memory …`: checking, mending, shrinking, merging and taking back."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from scroll_tactile.cli.terminal import Commands, progress_bar, say
+from scroll_tactile.pipelines.memories import open_for_upkeep
+from scroll_tactile.plain import export_plain
+from store import check_store, repair_store
+
+__all__ = ["memory"]
+
+memory = typer.Typer(cls=Commands, no_args_is_help=True, help="Look after a memory on disk.")
+
+MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
+
+
+class Shared(StrEnum):
+    """How streams that both memories felt are counted."""
+
+    ONCE = "once"
+    TWICE = "twice"
+
+
+@memory.command()
+def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """Verify every checksum; change nothing. The exit code is 1 where something is damaged."""
+    with progress_bar() as progress:
+        problems = check_store(folder, progress=progress)
+    damaged = [one for one in problems if one.kind != "leftover"]
+    if as_json:
+        found = [{"path": str(one.path), "what": one.what, "kind": one.kind} for one in problems]
+        typer.echo(json.dumps({"sound": not damaged, "problems": found}, ensure_ascii=False))
+    else:
+        for one in problems:
+            colour = {"lost": "red", "spare": "yellow"}.get(one.kind, "dim")
+            say(f"[{colour}]{one.kind}:[/] {escape(one.what)}")
+        say("[green]sound:[/] every checksum holds" if not damaged else f"[red]{len(damaged)} damaged[/]")
+        if damaged:
+            say(f"copy the folder, then: scroll-tactile memory repair {escape(str(folder))}")
+    if damaged:
+        raise typer.Exit(1)
+
+
+@memory.command()
+def repair(folder: MemoryFolder) -> None:
+    """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
+    with progress_bar() as progress:
+        done = repair_store(folder, progress=progress)
+    for what in done.lost:
+        say(f"[yellow]lost:[/] {escape(what)}")
+    if done.aside is not None:
+        say(f"the damaged journal was put aside: {escape(str(done.aside))}")
+    say(f"kept up to row {done.kept}" if done.lost else f"nothing was damaged; rows 1 to {done.kept} verify")
+
+
+@memory.command()
+def compact(
+    folder: MemoryFolder,
+    keep: Annotated[int, typer.Option(min=0, help="The newest so many observations can still be taken back.")] = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Give up the features of old observations for space: they stay learned, and cannot be taken back any more."""
+    with open_for_upkeep(folder) as learner:
+        felt = sum(learner.materials.values())
+        question = f"Of {felt} observations only the newest {keep} can be retracted or forgotten afterwards. Go on?"
+        if not yes and not typer.confirm(question):
+            raise typer.Exit(1)
+        done = learner.compact(keep=keep)
+    before, after = done.bytes_before / 2**20, done.bytes_after / 2**20
+    say(f"rows up to {done.upto} are compacted; on disk {before:.1f} MB before, {after:.1f} MB after")
+
+
+@memory.command()
+def export(
+    folder: MemoryFolder,
+    target: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
+) -> None:
+    """Write all that a memory holds as CSV, JSON and NumPy files, which need no scroll-tactile to be read."""
+    with open_for_upkeep(folder, mode="read") as learner, progress_bar() as progress:
+        export_plain(learner, target, progress)
+    say(f"written: {escape(str(target))}")
+
+
+@memory.command()
+def retract(
+    folder: MemoryFolder,
+    observation: Annotated[int, typer.Argument(help="Its number, as observe and export tell it.", show_default=False)],
+) -> None:
+    """Take one observation back, exactly, as if it had never been felt."""
+    with open_for_upkeep(folder) as learner:
+        learner.retract(observation)
+        left = sum(learner.materials.values())
+    say(f"observation {observation} was taken back; {left} are left")
+
+
+@memory.command()
+def forget(
+    folder: MemoryFolder,
+    material: Annotated[str, typer.Argument(help="Its name.", show_default=False)],
+) -> None:
+    """Take back all observations of a material, exactly, as if it had never been felt."""
+    with open_for_upkeep(folder) as learner:
+        count = learner.forget(material)
+        left = len(learner.materials)
+    say(f"{escape(material)}: {count} observations were taken back; {left} materials are left")
+
+
+@memory.command()
+def merge(
+    folder: MemoryFolder,
+    other: Annotated[Path, typer.Argument(help="The memory that comes in; it stays as it is.", show_default=False)],
+    shared: Annotated[Shared, typer.Option(help="How a stream that both felt is counted.", show_default=False)],
+) -> None:
+    """Make a memory the one that felt all that both did, exactly."""
+    with open_for_upkeep(folder) as learner, progress_bar() as progress:
+        done = learner.merge(other, shared=shared.value, progress=progress)
+        digest, felt = learner.digest(), sum(learner.materials.values())
+    say(f"{done.observations} observations came in; {done.shared} streams were felt by both; {felt} are there now")
+    say(f"[bold]digest:[/] {digest}")

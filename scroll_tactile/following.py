@@ -1,0 +1,61 @@
+"""A model that follows a memory between two fits: the readouts are those of all that was felt, to rounding.
+
+Choosing λ and calibrating takes a dozen factorisations a scale. Where observing and asking alternate, that is done
+again only when the memory has grown by a share; in between the readouts are updated row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory import Memory
+from scroll_tactile.model import Model
+from scroll_tactile.ridge.tracking import Tracked
+
+__all__ = ["Added", "Following"]
+
+Added = tuple[str, dict[int, npt.NDArray[np.int32]]]
+"""A material, and the codes of a touch of it by scale."""
+
+
+class Following:
+    """What a model that was fitted to a memory becomes as touches are added.
+
+    model: fitted to the memory as it is now. refit: the share by which the memory may grow before `follow` refuses.
+    """
+
+    def __init__(self, model: Model, memory: Memory, refit: float) -> None:
+        self.model = model
+        self._felt = sum(memory.statistics.materials.values())
+        self._most = (1 + refit) * self._felt
+        self._tracked: dict[int, Tracked] = {}
+
+    def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
+        """Take in the touches that were added since; False where the model has to be fitted again.
+
+        memory: as it is with them.
+        """
+        statistics = memory.statistics
+        self._felt += len(added)
+        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in statistics.scales):
+            return False
+        selections = dict(self.model.selections)
+        for scale, selection in selections.items():
+            rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]
+            if not rows:
+                continue
+            if (tracked := self._tracked.get(scale)) is None:
+                tracked = self._tracked[scale] = Tracked(statistics, scale, selection.readout)
+            elif not all(tracked.add(codes, place) for place, codes in rows):
+                tracked.anchor(statistics)
+            selections[scale] = replace(selection, readout=tracked.readout())
+        self.model = replace(self.model, selections=selections)
+        return True
+
+    def _names(self, scale: int) -> list[str]:
+        selection = self.model.selections.get(scale)
+        return [] if selection is None else selection.names

@@ -1,0 +1,178 @@
+"""What was felt, as the journal tells it: which observations can be taken back, and how two memories become one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory import FELT, MERGE, OBSERVE, RETRACT, Memory, unspanned
+from scroll_tactile.prediction import Receipt
+from store import Head, Record, Store
+
+__all__ = ["Incoming", "compaction_point", "observation_of", "observations_of"]
+
+
+def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
+    """The journal's row of an observation that can be taken back.
+
+    Raises ObservationError where there is none, it was taken back before, or compacted.
+    """
+    sequence = receipt.sequence if isinstance(receipt, Receipt) else receipt
+    if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= store.last:
+        raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
+    if sequence in memory.withdrawn:
+        raise ObservationError(f"observation {sequence} of {store.path} was taken back already")
+    if sequence <= memory.base:
+        raise ObservationError(
+            f"observation {sequence} of {store.path} cannot be taken back: rows 1 to {memory.base} were compacted, and "
+            "their features given up"
+        )
+    record = store.record(sequence)
+    if record.kind != OBSERVE:
+        raise ObservationError(f"row {sequence} of {store.path} is no observation, but of kind {record.kind!r}")
+    if isinstance(receipt, Receipt) and (receipt.material, receipt.key) != (record.label, record.key):
+        raise ObservationError(
+            f"the receipt is of another memory: it says that observation {sequence} is of {receipt.material!r} "
+            f"({receipt.key.hex()[:12]}); in {store.path} it is of {record.label!r} ({record.key.hex()[:12]})"
+        )
+    return record
+
+
+def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
+    """The sequences of all observations of a material, ascending.
+
+    Raises UnknownMaterialError for one never felt, and ObservationError where some were compacted.
+    """
+    felt = memory.statistics.materials.get(material, 0)
+    if not felt:
+        raise UnknownMaterialError(f"{material!r} was never felt; felt were {list(memory.statistics.materials)[:30]}")
+    rows = store.heads(memory.base, kind=OBSERVE, label=material)
+    found = [head.sequence for head in rows if head.sequence not in memory.withdrawn]
+    if len(found) != felt:
+        raise ObservationError(
+            f"{material!r} cannot be forgotten: {felt - len(found)} of its {felt} observations in {store.path} were "
+            "compacted, and their features given up. Retract the others one by one, by their receipts"
+        )
+    return found
+
+
+def compaction_point(store: Store, memory: Memory, keep: int) -> int:
+    """The last row to be compacted where the newest `keep` observations are to stay as they are."""
+    if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
+        raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
+    if keep == 0:
+        return store.last
+    rows = store.heads(memory.base, kind=OBSERVE)
+    sequences = [head.sequence for head in rows if head.sequence not in memory.withdrawn]
+    return memory.base if len(sequences) <= keep else sequences[-keep] - 1
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """What another memory would bring: rows to be appended, in order.
+
+    rows: its heads. shared: streams that both felt. Made by `Incoming.of`.
+    """
+
+    source: Store
+    rows: list[Head]
+    shared: int
+
+    @classmethod
+    def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool) -> Incoming:
+        """Look through both journals.
+
+        once: leave out streams that both felt, of one material with one content hash. Raises MismatchError where
+        theirs cannot be a part of ours, ObservationError where a shared one cannot be left out.
+        """
+        _require_mergeable(ours, memory, theirs)
+        withdrawn = _withdrawn(theirs)
+        base = theirs.compacted
+        there = [head for head in theirs.heads() if head.kind in (OBSERVE, MERGE, FELT)]
+        there = [head for head in there if head.sequence not in withdrawn]
+        gone = _withdrawn(ours)
+        known = {
+            (head.label, head.key)
+            for head in ours.heads()
+            if head.kind in (OBSERVE, FELT) and head.sequence not in gone
+        }
+        both = [head for head in there if head.kind != MERGE and (head.label, head.key) in known]
+        fixed = [head for head in both if head.sequence <= base or head.kind == FELT]
+        if once and fixed:
+            raise ObservationError(
+                f"{len(fixed)} streams that both memories felt, such as one of {fixed[0].label!r}, cannot be counted "
+                f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
+                'or count them twice, with shared="twice"'
+            )
+        rows = there if not once else [head for head in there if (head.label, head.key) not in known]
+        bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
+        if bare and memory.exemplars is not None:
+            raise MismatchError(
+                f"{theirs.path} kept no readings of what it felt (exemplars=0), of which {ours.path} keeps "
+                "exemplars: feel it again, or merge into a memory made with exemplars=0"
+            )
+        return cls(theirs, rows, len(both))
+
+    def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
+        """Append the rows to our journal and add them to our memory; the number of observations that came in.
+
+        The caller makes a batch of it, and tells `each` (rows done, rows in all) what is shown.
+        """
+        total = len(self.rows)
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._told(), start=1):
+            head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
+            if kind != FELT:
+                memory.replay(ours.record(head.sequence), ours)
+            memory.sequence = head.sequence
+            each(done, total)
+        return sum(head.kind in (OBSERVE, FELT) for head in self.rows)
+
+    def _told(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+        base = self.source.base()
+        if base is not None:
+            attributes = {name: value for name, value in base.attributes.items() if not name.startswith("tuned")}
+            arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
+            yield MERGE, "", b"", attributes, arrays, _first_time(self.rows)
+        for head in self.rows:
+            if base is not None and head.sequence <= base.upto:
+                if head.kind != MERGE:  # a merge before the base is a part of it
+                    yield FELT, head.label, head.key, {}, None, head.time
+            else:
+                record = self.source.record(head.sequence)
+                yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
+
+
+def _first_time(rows: list[Head]) -> float | None:
+    return rows[0].time if rows else None
+
+
+def _withdrawn(store: Store) -> set[int]:
+    """All sequences that were ever taken back."""
+    return {sequence for head in store.heads(kind=RETRACT) for sequence in unspanned(head.attributes["sequences"])}
+
+
+def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
+    if ours.path.resolve() == theirs.path.resolve():
+        raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
+    for part in ("sensor", "embedding", "reading", "grid"):
+        mine, other = ours.identity.get(part), theirs.identity.get(part)
+        if mine != other:
+            raise MismatchError(
+                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is {_told_of(mine)}, "
+                f"there {_told_of(other)}. Merge memories of one sensor and one embedding"
+            )
+    whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
+    if whole and memory.exemplars is not None and ours.identity.get("exemplars") != theirs.identity.get("exemplars"):
+        raise MismatchError(
+            f"{theirs.path} was compacted and keeps exemplars {theirs.identity.get('exemplars')} (streams, bytes); "
+            f"{ours.path} keeps {ours.identity.get('exemplars')}, and those that are missing cannot be had back"
+        )
+
+
+def _told_of(part: Any) -> str:
+    if isinstance(part, dict):
+        fields = {name: value[:12] if name == "fingerprint" else value for name, value in part.items()}
+        return ", ".join(f"{name} {value!r}" for name, value in fields.items() if value is not None)
+    return repr(part)

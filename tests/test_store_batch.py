@@ -1,0 +1,229 @@
+"""Group commit: rows that become durable together, or none of them."""
+
+import sqlite3
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from store import ReadOnlyError, RecordError, Store, StoreClosedError, StoreError, StoreFullError
+
+
+@pytest.fixture
+def opened(tmp_path):
+    with Store.open(tmp_path / "s", identity={}) as fresh:
+        fresh.append("a", "before", b"")
+        yield fresh
+
+
+def labels(opened):
+    return [row.label for row in opened.records()]
+
+
+def add(opened, *names):
+    return [opened.append("a", name, b"", arrays={"x": np.arange(5)}).sequence for name in names]
+
+
+def test_a_batch_is_durable_when_it_ends_and_its_rows_are_numbered_on(opened):
+    with opened.batch():
+        assert add(opened, "one", "two") == [2, 3]
+        assert opened.last == 3
+        assert labels(opened) == ["before", "one", "two"]
+    assert add(opened, "after") == [4]
+    opened.close()
+    with Store.open(opened.path) as again:
+        assert labels(again) == ["before", "one", "two", "after"]
+        assert again.record(3).arrays["x"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_batch_waits_for_the_disk_once(tmp_path, opened):
+    """The log grows by one commit for all the rows: pages that many of them share are in it once."""
+    log = opened.path / "journal.sqlite-wal"
+    before = log.stat().st_size
+    with opened.batch():
+        add(opened, *map(str, range(200)))
+    together = log.stat().st_size - before
+    with Store.open(tmp_path / "other", identity={}) as other:
+        other.append("a", "before", b"")
+        before = (tmp_path / "other" / "journal.sqlite-wal").stat().st_size
+        add(other, *map(str, range(200)))
+        one_by_one = (tmp_path / "other" / "journal.sqlite-wal").stat().st_size - before
+    assert 10 * together < one_by_one
+
+
+def test_an_empty_batch_is_nothing(opened):
+    with opened.batch():
+        pass
+    assert labels(opened) == ["before"]
+
+
+class Mine(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("raised", [OSError(5, "mine"), KeyError("mine"), KeyboardInterrupt(), Mine()], ids=repr)
+def test_after_an_exception_none_is_there_and_it_comes_out_as_it_is(opened, raised):
+    with pytest.raises(type(raised)) as caught, opened.batch():
+        add(opened, "one", "two")
+        raise raised
+    assert caught.value is raised
+    assert labels(opened) == ["before"]
+    assert opened.last == 1
+    assert add(opened, "after") == [2]
+    with opened.batch():
+        assert add(opened, "again") == [3]
+    assert labels(opened) == ["before", "after", "again"]
+
+
+def test_a_refused_record_is_not_part_of_a_batch_that_goes_on(opened):
+    with opened.batch():
+        add(opened, "one")
+        with pytest.raises(RecordError):
+            opened.append("a", "\0", b"")
+        assert add(opened, "two") == [3]
+    assert labels(opened) == ["before", "one", "two"]
+
+
+def test_after_a_failed_append_none_is_there_whether_or_not_the_caller_goes_on(opened):
+    with opened._journal._using("limiting its size") as connection:
+        connection.execute("PRAGMA max_page_count = 20")
+    noise = np.random.default_rng(0).integers(0, 2**60, 9000)
+    with pytest.raises(StoreError, match="nothing of this batch was kept"), opened.batch():
+        add(opened, "one")
+        with pytest.raises(StoreFullError):
+            opened.append("a", "large", b"", arrays={"x": noise})
+        with pytest.raises(StoreError, match="nothing more can be appended"):
+            add(opened, "two")
+        assert labels(opened) == ["before"]
+    with pytest.raises(StoreFullError), opened.batch():
+        add(opened, "one")
+        opened.append("a", "large", b"", arrays={"x": noise})
+    assert labels(opened) == ["before"]
+    assert add(opened, "after") == [2]
+
+
+def test_a_commit_that_fails_takes_the_batch_back(opened, monkeypatch):
+    real = opened._journal._connection
+
+    class Full:
+        def __getattr__(self, name):
+            return getattr(real, name)
+
+        def execute(self, statement, *values):
+            if statement == "COMMIT":
+                error = sqlite3.OperationalError("database or disk is full")
+                error.sqlite_errorcode = sqlite3.SQLITE_FULL
+                raise error
+            return real.execute(statement, *values)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(opened._journal, "_connection", Full())
+        with pytest.raises(StoreFullError), opened.batch():
+            add(opened, "one")
+    assert labels(opened) == ["before"]
+    assert add(opened, "after") == [2]
+
+
+def test_a_batch_that_cannot_be_taken_back_at_once_hides_no_error_and_blocks_nothing(opened, monkeypatch, caplog):
+    journal, real = opened._journal, opened._journal._using
+    stuck = []
+
+    def using(doing):
+        if doing == "taking a batch back" and not stuck:
+            stuck.append(doing)
+            raise StoreError("the disk says no")
+        return real(doing)
+
+    monkeypatch.setattr(journal, "_using", using)
+    with pytest.raises(KeyError), opened.batch():
+        add(opened, "one")
+        raise KeyError
+    assert "could not be taken back yet" in caplog.text
+    with pytest.raises(StoreError):
+        add(opened, "meanwhile")
+    assert labels(opened) == ["before"]
+    assert add(opened, "after") == [2]
+
+
+def test_other_threads_wait_and_their_rows_come_after(opened):
+    inside, done = threading.Event(), []
+
+    def other():
+        inside.wait(10)
+        done.append(("append", *add(opened, "theirs")))
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    with opened.batch():
+        add(opened, "one")
+        inside.set()
+        time.sleep(0.05)
+        assert done == []
+        add(opened, "two")
+    thread.join(10)
+    assert done == [("append", 4)]
+    assert labels(opened) == ["before", "one", "two", "theirs"]
+
+
+def test_a_reader_sees_nothing_of_it_until_it_ends(opened):
+    with Store.open(opened.path, mode="read") as reader:
+        with opened.batch():
+            add(opened, "one", "two")
+            assert reader.last == 1
+            assert labels(reader) == ["before"]
+            assert len(list(reader.heads())) == 1
+        assert labels(reader) == ["before", "one", "two"]
+
+
+ONE = {"x": np.arange(3)}
+IMPOSSIBLE = {
+    "commit": lambda opened: opened.commit(ONE, upto=1),
+    "commit_later": lambda opened: opened.commit_later(ONE, upto=1),
+    "compact": lambda opened: opened.compact(ONE, upto=1),
+    "flush": lambda opened: opened.flush(),
+    "close": lambda opened: opened.close(),
+    "batch": lambda opened: opened.batch().__enter__(),
+}
+
+
+@pytest.mark.parametrize("call", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_what_a_batch_does_not_allow_is_refused_at_once_and_does_no_harm(opened, call):
+    with opened.batch():
+        add(opened, "one")
+        with pytest.raises(StoreError, match=r"not possible in a batch .*: end it first"):
+            call(opened)
+        add(opened, "two")
+    assert labels(opened) == ["before", "one", "two"]
+    assert opened.latest() is None
+    assert opened.commit(ONE, upto=3) == 1
+
+
+def test_a_batch_and_a_background_commit_do_not_wait_for_each_other_for_ever(opened):
+    for _ in range(5):
+        opened.commit_later(ONE, upto=1)
+        with opened.batch():
+            add(opened, "one")
+            with pytest.raises(StoreError, match="end it first"):
+                opened.flush()
+    opened.flush()
+    assert opened.last == 6
+
+
+def test_closing_from_another_thread_waits_for_the_batch(opened):
+    thread = threading.Thread(target=opened.close)
+    with opened.batch():
+        add(opened, "one")
+        thread.start()
+        time.sleep(0.05)
+        add(opened, "two")
+    thread.join(10)
+    with pytest.raises(StoreClosedError), opened.batch():
+        pass
+    with Store.open(opened.path) as again:
+        assert labels(again) == ["before", "one", "two"]
+
+
+def test_a_reader_has_no_batches(opened):
+    with Store.open(opened.path, mode="read") as reader, pytest.raises(ReadOnlyError), reader.batch():
+        pass

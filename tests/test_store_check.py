@@ -1,0 +1,392 @@
+"""Checking a store: all that is wrong is named, and nothing is changed."""
+
+import json
+import os
+import shutil
+import sqlite3
+import threading
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from store import DamageError, NotAStoreError, Problem, Store, StoreError, VersionError, check_store
+
+LAST = 20
+
+
+def values(number):
+    return np.random.default_rng(number).integers(0, 2**40, 200)
+
+
+def state(upto):
+    return {"sum": np.array(upto), "rows": np.arange(400.0).reshape(100, 4) + upto, "names": np.array(["wool", "é"])}
+
+
+@pytest.fixture(scope="module", params=["plain", "compacted"])
+def made(request, tmp_path_factory):
+    """Twenty rows, generations up to rows 10 and 15, and, where compacted, a base up to row 6 in place of the first."""
+    path = tmp_path_factory.mktemp("made") / "s"
+    with Store.open(path, identity={"for": "checks"}) as opened:
+        for number in range(1, LAST + 1):
+            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)})
+            if number in (10, 15):
+                opened.commit(state(number), upto=number, chunks={"rows": 25})
+            if number == 15 and request.param == "compacted":
+                opened.compact(state(6), upto=6, chunks={"rows": 25})
+    return path
+
+
+@pytest.fixture
+def path(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "s")
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def change(path, *statements):
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def flip(file, place=-9, bit=2):
+    data = bytearray(file.read_bytes())
+    data[place] ^= 1 << bit
+    file.write_bytes(data)
+
+
+def newest(path):
+    return path / "generations" / "00000002"
+
+
+def older(path):
+    (found,) = [one for one in (path / "generations").iterdir() if one != newest(path)]
+    return found
+
+
+def texts(problems):
+    return " | ".join(f"{one.kind}: {one.what}" for one in problems)
+
+
+def test_a_sound_store_has_no_problems_and_stays_as_it_is(path):
+    before = contents(path)
+    assert check_store(path) == []
+    assert check_store(str(path)) == []
+    after = contents(path)
+    # What SQLite makes for any reader.
+    assert after.pop("journal.sqlite-shm", None) is not None
+    assert after.pop("journal.sqlite-wal", b"") == b""
+    assert after == before
+
+
+def test_a_store_without_rows_or_generations_is_sound(tmp_path):
+    Store.open(tmp_path, identity={}).close()
+    assert check_store(tmp_path) == []
+
+
+def test_what_is_being_done_is_told(path):
+    told = []
+    check_store(path, progress=lambda *step: told.append(step))
+    assert {what for what, _, _ in told} >= {"generations"}
+    assert all(0 <= done <= of for _, done, of in told)
+
+
+def test_a_problem_is_plain_data(path):
+    (newest(path) / "sum" / "zarr.json").unlink()
+    (problem,) = check_store(path)
+    assert isinstance(problem, Problem)
+    assert (problem.path, problem.kind) == (newest(path) / "sum", "spare")
+    with pytest.raises(AttributeError):
+        problem.kind = "lost"
+
+
+HEADS = {
+    "a column": ("UPDATE record SET label = 'z' WHERE sequence = 18", "row 18 fails its checksum"),
+    "a checksum": ("UPDATE record SET checksum = x'00' WHERE sequence = 18", "row 18 fails its checksum"),
+    "a head": ("DELETE FROM record WHERE sequence = 18", "row 18 is missing"),
+    "several heads": ("DELETE FROM record WHERE sequence IN (17, 18)", "rows 17 to 18 are missing"),
+    "the last": ("DELETE FROM record WHERE sequence = 20", "row 20 is missing"),
+    "arrays": ("UPDATE payload SET bytes = zeroblob(9) WHERE sequence = 18", "row 18 has arrays that fail"),
+    "no arrays": ("DELETE FROM payload WHERE sequence = 18", "row 18 has lost its arrays"),
+    "a compacted head": ("UPDATE record SET key = x'' WHERE sequence = 2", "row 2 fails its checksum"),
+}
+
+
+@pytest.mark.parametrize(("statement", "said"), HEADS.values(), ids=HEADS)
+def test_damaged_rows_are_lost(path, statement, said):
+    change(path, statement)
+    problems = check_store(path)
+    assert {one.path for one in problems} == {path / "journal.sqlite"}
+    assert f"lost: {said}" in texts(problems)
+    # The arrays that belong to a missing row are told of, too, but not as another loss.
+    assert [one.kind for one in problems].count("lost") == 1
+
+
+def test_exchanged_arrays_are_found(path):
+    change(
+        path,
+        "UPDATE payload SET sequence = 99 WHERE sequence = 16",
+        "UPDATE payload SET sequence = 16 WHERE sequence = 17",
+        "UPDATE payload SET sequence = 17 WHERE sequence = 99",
+    )
+    (problem,) = check_store(path)
+    assert "rows 16 to 17 have arrays that fail their checksums" in problem.what
+
+
+def test_arrays_too_many_are_found(path):
+    change(path, "INSERT INTO payload VALUES (25, x'00')")
+    assert "rows 21 to 25 are missing" in texts(check_store(path))
+    assert "holds arrays of row 25 that no row has" in texts(check_store(path))
+
+
+def test_arrays_that_were_given_up_and_are_there_are_found(path):
+    with Store.open(path, mode="read") as opened:
+        compacted = opened.compacted
+    change(path, "INSERT OR REPLACE INTO payload SELECT 3, bytes FROM payload WHERE sequence = 16")
+    (problem,) = check_store(path)
+    if compacted:
+        assert problem.kind == "spare"
+        assert "arrays of row 3 that no row has, or a base stands for" in problem.what
+    else:
+        assert problem.kind == "lost"
+        assert "row 3 has arrays that fail their checksum" in problem.what
+
+
+GENERATIONS = {
+    "a chunk": (lambda folder: flip(folder / "rows" / "c" / "0" / "0", 30), "chunk 0 (rows 0 to 25) of array 'rows'"),
+    "another chunk": (lambda folder: spoil_chunk(folder, 2), "chunk 2 (rows 50 to 75) of array 'rows'"),
+    "an array": (lambda folder: flip(folder / "names" / "c" / "0" / "0", 20), "array 'names' of generation"),
+    "an array's description": (lambda folder: (folder / "sum" / "zarr.json").write_text("{}"), "array 'sum'"),
+    "an array's folder": (lambda folder: shutil.rmtree(folder / "sum"), "array 'sum' of generation"),
+    "the group": (lambda folder: (folder / "zarr.json").unlink(), "zarr.json cannot be read"),
+    "the folder": (shutil.rmtree, "zarr.json cannot be read"),
+}
+
+
+def spoil_chunk(folder, chunk):
+    file = folder / "rows" / "c" / "0" / "0"
+    data = bytearray(file.read_bytes())
+    index = np.frombuffer(data[-4 - 4 * 16 : -4], "<u8").reshape(4, 2)
+    data[int(index[chunk, 0] + index[chunk, 1] // 2)] ^= 1
+    file.write_bytes(data)
+
+
+@pytest.mark.parametrize("which", [newest, older])
+@pytest.mark.parametrize(("spoil", "said"), GENERATIONS.values(), ids=GENERATIONS)
+def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said, which):
+    folder = which(path)
+    spoil(folder)
+    problems = check_store(path)
+    assert said in texts(problems)
+    assert all(one.path.is_relative_to(folder) and str(one.path) in one.what for one in problems)
+    base = folder.name == "00000003"
+    assert {one.kind for one in problems} == {"lost" if base else "spare"}
+
+
+def test_every_damaged_chunk_is_named_and_no_other(path):
+    for chunk in (0, 3):
+        spoil_chunk(newest(path), chunk)
+    assert [one.what.split(" (")[0] for one in check_store(path)] == ["chunk 0", "chunk 3"]
+
+
+def test_the_only_copy_of_a_state_is_lost(path):
+    """Where a row that it contains is damaged it cannot be made anew."""
+    shutil.rmtree(older(path))
+    shutil.rmtree(newest(path))
+    change(path, "UPDATE record SET label = 'z' WHERE sequence = 9")
+    kinds = {one.path.parent.name: one.kind for one in check_store(path)}
+    assert kinds[newest(path).name] == "lost"
+
+
+def test_what_a_group_says_of_itself_is_checked(path):
+    for name, value in {"upto": 99, "number": 7, "identity": {"for": "another"}, "attributes": {"a": 1}}.items():
+        header = newest(path) / "zarr.json"
+        text = header.read_text()
+        known = json.loads(text)
+        known["attributes"][name] = value
+        header.write_text(json.dumps(known))
+        (problem,) = check_store(path)
+        assert (problem.kind, problem.path) == ("spare", header)
+        assert "its sha256 differs" in problem.what
+        header.write_text(text)
+
+
+def test_a_generation_in_anothers_place_is_found(path):
+    shutil.rmtree(newest(path))
+    shutil.copytree(older(path), newest(path))
+    assert "is of another generation, or of another store" in texts(check_store(path))
+
+
+def test_a_generation_of_another_store_is_found(path, tmp_path):
+    with Store.open(tmp_path / "other", identity={"for": "other checks"}) as other:
+        other.append("a", "b", b"")
+        for upto in (0, 1):
+            other.commit(state(upto), upto=upto, chunks={"rows": 25})
+    shutil.rmtree(newest(path))
+    shutil.copytree(newest(tmp_path / "other"), newest(path))
+    assert "it says another identity: {'for': 'other checks'}" in texts(check_store(path))
+
+
+@pytest.mark.parametrize("assignment", ["upto = 99", "content = '{}'", "checksum = x''", "base = 1 - base", "time = 0"])
+def test_a_damaged_row_of_a_generation_is_spare_where_the_group_knows_better(path, assignment):
+    change(path, f"UPDATE generation SET {assignment} WHERE number = 2")
+    (problem,) = check_store(path)
+    assert (problem.kind, problem.path) == ("spare", path / "journal.sqlite")
+    assert "the row of generation 2" in problem.what
+    shutil.rmtree(newest(path))
+    assert "the row of generation 2" in texts(check_store(path))
+
+
+META = {
+    "the identity": ("UPDATE meta SET value = '{}' WHERE key = 'identity'", "without a row that verifies: identity"),
+    "no identity": ("DELETE FROM meta WHERE key = 'identity'", "without a row that verifies: identity"),
+    "the format": ("UPDATE meta SET value = '2' WHERE key = 'format'", "without a row that verifies: format"),
+    "more": ("INSERT INTO meta VALUES ('more', 'x', x'00')", "1 rows of table meta"),
+}
+
+
+@pytest.mark.parametrize(("statement", "said"), META.values(), ids=META)
+def test_table_meta_is_checked(path, statement, said):
+    change(path, statement)
+    (problem,) = check_store(path)
+    assert said in problem.what
+    # A generation knows the identity, too.
+    assert problem.kind == "spare"
+
+
+def test_an_identity_that_nothing_knows_is_lost(path):
+    shutil.rmtree(path / "generations")
+    (path / "generations").mkdir()
+    change(path, "DELETE FROM meta WHERE key = 'identity'", "DELETE FROM generation")
+    (problem, *_) = check_store(path)
+    assert problem.kind == "lost"
+
+
+JOURNALS = {
+    "missing": (lambda file: file.unlink(), "journal.sqlite is missing"),
+    "empty": (lambda file: file.write_bytes(b""), "was cut off: it has 0 bytes"),
+    "a stub": (lambda file: file.write_bytes(file.read_bytes()[:1000]), "was cut off"),
+    "cut": (lambda file: file.write_bytes(file.read_bytes()[: 4096 * 9]), "SQLite refuses to read"),
+    "text": (lambda file: file.write_text("dear diary " * 900), "does not begin as a journal of format 1"),
+    "another page size": (lambda file: flip(file, 16, 1), "does not begin as a journal of format 1"),
+    "another encoding": (lambda file: flip(file, 59, 1), "does not begin as a journal of format 1"),
+    "another version": (lambda file: flip(file, 63, 2), "does not begin as a journal of format 1"),
+    "another program's id": (lambda file: flip(file, 70, 2), "does not begin as a journal of format 1"),
+    "another schema": (lambda file: flip(file, 4000, 2), "journal.sqlite"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "said"), JOURNALS.values(), ids=JOURNALS)
+def test_all_the_rest_is_checked_where_the_journal_is_malformed(path, spoil, said):
+    spoil(path / "journal.sqlite")
+    flip(newest(path) / "names" / "c" / "0" / "0", 20)
+    before = contents(path)
+    found = texts(check_store(path))
+    assert said in found
+    assert "array 'names' of generation 2" in found
+    assert contents(path).items() >= before.items()
+    with pytest.raises(StoreError):
+        Store.open(path)
+
+
+def test_sqlites_own_structure_is_checked(path):
+    file = path / "journal.sqlite"
+    data = bytearray(file.read_bytes())
+    # The fourth page is the root of table record; here the number of its cells.
+    data[3 * 4096 + 4] ^= 1
+    file.write_bytes(data)
+    assert "SQLite finds in" in texts(check_store(path))
+
+
+def test_what_is_there_too_much_is_left_over_and_no_damage(path):
+    generations = path / "generations"
+    shutil.copytree(newest(path), generations / "00000009")
+    (generations / "00000010.partial").mkdir()
+    (generations / "00000001.damaged").mkdir()
+    (generations / "notes").mkdir()
+    (path / "journal.sqlite.damaged").write_bytes(b"old")
+    (path / "journal.sqlite.repaired").write_bytes(b"half")
+    (path / "thesis.txt").write_text("mine")
+    problems = check_store(path)
+    assert {one.kind for one in problems} == {"leftover"}
+    assert sorted(one.path.name for one in problems) == [
+        "00000001.damaged",
+        "00000009",
+        "00000010.partial",
+        "journal.sqlite.damaged",
+        "journal.sqlite.repaired",
+    ]
+    Store.open(path).close()
+    left = {one.path.name for one in check_store(path)}
+    assert left == {"00000001.damaged", "journal.sqlite.damaged"}
+
+
+def test_everything_that_is_wrong_is_told_at_once(path):
+    change(
+        path,
+        "UPDATE record SET label = 'z' WHERE sequence IN (8, 18)",
+        "DELETE FROM payload WHERE sequence = 12",
+        "UPDATE meta SET value = '' WHERE key = 'created'",
+    )
+    spoil_chunk(newest(path), 1)
+    flip(older(path) / "names" / "c" / "0" / "0", 20)
+    found = texts(check_store(path))
+    for said in ("created", "row 8 fails", "row 12 has lost", "row 18 fails", "chunk 1 (rows 25", "array 'names'"):
+        assert said in found
+
+
+def test_where_there_is_no_store_none_is_checked(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.txt").write_text("mine")
+    (tmp_path / "database").mkdir()
+    with closing(sqlite3.connect(tmp_path / "database" / "journal.sqlite")) as connection:
+        connection.execute("CREATE TABLE mine (x)")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "empty").mkdir()
+    before = contents(tmp_path)
+    for name in ("file", "folder", "database", "loop", "empty", "nothing"):
+        with pytest.raises(NotAStoreError, match=name):
+            check_store(tmp_path / name)
+    assert contents(tmp_path) == before
+
+
+def test_a_newer_format_is_not_judged(path):
+    change(path, "PRAGMA user_version = 2", "DELETE FROM meta WHERE key = 'format'")
+    with pytest.raises(VersionError, match="format 2"):
+        check_store(path)
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="this user may read everything")
+def test_a_folder_without_permission_is_no_damage(path):
+    path.chmod(0)
+    try:
+        with pytest.raises(StoreError) as caught:
+            check_store(path)
+        assert not isinstance(caught.value, DamageError)
+    finally:
+        path.chmod(0o700)
+
+
+def test_a_store_that_is_being_written_is_checked_beside_the_writer(path):
+    stop, found = threading.Event(), []
+
+    def look():
+        while not stop.is_set():
+            found.extend(one for one in check_store(path) if one.kind != "leftover")
+
+    with Store.open(path) as opened:
+        thread = threading.Thread(target=look)
+        thread.start()
+        for number in range(LAST + 1, LAST + 25):
+            opened.append("a", f"row {number}", b"", arrays={"x": values(number)})
+            opened.commit(state(number), upto=number, chunks={"rows": 25})
+            if number % 4 == 0:
+                opened.compact(state(number - 2), upto=number - 2)
+        stop.set()
+        thread.join()
+    assert found == []
+    assert check_store(path) == []

@@ -1,0 +1,663 @@
+"""Repairing a store: the longest part that verifies is kept, what is lost is named, and nothing is thrown away."""
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import threading
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+import store.files
+import store.rebuild
+import store.repair
+import store.schema
+from store import (
+    CompactedError,
+    DamageError,
+    LockedError,
+    NotAStoreError,
+    ReadOnlyError,
+    Repair,
+    Store,
+    VersionError,
+    check_store,
+    repair_store,
+)
+
+LAST = 20
+IDENTITY = {"for": ["repairs", 1]}
+
+
+def values(number):
+    return np.random.default_rng(number).integers(0, 2**40, 200)
+
+
+def state(upto):
+    return {"sum": np.array(upto), "rows": np.arange(400.0).reshape(100, 4) + upto}
+
+
+def build(path, *, compacted):
+    """Twenty rows, generations up to rows 10 and 15, and, where compacted, a base up to row 6 in place of the first."""
+    with Store.open(path, identity=IDENTITY) as opened:
+        for number in range(1, LAST + 1):
+            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
+            if number in (10, 15):
+                opened.commit(state(number), upto=number, attributes={"n": number}, chunks={"rows": 25})
+            if number == 15 and compacted:
+                opened.compact(state(6), upto=6, attributes={"n": 6}, chunks={"rows": 25})
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    home = tmp_path_factory.mktemp("made")
+    return {compacted: build(home / str(compacted), compacted=compacted) for compacted in (False, True)}
+
+
+@pytest.fixture
+def path(made, tmp_path):
+    return shutil.copytree(made[False], tmp_path / "s")
+
+
+@pytest.fixture
+def compacted(made, tmp_path):
+    return shutil.copytree(made[True], tmp_path / "s")
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def change(path, *statements):
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def spoil(path, number, name="rows/c/0/0"):
+    file = path / "generations" / f"{number:08d}" / name
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3] ^= 16
+    file.write_bytes(data)
+
+
+def damage(path):
+    return [one for one in check_store(path) if one.kind != "leftover"]
+
+
+def agrees(path, *, kept, base=0, latest=None, lost=()):
+    """A store of rows 1 to `kept`, of which those up to `base` have no arrays and those in `lost` are not there."""
+    assert damage(path) == []
+    for mode in ("read", "write"):
+        with Store.open(path, mode=mode) as opened:
+            assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, kept, base)
+            rows = [(row.sequence, row.label, row.key, row.attributes) for row in opened.heads()]
+            expected = [n for n in range(1, kept + 1) if n not in lost]
+            assert rows == [(n, f"row {n}", bytes([n]), {"n": n}) for n in expected]
+            rows = [(row.sequence, row.arrays["x"].tobytes()) for row in opened.records(base)]
+            assert rows == [(n, values(n).tobytes()) for n in range(base + 1, kept + 1)]
+            for number in range(1, base + 1):
+                with pytest.raises(CompactedError):
+                    opened.record(number)
+            for found, upto in ((opened.latest(), latest), (opened.base(), base or None)):
+                assert (found and found.upto) == upto
+                if found:
+                    assert found.attributes == {"n": upto}
+                    assert {name: array.tobytes() for name, array in found.arrays.items()} == {
+                        name: array.tobytes() for name, array in state(upto).items()
+                    }
+    return True
+
+
+def goes_on(path):
+    """New rows are numbered behind those that were kept, and generations can be made."""
+    with Store.open(path) as opened:
+        number = opened.last + 1
+        assert opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}).sequence == number
+        opened.commit(state(number), upto=number, attributes={"n": number})
+        opened.compact(state(number), upto=number, attributes={"n": number})
+        assert opened.base().upto == number
+    assert damage(path) == []
+    return True
+
+
+@pytest.mark.parametrize("which", [False, True])
+def test_a_sound_store_is_left_as_it_is(made, tmp_path, which):
+    path = shutil.copytree(made[which], tmp_path / "s")
+    shutil.copytree(path / "generations" / "00000002", path / "generations" / "00000009")
+    before = contents(path)
+    assert repair_store(path) == Repair(LAST, [], None)
+    after = contents(path)
+    assert {name for name in after if after[name] != before.get(name)} <= {"journal.sqlite-shm", "journal.sqlite-wal"}
+    assert before.keys() <= after.keys()
+
+
+BEHIND = {
+    "a damaged head": "UPDATE record SET label = 'z' WHERE sequence = 18",
+    "a missing row": "DELETE FROM record WHERE sequence = 18",
+    "damaged arrays": "UPDATE payload SET bytes = zeroblob(50) WHERE sequence = 18",
+    "missing arrays": "DELETE FROM payload WHERE sequence = 18",
+}
+
+
+@pytest.mark.parametrize("statement", BEHIND.values(), ids=BEHIND)
+@pytest.mark.parametrize("which", [False, True])
+def test_behind_the_newest_generation_rows_are_kept_up_to_the_first_that_is_lost(made, tmp_path, which, statement):
+    path = shutil.copytree(made[which], tmp_path / "s")
+    change(path, statement)
+    done = repair_store(path)
+    assert done.kept == 17
+    (lost,) = done.lost
+    assert lost.startswith("rows 18 to 20 are dropped, also those that verify: row 18 ")
+    assert agrees(path, kept=17, base=6 if which else 0, latest=15)
+    assert goes_on(path)
+
+
+WITHIN = {
+    "a damaged head": ("UPDATE record SET label = 'z' WHERE sequence = 8", [8]),
+    "missing rows": ("DELETE FROM record WHERE sequence IN (8, 9)", [8, 9]),
+    "damaged arrays": ("UPDATE payload SET bytes = zeroblob(50) WHERE sequence = 8", []),
+    "exchanged arrays": (
+        "UPDATE payload SET bytes = (SELECT bytes FROM payload WHERE sequence = 9) WHERE sequence = 8",
+        [],
+    ),
+    "missing arrays": ("DELETE FROM payload WHERE sequence = 8", []),
+}
+
+
+@pytest.mark.parametrize(("statement", "gone"), WITHIN.values(), ids=WITHIN)
+@pytest.mark.parametrize("which", [False, True])
+def test_a_generation_that_contains_lost_rows_becomes_the_base(made, tmp_path, which, statement, gone):
+    path = shutil.copytree(made[which], tmp_path / "s")
+    change(path, statement)
+    done = repair_store(path)
+    assert done.kept == LAST
+    assert f"row{'s' if len(gone) > 1 else ''} 8" in done.lost[0]
+    assert "is in generation 2, but can no longer be taken back" in done.lost[0]
+    assert "the arrays of rows 1 to 15 are given up, generation 2 stands for them" in done.lost[-1]
+    assert agrees(path, kept=LAST, base=15, latest=15, lost=gone)
+    assert goes_on(path)
+
+
+def test_a_lost_head_of_a_compacted_row_is_left_out_and_no_more(compacted):
+    change(compacted, "UPDATE record SET key = x'' WHERE sequence = 3", "DELETE FROM record WHERE sequence = 5")
+    done = repair_store(compacted)
+    assert [lost.split(";")[0] for lost in done.lost] == ["row 3 fails its checksum", "row 5 is missing"]
+    assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 5])
+    with Store.open(compacted, mode="read") as opened:
+        assert [head.sequence for head in opened.heads(kind="a")][:4] == [1, 2, 4, 6]
+    # They are named as lost once; another one that goes is damage.
+    change(compacted, "DELETE FROM record WHERE sequence = 4")
+    with Store.open(compacted) as opened, pytest.raises(DamageError, match="rows 4 to 4 are missing"):
+        list(opened.heads())
+    repair_store(compacted)
+    assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 4, 5])
+    assert goes_on(compacted)
+    with Store.open(compacted) as opened:
+        assert [head.sequence for head in opened.heads()] == [1, 2, *range(6, LAST + 2)]
+
+
+def test_a_damaged_generation_is_put_aside_and_the_one_before_it_gone_on_from(path):
+    spoil(path, 2)
+    before = contents(path / "generations" / "00000002")
+    done = repair_store(path)
+    assert (done.kept, done.aside) == (LAST, path / "journal.sqlite.damaged")
+    (lost,) = done.lost
+    assert lost.startswith("generation 2: chunk 1 (rows 25 to 50) of array 'rows'")
+    assert agrees(path, kept=LAST, latest=10)
+    assert contents(path / "generations" / "00000002.damaged") == before
+    assert sorted(entry.name for entry in (path / "generations").iterdir()) == ["00000001", "00000002.damaged"]
+    assert goes_on(path)
+
+
+def test_without_any_generation_the_rows_are_what_there_is(path):
+    spoil(path, 1)
+    shutil.rmtree(path / "generations" / "00000002")
+    assert len(repair_store(path).lost) == 2
+    assert agrees(path, kept=LAST)
+    assert goes_on(path)
+
+
+def test_without_any_generation_rows_are_kept_up_to_the_first_that_is_lost(path):
+    spoil(path, 1)
+    spoil(path, 2)
+    change(path, "DELETE FROM payload WHERE sequence IN (4, 12)")
+    assert repair_store(path).kept == 3
+    assert agrees(path, kept=3)
+    assert goes_on(path)
+
+
+def test_a_damaged_base_is_replaced_by_the_newest_generation(compacted):
+    spoil(compacted, 3)
+    done = repair_store(compacted)
+    assert done.lost[0] == (
+        "the arrays of rows 1 to 15 are given up, generation 2 stands for them: none of them can be taken back any more"
+    )
+    assert agrees(compacted, kept=LAST, base=15, latest=15)
+    assert goes_on(compacted)
+
+
+def test_a_damaged_newest_generation_is_made_up_for_by_the_base(compacted):
+    spoil(compacted, 2)
+    assert repair_store(compacted).kept == LAST
+    assert agrees(compacted, kept=LAST, base=6, latest=6)
+    assert goes_on(compacted)
+
+
+def test_without_the_base_and_the_newest_generation_compacted_rows_are_gone(compacted):
+    spoil(compacted, 2)
+    spoil(compacted, 3)
+    done = repair_store(compacted)
+    assert done.kept == 0
+    assert "rows 1 to 20 are dropped" in done.lost[0]
+    assert agrees(compacted, kept=0)
+    assert done.aside.exists()
+    assert goes_on(compacted)
+
+
+@pytest.mark.parametrize("assignment", ["upto = 3", "content = '{}'", "base = 0", "checksum = x''"])
+def test_a_generation_whose_row_is_damaged_tells_itself_what_it_is(compacted, assignment):
+    change(compacted, f"UPDATE generation SET {assignment}")
+    done = repair_store(compacted)
+    assert done.lost == []
+    assert done.aside is not None
+    assert agrees(compacted, kept=LAST, base=6, latest=15)
+    assert goes_on(compacted)
+
+
+def test_a_generation_that_does_not_tell_what_it_is_is_written_again(compacted):
+    for number in (2, 3):
+        header = compacted / "generations" / f"{number:08d}" / "zarr.json"
+        known = json.loads(header.read_text())
+        known["attributes"]["upto"] = 99
+        header.write_text(json.dumps(known))
+    assert repair_store(compacted).lost == []
+    assert agrees(compacted, kept=LAST, base=6, latest=15)
+    with Store.open(compacted) as opened:
+        assert {opened.base().number, opened.latest().number} == {4, 5}
+        assert opened.read_rows("rows", 30, 31).tolist() == state(15)["rows"][30:31].tolist()
+    assert goes_on(compacted)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE meta SET value = '{}' WHERE key = 'identity'",
+        "DELETE FROM meta",
+        "UPDATE meta SET checksum = x'' WHERE key = 'created'",
+        "INSERT INTO payload VALUES (1, x'00') ON CONFLICT DO UPDATE SET bytes = x'00'",
+    ],
+)
+def test_what_is_known_twice_is_not_lost(compacted, statement):
+    change(compacted, statement)
+    assert repair_store(compacted).lost == []
+    assert agrees(compacted, kept=LAST, base=6, latest=15)
+
+
+def test_without_any_identity_nothing_is_done(path):
+    shutil.rmtree(path / "generations")
+    change(path, "DELETE FROM meta WHERE key = 'identity'")
+    before = contents(path)
+    with pytest.raises(DamageError, match=r"tells what the store .* is for"):
+        repair_store(path)
+    after = contents(path)
+    assert {name: after[name] for name in before if name != "holder.json"} == before
+
+
+HEADS = {
+    "the first bytes": (0, 1),
+    "the page size": (16, 1),
+    "the way of writing": (18, 4),
+    "the encoding": (59, 2),
+    "the version": (63, 4),
+    "the id": (70, 2),
+    "a table's place": (4096 - 200, 1),
+}
+
+
+@pytest.mark.parametrize(("place", "bit"), HEADS.values(), ids=HEADS)
+def test_a_first_page_is_made_anew(compacted, place, bit):
+    file = compacted / "journal.sqlite"
+    data = bytearray(file.read_bytes())
+    data[place] ^= bit
+    file.write_bytes(data)
+    assert repair_store(compacted).lost == []
+    assert agrees(compacted, kept=LAST, base=6, latest=15)
+
+
+@pytest.mark.parametrize("pages", [2, 5, 9, 12, 20])
+def test_a_journal_that_was_cut_off_gives_what_it_still_has(path, pages):
+    file = path / "journal.sqlite"
+    file.write_bytes(file.read_bytes()[: 4096 * pages])
+    done = repair_store(path)
+    assert 15 <= done.kept <= LAST
+    with Store.open(path) as opened:
+        base = opened.compacted
+        rows = {head.sequence for head in opened.heads()}
+    assert base in (0, 15)
+    assert agrees(path, kept=done.kept, base=base, latest=15, lost=set(range(1, base + 1)) - rows)
+    assert goes_on(path)
+
+
+@pytest.mark.parametrize("how", ["deleted", "empty", "stub", "text"])
+@pytest.mark.parametrize("which", [False, True])
+def test_without_a_journal_the_newest_generation_is_gone_on_from(made, tmp_path, which, how):
+    path = shutil.copytree(made[which], tmp_path / "s")
+    file = path / "journal.sqlite"
+    if how == "deleted":
+        file.unlink()
+    else:
+        file.write_bytes({"empty": b"", "stub": b"SQLite format 3\0", "text": b"dear diary" * 900}[how])
+    with pytest.raises(DamageError, match="repair"):
+        Store.open(path, identity={"for": "another"})
+    done = repair_store(path)
+    assert done.kept == 15
+    assert done.aside == (None if how == "deleted" else path / "journal.sqlite.damaged")
+    assert f"rows 1 to 15 {'cannot be read' if how == 'text' else 'are missing'}" in done.lost[0]
+    if how != "text":
+        assert "the rows behind 15, if there were any, are lost" in done.lost[-1]
+    assert agrees(path, kept=15, base=15, latest=15, lost=range(1, 16))
+    assert goes_on(path)
+
+
+def test_a_log_without_its_journal_never_meets_the_new_one(path):
+    """Its frames would be taken for changes to the repaired file."""
+    with Store.open(path) as opened:
+        for number in range(21, 40):
+            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)})
+        shutil.copytree(path, path.parent / "copy", ignore=shutil.ignore_patterns("*-shm", "holder.json"))
+    copy = path.parent / "copy"
+    log = (copy / "journal.sqlite-wal").read_bytes()
+    assert len(log) > 10 * 4096
+    (copy / "journal.sqlite").unlink()
+    done = repair_store(copy)
+    assert (done.kept, done.aside) == (15, None)
+    assert (copy / "journal.sqlite.damaged-wal").read_bytes() == log
+    assert agrees(copy, kept=15, base=15, latest=15, lost=range(1, 16))
+
+
+def test_what_the_log_holds_is_kept_with_the_damaged_journal(path):
+    with Store.open(path) as opened:
+        for number in range(21, 25):
+            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
+        shutil.copytree(path, path.parent / "copy", ignore=shutil.ignore_patterns("*-shm", "holder.json"))
+    copy = path.parent / "copy"
+    spoil(copy, 2)
+    log, main = (copy / "journal.sqlite-wal").read_bytes(), (copy / "journal.sqlite").read_bytes()
+    done = repair_store(copy)
+    assert done.kept == 24
+    assert agrees(copy, kept=24, latest=10)
+    assert done.aside.read_bytes() == main
+    assert (copy / "journal.sqlite.damaged-wal").read_bytes() == log
+    # And can be read there, with all its rows, by whoever looks into it.
+    with closing(sqlite3.connect(done.aside)) as connection:
+        assert connection.execute("SELECT count(*) FROM record").fetchone() == (24,)
+
+
+def test_a_journal_of_another_store_keeps_its_rows_and_no_generation_of_this_one(path, tmp_path):
+    with Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
+        for number in range(1, 4):
+            other.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
+        for upto in (2, 3):
+            other.commit(state(upto), upto=upto, chunks={"rows": 25})
+    shutil.copy(tmp_path / "other" / "journal.sqlite", path / "journal.sqlite")
+    assert "another identity" in " ".join(one.what for one in damage(path))
+    done = repair_store(path)
+    assert done.kept == 3
+    assert sorted(entry.name for entry in (path / "generations").iterdir()) == ["00000001.damaged", "00000002.damaged"]
+    assert damage(path) == []
+    with Store.open(path) as opened:
+        assert opened.identity == IDENTITY | {"other": True}
+        assert opened.latest() is None
+        assert len(list(opened.records())) == 3
+
+
+def test_damaged_journals_are_never_written_over(path):
+    for expected in ("journal.sqlite.damaged", "journal.sqlite.damaged-2", "journal.sqlite.damaged-3"):
+        with Store.open(path) as opened:
+            last = opened.last
+        change(path, f"UPDATE record SET label = 'z' WHERE sequence = {last}")
+        done = repair_store(path)
+        assert done.aside == path / expected
+        assert done.kept == last - 1
+    assert len([one for one in check_store(path) if one.kind == "leftover"]) >= 3
+    assert agrees(path, kept=17, latest=15)
+
+
+def test_what_a_repair_lost_is_noted_in_the_journal(path):
+    change(path, "DELETE FROM record WHERE sequence = 8")
+    done = repair_store(path)
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection:
+        (noted,) = connection.execute("SELECT value FROM meta WHERE key = 'repaired'").fetchone()
+    assert json.loads(noted) == {
+        "aside": "journal.sqlite.damaged",
+        "heads": [[8, 8]],
+        "kept": LAST,
+        "lost": done.lost,
+    }
+
+
+def test_progress_is_told(path):
+    change(path, "DELETE FROM record WHERE sequence = 18")
+    told = []
+    repair_store(path, progress=lambda *step: told.append(step))
+    assert {"generations", "rows written"} <= {what for what, _, _ in told}
+
+
+def test_while_a_writer_has_it_nothing_is_done(path):
+    change(path, "DELETE FROM record WHERE sequence = 18")
+    with Store.open(path), pytest.raises(LockedError, match=f"process {os.getpid()}"):
+        repair_store(path)
+    assert repair_store(path).kept == 17
+
+
+def test_where_there_is_no_store_none_is_repaired(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.txt").write_text("mine")
+    (tmp_path / "database").mkdir()
+    with closing(sqlite3.connect(tmp_path / "database" / "journal.sqlite")) as connection:
+        connection.execute("CREATE TABLE mine (x)")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    before = contents(tmp_path)
+    for name in ("folder", "database", "loop", "nothing"):
+        with pytest.raises(NotAStoreError, match=name):
+            repair_store(tmp_path / name)
+    assert contents(tmp_path) == before
+
+
+def test_a_newer_format_is_not_touched(path):
+    change(path, "PRAGMA user_version = 2", "DELETE FROM meta WHERE key = 'format'")
+    before = contents(path)
+    with pytest.raises(VersionError):
+        repair_store(path)
+    assert contents(path) == before
+
+
+def test_a_folder_that_may_not_be_written_is_left(path, tmp_path):
+    mount, command = tmp_path / "disk", shutil.which("mount")
+    mount.mkdir()
+    arguments = [command, "-t", "tmpfs", "-o", "size=2m", "tmpfs", mount]
+    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        change(path, "DELETE FROM record WHERE sequence = 18")
+        shutil.copytree(path, mount / "s")
+        subprocess.run(["mount", "-o", "remount,ro", mount], check=True)
+        assert "row 18 is missing" in " ".join(one.what for one in damage(mount / "s"))
+        with pytest.raises(ReadOnlyError):
+            repair_store(mount / "s")
+        assert "row 18 is missing" in " ".join(one.what for one in damage(mount / "s"))
+    finally:
+        subprocess.run(["umount", mount], check=True)
+
+
+def test_a_full_disk_leaves_the_damaged_store_as_it_was(path, tmp_path):
+    mount, command = tmp_path / "disk", shutil.which("mount")
+    mount.mkdir()
+    arguments = [command, "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount]
+    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        change(path, "DELETE FROM record WHERE sequence = 18")
+        shutil.copytree(path, mount / "s")
+        free = shutil.disk_usage(mount).free
+        (mount / "ballast").write_bytes(bytes(free - 3 * 4096))
+        journal = (mount / "s" / "journal.sqlite").read_bytes()
+        with pytest.raises(store.StoreFullError):
+            repair_store(mount / "s")
+        assert (mount / "s" / "journal.sqlite").read_bytes() == journal
+        (mount / "ballast").unlink()
+        assert repair_store(mount / "s").kept == 17
+        assert agrees(mount / "s", kept=17, latest=15)
+    finally:
+        subprocess.run(["umount", mount], check=True)
+
+
+class KilledError(BaseException):
+    pass
+
+
+def steps_of(monkeypatch, at):
+    """Kill the repair before its step `at`: a step is a rename, a sync, a removal or a file that SQLite makes."""
+    count = [0]
+
+    def killing(owner, name):
+        real = getattr(owner, name)
+
+        def step(*args, **options):
+            count[0] += 1
+            if count[0] == at:
+                raise KilledError
+            return real(*args, **options)
+
+        monkeypatch.setattr(owner, name, step)
+
+    killing(os, "rename")
+    killing(os, "fsync")
+    killing(shutil, "rmtree")
+    killing(store.rebuild, "build_journal")
+    killing(store.rebuild, "_verify")
+    return count
+
+
+@pytest.mark.parametrize("how", ["row", "row and generation", "no journal", "description"])
+def test_killed_before_any_step_it_can_be_begun_again(made, tmp_path, monkeypatch, how):
+    source = shutil.copytree(made[how == "description"], tmp_path / "source")
+    if how == "no journal":
+        (source / "journal.sqlite").unlink()
+    elif how == "description":
+        spoil(source, 2, "zarr.json")
+        assert [one.kind for one in damage(source)] == ["spare"]
+    else:
+        change(source, "DELETE FROM payload WHERE sequence IN (8, 18)")
+    if how == "row and generation":
+        spoil(source, 1)
+    whole = shutil.copytree(source, tmp_path / "whole")
+    expected = repair_store(whole)
+    at, interrupted = 0, 0
+    while True:
+        at += 1
+        path = shutil.copytree(source, tmp_path / f"{at}")
+        with monkeypatch.context() as broken:
+            count = steps_of(broken, at)
+            try:
+                repair_store(path)
+            except KilledError:
+                interrupted += 1
+        if count[0] < at:
+            break
+        # Whoever opens it now finds a store, or is told to repair it; and never another one.
+        try:
+            with Store.open(path, mode="read") as opened:
+                rows = [row.sequence for row in opened.heads(opened.compacted)]
+                assert rows == list(range(opened.compacted + 1, opened.last + 1))
+                assert opened.identity == IDENTITY
+                assert opened.last in (LAST, expected.kept)
+        except DamageError:
+            pass
+        if not (path / "journal.sqlite").exists():
+            for mode in ("read", "write"):
+                with pytest.raises(DamageError, match="repair the store"):
+                    Store.open(path, identity={"for": "another"}, mode=mode)
+        again = repair_store(path)
+        assert again.kept == expected.kept
+        assert damage(path) == []
+        with Store.open(whole, mode="read") as right, Store.open(path, mode="read") as found:
+            assert (found.last, found.compacted, found.identity) == (right.last, right.compacted, right.identity)
+            assert list(found.heads()) == list(right.heads())
+            assert found.latest().upto == right.latest().upto
+        # The damaged journal is never lost on the way.
+        if how != "no journal":
+            asides = [one for one in path.iterdir() if one.name.startswith("journal.sqlite.damaged")]
+            assert (source / "journal.sqlite").read_bytes() in [one.read_bytes() for one in asides]
+    assert interrupted >= 8
+
+
+def test_what_an_interrupted_repair_made_is_not_believed_after_the_store_went_on(path, monkeypatch):
+    change(path, "DELETE FROM payload WHERE sequence = 18")
+    with monkeypatch.context() as broken, pytest.raises(KilledError):
+        broken.setattr(store.repair, "put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
+        repair_store(path)
+    assert (path / "journal.sqlite.repaired").exists()
+    with Store.open(path) as opened:
+        opened.append("a", "row 21", b"")
+    assert not (path / "journal.sqlite.repaired").exists()
+    (path / "journal.sqlite").unlink()
+    assert repair_store(path).kept == 15
+
+
+def test_a_damaged_result_of_an_interrupted_repair_is_named(path, monkeypatch):
+    change(path, "DELETE FROM payload WHERE sequence = 18")
+    with monkeypatch.context() as broken, pytest.raises(KilledError):
+        broken.setattr(store.repair, "put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
+        repair_store(path)
+    (path / "journal.sqlite").rename(path / "journal.sqlite.damaged")
+    (path / "journal.sqlite.repaired").write_bytes(b"no longer what it was" * 900)
+    with pytest.raises(DamageError, match=r"is damaged: remove it, .* and repair the store once more"):
+        repair_store(path)
+    assert (path / "journal.sqlite.damaged").exists()
+
+
+def test_a_disk_that_does_not_keep_what_is_written_is_told_of(path, monkeypatch):
+    change(path, "DELETE FROM payload WHERE sequence = 18")
+    real = store.rebuild.build_journal
+
+    def forgetful(draft, meta, fill=None):
+        real(draft, meta, fill)
+        with closing(sqlite3.connect(draft)) as connection, connection:
+            connection.execute("UPDATE record SET time = 0 WHERE sequence = 3")
+
+    with monkeypatch.context() as broken, pytest.raises(DamageError, match="does not read back as it was just written"):
+        broken.setattr(store.rebuild, "build_journal", forgetful)
+        repair_store(path)
+    assert not (path / "journal.sqlite.repaired").exists()
+    assert repair_store(path).kept == 17
+
+
+def test_readers_meanwhile_get_right_answers_or_are_told(path):
+    change(path, "DELETE FROM payload WHERE sequence = 18")
+    stop, wrong = threading.Event(), []
+
+    def read():
+        while not stop.is_set():
+            try:
+                with Store.open(path, mode="read") as reader:
+                    rows = [row.arrays["x"].tobytes() for row in reader.records()]
+                    if rows != [values(number).tobytes() for number in range(1, len(rows) + 1)]:
+                        wrong.append(len(rows))
+            except DamageError:
+                pass
+            except BaseException as error:
+                wrong.append(error)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    repair_store(path)
+    stop.set()
+    thread.join()
+    assert wrong == []
+    assert agrees(path, kept=17, latest=15)

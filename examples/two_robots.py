@@ -1,7 +1,8 @@
 """The memory is exact: order, batching, restarts and a cut of the power leave the same bytes.
 
 One robot feels everything in one go; another feels it in another order and is switched off halfway, without a
-chance to close anything. Simulated, so that it runs anywhere: python examples/two_robots.py
+chance to close anything; two more feel half each and put it together. Simulated, so that it runs anywhere:
+python examples/two_robots.py
 """
 
 import subprocess
@@ -42,3 +43,15 @@ with tempfile.TemporaryDirectory() as folder:
         for material, repetition in backwards[10:]:
             learner.observe(material, scene.touch(material, repetition))
         print(f"the same bytes: {learner.digest() == expected}")
+
+    left, right = Path(folder) / "left", Path(folder) / "right"
+    for path, half in ((left, touches[::2]), (right, touches[1::2])):
+        with TactileLearner.open(path, sensor=sensors.ROBOSKIN) as learner, learner.batch():
+            for material, repetition in half:
+                learner.observe(material, scene.touch(material, repetition))
+    with TactileLearner.open(left) as learner:
+        learner.merge(right, shared="once")
+        print(f"put together, the same bytes: {learner.digest() == expected}")
+        slip = learner.observe(scene.materials[0], scene.touch("something else", 0))
+        learner.retract(slip)
+        print(f"a slip taken back, the same bytes: {learner.digest() == expected}")

@@ -231,9 +231,11 @@ class Ledger:
                 self._snapshot()
                 base = memory.until(store, upto) if upto < memory.sequence else memory
                 arrays, attributes = base.to_arrays(base_at=upto)
+                self._whole = False  # should ctrl-C come when it is done already, what can be taken back is read anew
                 store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
                 memory.base = upto
                 memory.withdrawn = {sequence for sequence in memory.withdrawn if sequence > upto}
+                self._whole = True
                 give_back_scratch()
             return Compacted(memory.base, before, sum(store.size().values()))
 

@@ -79,6 +79,10 @@ def test_the_continual_and_vision_tables_come_from_their_results():
             if row["method"] in ("f", "streaming LDA") or (row["method"], row["size"]) == ("f*", "400"):
                 assert f"{100 * row['accuracy']['mean']:.1f} ± {100 * row['accuracy']['sd']:.1f}" in shown
         assert {"command", "seed", "versions", "date"} <= result.keys()
+        sizes = README.split("<!-- buffers -->")[1].split("<!-- /buffers -->")[0]
+        for row in result["means"] if f"{'BioTac' if name[0] == 'b' else 'RoboSkin'}-20: f" in sizes else ():
+            if row["size"] not in (None, "0"):
+                assert f"{100 * row['accuracy']['mean']:.1f}" in sizes
     vision = json.loads((ROOT / "examples" / "results" / "vision.json").read_text())
     table = README.split("<!-- vision -->")[1].split("<!-- /vision -->")[0]
     for record in vision["records"]:

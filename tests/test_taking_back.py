@@ -515,3 +515,21 @@ def test_what_damage_keeps_from_being_taken_back_is_named(path, caplog):
 
 def learner_key(one):
     return validate(stream(one[1]), PAD).key
+
+
+def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkeypatch):
+    learner, receipts = filled(path)
+    with learner:
+
+        def interrupted(_):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as broken:
+            broken.setattr(type(learner._ledger.store._journal), "shrink", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                learner.compact(keep=2)
+        require_same(learner, FELT)
+        with pytest.raises(ObservationError, match="rows 1 to 10 were compacted"):
+            learner.retract(receipts[0])
+        learner.retract(receipts[-1])
+        require_same(learner, without(11))

@@ -27,7 +27,7 @@ LAYERS = [
     {"export", "plain"},
     {"datasets"},
     {"plots"},
-    {"plots_continual"},
+    {"plots_continual", "plots_numerics"},
     {"pipelines", "bench"},
     {"cli", "__main__"},
     {""},  # the package's own __init__

@@ -9,13 +9,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
+from store.faults import Progress, rows_text
 from store.generations import PARTIAL
 from store.remains import Remains, require_remains
 from store.reporting import reported
 from store.schema import DAMAGED_FILE, DRAFT_FILE, GENERATIONS, JOURNAL_FILE, REPAIRED_FILE
-from store.survey import Fault, Found, Progress, Survey, survey
+from store.survey import Found, Survey, survey
 
-__all__ = ["Problem", "check_store", "problems", "rows_text"]
+__all__ = ["Problem", "check_store", "problems"]
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,6 @@ def _in_journal(remains: Remains, found: Survey) -> Iterator[Problem]:
         what = f"{found.damaged_meta} rows of table meta in {found.journal} fail their checksums"
         what += f"; without a row that verifies: {', '.join(missing)}" if missing else ""
         yield Problem(found.journal, what, "spare" if found.identity is not None else "lost")
-
-
-def rows_text(first: int, last: int, fault: Fault) -> str:
-    """Return that rows `first` to `last` have a fault, in words."""
-    return f"row {first} {fault.value[0]}" if first == last else f"rows {first} to {last} {fault.value[1]}"
 
 
 def _in_rows(found: Survey) -> Iterator[Problem]:

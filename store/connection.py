@@ -14,6 +14,9 @@ __all__ = ["connect", "roll_back"]
 # Seconds for another program, such as a backup, to leave a transaction before it is reported.
 PATIENCE = 5.0
 
+# Bytes to which the log is cut again when it was emptied: a large batch would leave one as large as itself.
+LARGEST_IDLE_LOG = 16 * 2**20
+
 
 def connect(path: Path, *, write: bool) -> sqlite3.Connection:
     """Return a connection that begins no transaction by itself, gives text as bytes and serves any thread."""
@@ -35,6 +38,7 @@ def connect(path: Path, *, write: bool) -> sqlite3.Connection:
             # On a Mac a plain fsync stops at the drive's cache.
             connection.execute("PRAGMA fullfsync = 1")
             connection.execute("PRAGMA checkpoint_fullfsync = 1")
+            connection.execute(f"PRAGMA journal_size_limit = {LARGEST_IDLE_LOG}")
             (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
             if mode != b"wal":
                 raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")

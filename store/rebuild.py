@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from store.errors import DamageError
+from store.faults import Fault, Progress, survey_rows, walk
 from store.files import sync_folder
 from store.records import JSON, from_json
 from store.remains import Remains
@@ -23,7 +24,6 @@ from store.schema import (
     payload_digest,
     remove_drafts,
 )
-from store.survey import Fault, Progress, survey_rows, walk
 
 __all__ = ["Contents", "finish_repair", "free_name", "put_in_place", "write_repaired"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import struct
 from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
@@ -14,29 +13,16 @@ from typing import Any
 from store.connection import connect
 from store.errors import DamageError, NotAStoreError, VersionError
 from store.files import file_size
+from store.header import header_fault, holds_store, with_new_header
 from store.log import damaged_frame, log_text, mend_log
 from store.reporting import SQLITE_ERRORS, from_sqlite, is_damage, reported
 from store.rows import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, Spans, read_meta
-from store.schema import (
-    FORMAT_VERSION,
-    HEADER_LENGTH,
-    JOURNAL_FILE,
-    LOG,
-    PAGE_BYTES,
-    build_journal,
-    has_our_schema,
-    holds_store,
-    is_our_header,
-)
+from store.schema import FORMAT_VERSION, JOURNAL_FILE, LOG, PAGE_BYTES, build_journal, has_our_schema
 
 __all__ = ["WINDOW", "Remains", "require_remains"]
 
 # Rows looked at together; behind damage, sequences that are tried one by one.
 WINDOW = 256
-
-# Where in the header the file's pages and free pages are counted; a count that is not of this very change
-# (the last field) is not believed.
-CHANGE_AT, FREE_AT, COUNTED_AT = 24, 32, 92
 
 
 def require_remains(folder: Path) -> None:
@@ -100,10 +86,10 @@ class Remains:
         frame = damaged_frame(log)
         if frame is not None:
             self.damage.append(log_text(log, frame))
-        with self.path.open("rb") as file:
-            fits = is_our_header(file.read(HEADER_LENGTH))
-        if not fits:
-            self.damage.append(f"{self.path} does not begin as a journal of format {FORMAT_VERSION}")
+        fault = header_fault(self.path)
+        fits = fault is None
+        if fault is not None:
+            self.damage.append(fault)
         elif frame is None:
             connection = undo.enter_context(closing(connect(self.path, write=False)))
             if fits := self._is_readable(connection):
@@ -200,11 +186,13 @@ class Remains:
     def payload(self, sequence: int) -> tuple[bytes | None, bool]:
         """Return the payload of a row, not verified, None where there is none; and whether that could be read."""
         rows, whole = self._until_damage("SELECT bytes FROM payload WHERE sequence = ?", sequence)
-        if rows or not self.damage or self._connection is None:
-            return (rows[0][0] if rows else None), whole
-        return self._passed_by(self._connection, sequence), whole
+        found = rows[0][0] if rows else None
+        if found is None and self.damage and self._connection is not None:
+            found = self._passed_by(self._connection, sequence)
+        # A flipped bit can also change a value's type; no payload is empty.
+        return (found if found is None or isinstance(found, bytes) else b""), whole
 
-    def _passed_by(self, connection: sqlite3.Connection, sequence: int) -> bytes | None:
+    def _passed_by(self, connection: sqlite3.Connection, sequence: int) -> Any:
         # In a damaged tree the way that leads to a row may be lost, and it is still passed by, from one side.
         for sides in ("> ? - ? ORDER BY sequence", "< ? + ? ORDER BY sequence DESC"):
             query = f"SELECT sequence, bytes FROM payload WHERE sequence {sides}"
@@ -212,7 +200,7 @@ class Remains:
                 with closing(connection.execute(query, (sequence, WINDOW))) as cursor:
                     for number, found in islice(cursor, 2 * WINDOW):
                         if number == sequence:
-                            return bytes(found)
+                            return found
             except SQLITE_ERRORS as error:
                 self._require_damage(error)
         return None
@@ -252,10 +240,5 @@ def _mended(path: Path, scratch: Path, *, page: bool, log: bool) -> Path:
 
 def _put_new_first_page(copy: Path, new: Path) -> None:
     build_journal(new, {})
-    page = bytearray(new.read_bytes()[:PAGE_BYTES])
-    # No free pages, and a count of pages that is not believed: SQLite then goes by the size of the file.
-    struct.pack_into(">II", page, FREE_AT, 0, 0)
-    struct.pack_into(">I", page, COUNTED_AT, 0)
-    struct.pack_into(">I", page, CHANGE_AT, 1)
     with copy.open("r+b") as file:
-        file.write(page)
+        file.write(with_new_header(new.read_bytes()[:PAGE_BYTES]))

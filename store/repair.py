@@ -9,8 +9,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, cast
 
-from store.check import problems, rows_text
+from store.check import problems
 from store.errors import DamageError
+from store.faults import Progress, rows_text
 from store.files import sync_folder
 from store.generations import folder_name, highest_number, remove_others, write_generation
 from store.lock import WriterLock
@@ -21,7 +22,7 @@ from store.remains import Remains, require_remains
 from store.reporting import reported
 from store.rows import GenerationRow, Spans, lost_heads
 from store.schema import DAMAGED_FILE, GENERATIONS, JOURNAL_FILE, SIDES, new_meta
-from store.survey import Found, Progress, Survey, survey
+from store.survey import Found, Survey, survey
 
 __all__ = ["Repair", "repair_store"]
 

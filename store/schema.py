@@ -1,4 +1,4 @@
-"""The journal file: what it looks like when new, and whether a folder holds one."""
+"""The journal file: its name, its tables and their checksums, and how a new one is made."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
-from store.errors import DamageError, NotAStoreError, VersionError
 from store.files import remove_tree, sync_file, sync_folder
-from store.lock import HOLDER_FILE, LOCK_FILE
-from store.reporting import reported
 
 __all__ = [
+    "APPLICATION_ID",
     "DAMAGED_FILE",
     "DRAFT_FILE",
     "FORMAT_VERSION",
     "GENERATIONS",
-    "HEADER_LENGTH",
     "JOURNAL_FILE",
     "LOG",
     "PAGE_BYTES",
@@ -30,8 +27,6 @@ __all__ = [
     "checksum",
     "create_journal",
     "has_our_schema",
-    "holds_store",
-    "is_our_header",
     "new_meta",
     "payload_digest",
     "remove_drafts",
@@ -53,13 +48,9 @@ LOG = "-wal"
 SIDES = (LOG, "-shm")
 
 
-
-STRICT = " STRICT"
-SQLITE_MAGIC = b"SQLite format 3\0"
-# The places of user_version and application_id in the header of every SQLite file.
-USER_VERSION_AT, APPLICATION_ID_AT, HEADER_LENGTH = 60, 68, 100
 # Part of the format, so that a damaged first page can be made anew: with TABLES it is always the same.
 PAGE_BYTES = 4096
+STRICT = " STRICT"
 TABLES = (
     """CREATE TABLE meta (
     key TEXT PRIMARY KEY NOT NULL,

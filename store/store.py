@@ -18,20 +18,20 @@ from store.arrays import check_arrays, check_chunks, encode_payload
 from store.background import Background
 from store.errors import (
     CompactedError,
-    DamageError,
     NotAStoreError,
     ReadOnlyError,
     RecordError,
     StoreClosedError,
     StoreError,
 )
-from store.files import file_size, sync_folder, tree_size
+from store.files import file_size, tree_size
+from store.header import holds_store
 from store.journal import Journal
 from store.lock import WriterLock
-from store.log import damaged_frame, log_text
+from store.opening import lock_to_write, require_whole_log
 from store.records import JSON, Generation, Head, Record, check_key, check_text, check_time, from_json, to_json
 from store.reporting import reported
-from store.schema import GENERATIONS, JOURNAL_FILE, LOG, create_journal, holds_store, remove_drafts
+from store.schema import GENERATIONS, JOURNAL_FILE
 from store.snapshots import Snapshots
 
 __all__ = ["Store"]
@@ -87,11 +87,9 @@ class Store:
         self._background = Background(f"store commit {folder.name}")
         with ExitStack() as undo:
             if mode == "write":
-                self._make_folder()
-                self._lock = WriterLock(folder)
+                self._lock = lock_to_write(folder, identity)
                 undo.callback(self._lock.release)
-                self._make_journal(identity)
-            self._require_whole_log()
+            require_whole_log(folder)
             self._journal = Journal(folder / JOURNAL_FILE, write=mode == "write")
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
@@ -99,31 +97,6 @@ class Store:
             if mode == "write":
                 self._snapshots.remove_unfinished()
             undo.pop_all()
-
-    def _make_folder(self) -> None:
-        with reported(self.path, "making the folder"):
-            if not self.path.is_dir():
-                self.path.mkdir(parents=True, exist_ok=True)
-                sync_folder(self.path.parent)
-
-    def _make_journal(self, identity: str | None) -> None:
-        # Asked again, under the lock: another writer may have made the store, and left, since.
-        if not holds_store(self.path):
-            if identity is None:
-                raise NotAStoreError(f"{self.path} holds no store; give an identity to make one")
-            with reported(self.path, "making the store"):
-                create_journal(self.path, identity)
-        with reported(self.path, "removing what an interrupted repair left"):
-            # Or, were the journal lost later, the rows appended from now on would be lost with it.
-            remove_drafts(self.path)
-
-    def _require_whole_log(self) -> None:
-        # Before SQLite sees it, which takes a damaged frame for its end and writes over the rows behind it.
-        log = self.path / (JOURNAL_FILE + LOG)
-        with reported(log, "reading the write-ahead log"):
-            frame = damaged_frame(log)
-        if frame is not None:
-            raise DamageError(f"{log_text(log, frame)}: repair the store (repair_store)", path=log)
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -205,8 +178,9 @@ class Store:
         Raises RecordError where there is none, CompactedError where its arrays were given up, DamageError.
         """
         self._check_open()
-        if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= self._journal.last():
-            raise RecordError(f"{self.path} has records 1 to {self._journal.last()}, not {sequence!r}")
+        last = self._journal.last()
+        if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= last:
+            raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
         record = self._journal.row_after(sequence - 1)
         assert record is not None
         return record

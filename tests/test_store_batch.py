@@ -52,6 +52,18 @@ def test_a_batch_waits_for_the_disk_once(tmp_path, opened):
     assert 10 * together < one_by_one
 
 
+def test_a_large_batch_leaves_no_large_log(opened):
+    log = opened.path / "journal.sqlite-wal"
+    noise = np.random.default_rng(0)
+    with opened.batch():
+        for _ in range(5):
+            opened.append("a", "b", b"", arrays={"x": noise.integers(0, 2**63, 2**19)})
+    assert log.stat().st_size > 20 * 2**20
+    for _ in range(3):
+        add(opened, "after")
+    assert log.stat().st_size <= 16 * 2**20
+
+
 def test_an_empty_batch_is_nothing(opened):
     with opened.batch():
         pass

@@ -25,6 +25,7 @@ from store import (
     StoreError,
     StoreFullError,
     VersionError,
+    check_store,
 )
 
 ROOT = Path(store.__file__).parents[1]
@@ -243,6 +244,20 @@ def test_a_future_format_is_refused_and_not_touched(tmp_path):
         with pytest.raises(VersionError, match=r"format 7; .* up to format 1: upgrade"):
             Store.open(tmp_path, mode=mode)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("statement", ["PRAGMA journal_mode = DELETE", "ANALYZE", "VACUUM", "PRAGMA user_version = 1"])
+def test_what_another_program_may_do_to_the_journal_does_no_harm(tmp_path, statement):
+    with Store.open(tmp_path, identity={"a": 1}) as opened:
+        opened.append("a", "b", b"", arrays={"x": np.arange(3)})
+        opened.commit({"x": np.arange(3)}, upto=1)
+    with closing(sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)) as connection:
+        connection.execute(statement)
+    for mode in ("read", "write"):
+        with Store.open(tmp_path, mode=mode) as opened:
+            assert [row.label for row in opened.records()] == ["b"]
+            assert opened.latest().upto == 1
+    assert check_store(tmp_path) == []
 
 
 def test_an_interrupted_creation_is_finished_by_the_next(tmp_path):

@@ -21,7 +21,7 @@ def show_numerics(result: Mapping[str, Any]) -> None:
     records, judged = result["records"], result["bars"]
     best = {one["case"]: one["best"] for one in judged}
     methods = list(dict.fromkeys(one["method"] for one in records))
-    table = Table(title="relative error of the weights [decisions flipped]", box=SIMPLE_HEAD)
+    table = Table(title="relative error of the weights; in brackets decisions flipped", box=SIMPLE_HEAD)
     for name in ("case", *methods):
         table.add_column(name.replace("covariance", "cov").replace("symmetric", "sym"), no_wrap=True)
     for case in dict.fromkeys(one["case"] for one in records):
@@ -31,7 +31,8 @@ def show_numerics(result: Mapping[str, Any]) -> None:
             table.add_row(escape(case), *cells)
     # Cut off at 80 columns, as for want of a terminal's width, it would show nothing.
     screen = console()
-    screen.print(table, width=max(WIDE, screen.width))
+    screen.width = max(WIDE, screen.width)
+    screen.print(table)
     for one in records:
         if one["family"] == "schedules":
             say(f"{one['case']}: {one['method']}: {one['diagnosis']}")

@@ -58,7 +58,8 @@ def repair(folder: MemoryFolder) -> None:
         say(f"[yellow]lost:[/] {escape(what)}")
     if done.aside is not None:
         say(f"the damaged journal was put aside: {escape(str(done.aside))}")
-    say(f"kept up to row {done.kept}" if done.lost else f"nothing was damaged; rows 1 to {done.kept} verify")
+    whole = done.aside is None and not done.lost
+    say(f"nothing was damaged; rows 1 to {done.kept} verify" if whole else f"kept up to row {done.kept}")
 
 
 @memory.command()

@@ -1,0 +1,145 @@
+"""Whether a folder holds a store: what the first bytes of its journal say, before SQLite sees them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from store.errors import DamageError, NotAStoreError, VersionError
+from store.files import file_size
+from store.lock import HOLDER_FILE, LOCK_FILE
+from store.reporting import reported
+from store.schema import (
+    APPLICATION_ID,
+    DAMAGED_FILE,
+    DRAFT_FILE,
+    FORMAT_VERSION,
+    GENERATIONS,
+    JOURNAL_FILE,
+    LOG,
+    PAGE_BYTES,
+    REPAIRED_FILE,
+    SIDES,
+)
+
+__all__ = ["header_fault", "holds_store", "with_new_header"]
+
+# What may be in a folder in which a store was not made yet; and of these one is there where a journal was.
+OURS = frozenset(
+    {LOCK_FILE, HOLDER_FILE, HOLDER_FILE + ".new", GENERATIONS}
+    | {DRAFT_FILE + suffix for suffix in ("", "-journal", *SIDES)}
+)
+TRACES = (JOURNAL_FILE + LOG, REPAIRED_FILE, DAMAGED_FILE)
+
+SQLITE_MAGIC = b"SQLite format 3\0"
+HEADER_LENGTH = 100
+# Where the header says what: the file's change, its pages, its free pages, user_version, application_id,
+# and the change for which the count of pages was made.
+CHANGE_AT, PAGES_AT, FREE_AT, VERSION_AT, APPLICATION_AT, COUNTED_AT = 24, 28, 32, 60, 68, 92
+
+# What every journal's header says, and where; between these, and behind, are counts that change. `log` is 2
+# for a write-ahead log, and 1 without one, which another program may have made of it; `spare` are the bytes
+# kept free at the end of a page, of which Apple's builds of SQLite want 12.
+FIXED = (
+    (
+        0,
+        tuple(
+            SQLITE_MAGIC + struct.pack(">H6B", PAGE_BYTES, log, log, spare, 64, 32, 32)
+            for log in (2, 1)
+            for spare in (0, 12)
+        ),
+    ),
+    (44, (struct.pack(">7I", 4, 0, 0, 1, FORMAT_VERSION, 0, APPLICATION_ID) + bytes(20),)),
+)
+
+
+def holds_store(folder: Path) -> bool:
+    """Return whether `folder` holds a store that this release reads; False when one may be made there.
+
+    Only looks. Raises NotAStoreError for a file, for a folder with other things in it and for another
+    program's database, VersionError for a newer format, and DamageError for a journal whose first
+    bytes are damaged, or which is gone while its generations are still there.
+    """
+    with reported(folder, "looking for a store"):
+        if not folder.exists():
+            return False
+        if not folder.is_dir():
+            raise NotAStoreError(f"{folder} is a file; a store is a folder")
+        journal = folder / JOURNAL_FILE
+        if journal.is_file():
+            _require_ours(journal, _header(journal))
+            # Before SQLite sees it: with a smaller page, or fewer of them, it would write over rows.
+            if (fault := header_fault(journal)) is not None:
+                raise DamageError(f"{fault}: repair the store (repair_store)", path=journal)
+            return True
+        _refuse_foreign(folder)
+        return False
+
+
+def _header(journal: Path) -> bytes:
+    with journal.open("rb") as file:
+        return file.read(HEADER_LENGTH)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    generations = folder / GENERATIONS
+    traces = [name for name in TRACES if (folder / name).exists()]
+    if generations.is_dir() and any(generations.iterdir()):
+        traces.append(GENERATIONS)
+    if traces:
+        raise DamageError(
+            f"{folder} has {' and '.join(traces)} but no {JOURNAL_FILE}: put the journal back from a copy, or "
+            "repair the store (repair_store), which goes on from what verifies",
+            path=folder / JOURNAL_FILE,
+        )
+    if foreign := sorted(entry.name for entry in folder.iterdir() if entry.name not in OURS):
+        raise NotAStoreError(
+            f"{folder} holds no {JOURNAL_FILE} but other things ({', '.join(foreign[:3])}"
+            f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
+        )
+
+
+def _require_ours(journal: Path, header: bytes) -> None:
+    if len(header) < HEADER_LENGTH or not header.startswith(SQLITE_MAGIC):
+        if (journal.parent / GENERATIONS).is_dir():
+            raise DamageError(
+                f"{journal} does not begin as a SQLite file: put it back from a copy of the folder, or repair "
+                "the store (repair_store)",
+                path=journal,
+            )
+        raise NotAStoreError(f"{journal} is not a SQLite file; nothing was written")
+    (application,) = struct.unpack_from(">I", header, APPLICATION_AT)
+    (version,) = struct.unpack_from(">I", header, VERSION_AT)
+    if application != APPLICATION_ID:
+        raise NotAStoreError(
+            f"{journal} is another program's database (application id {application:#010x}, not "
+            f"{APPLICATION_ID:#010x}); nothing was written"
+        )
+    if version > FORMAT_VERSION:
+        raise VersionError(
+            f"{journal} is written in format {version}; this release reads up to format {FORMAT_VERSION}: "
+            "upgrade it, or open the store with the release that wrote it; nothing was changed"
+        )
+
+
+def header_fault(journal: Path) -> str | None:
+    """Return in words what is wrong with the header of a journal, None for a sound one. A writer may be at work."""
+    header = _header(journal)
+    if len(header) < HEADER_LENGTH or not all(header.startswith(wanted, at) for at, wanted in FIXED):
+        return f"{journal} does not begin as a journal of format {FORMAT_VERSION}"
+    (pages,) = struct.unpack_from(">I", header, PAGES_AT)
+    size = file_size(journal)
+    # The log knows it better; and what changed meanwhile is no damage.
+    if size == pages * PAGE_BYTES or file_size(journal.with_name(journal.name + LOG)) or _header(journal) != header:
+        return None
+    return f"{journal} has {size} bytes, and says that it has {pages} pages of {PAGE_BYTES}"
+
+
+def with_new_header(page: bytes) -> bytes:
+    """Return the first page of a new journal, so that SQLite takes it for that of one of any size."""
+    fresh = bytearray(page)
+    struct.pack_into(">II", fresh, FREE_AT, 0, 0)
+    # A count of pages that was made for another change is not believed: it goes by the size of the file.
+    struct.pack_into(">I", fresh, CHANGE_AT, 1)
+    struct.pack_into(">I", fresh, COUNTED_AT, 0)
+    return bytes(fresh)

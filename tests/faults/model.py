@@ -1,0 +1,293 @@
+"""What a memory must hold: a list of touches that cannot go wrong, and the operations that change it.
+
+An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
+("forget", material), ("merge", name, shared), ("compact", keep), ("fine_tune",). `after` says what it makes of a
+`State` and what the call returns, `perform` does it to a learner, and `expected` is what can be seen of a learner
+in that state: made anew, in memory, from the touches in another order.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+import scroll_tactile.memory
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.errors import InputError
+from scroll_tactile.ridge.pool import Pool
+
+PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+MATERIALS = ("a", "b", "c", "ü")
+LENGTHS = (9, 16, 25, 40, 60, 90, 90)  # the widest scale needs 37, a fine-tune some of two materials
+
+Touch = tuple[int, int]
+Operation = tuple[Any, ...]
+
+
+class SmallPool(Pool):
+    """A pool that is soon full, so that what was left out of it has to come back."""
+
+    def __init__(self, capacity: int = 5) -> None:
+        super().__init__(capacity)
+
+
+def warm() -> None:
+    """Have everything imported and set, so that a process forked from here begins at once, with no thread running."""
+    torch.set_num_threads(1)
+    scroll_tactile.memory.Pool = SmallPool  # type: ignore[misc]  # for good: this process does nothing else
+    learner = TactileLearner(**settings())
+    for at in range(4):
+        for name in MATERIALS[:2]:
+            learner.observe(name, stream((at, 90)))
+    learner.fine_tune(epochs=1)
+    learner.predict(stream((9, 90)))
+    import filelock  # noqa: F401  # what the store imports late
+    import zarr  # noqa: F401
+    from numcodecs import blosc  # noqa: F401
+
+
+_settings: dict[str, Any] = {"sensor": PAD, "embedding": Kernels(seed=0, dimension=64), "exemplars": 4}
+
+
+def settings() -> dict[str, Any]:
+    """The arguments of every learner here."""
+    return _settings
+
+
+def one_scale() -> None:
+    """Have touches read at one scale only, from here on: fewer files, where each call for each of them is tried."""
+    _settings["sensor"] = PAD.model_copy(update={"duration": 0.3})
+
+
+def opened(path: Path, mode: Any = "write") -> TactileLearner:
+    """The memory in folder `path`."""
+    return TactileLearner.open(path, mode=mode, **settings())
+
+
+def stream(touch: Touch) -> npt.NDArray[np.float64]:
+    """The readings of a touch, the same for the same numbers."""
+    seed, readings = touch
+    return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
+
+
+@dataclass(frozen=True)
+class Felt:
+    """An observation; fixed: it can no longer be taken back."""
+
+    sequence: int
+    material: str
+    touch: Touch
+    fixed: bool = False
+
+    @property
+    def pair(self) -> tuple[str, Touch]:
+        """What was felt, whenever it was."""
+        return self.material, self.touch
+
+
+Pairs = tuple[tuple[str, Touch], ...]
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a memory holds. last: its rows. base: the last that was compacted. tuned: what f* was made from."""
+
+    felt: tuple[Felt, ...] = ()
+    last: int = 0
+    base: int = 0
+    tuned: Pairs | None = None
+    tuned_upto: int = 0
+
+    @property
+    def pairs(self) -> Pairs:
+        """What was felt, in an order of its own."""
+        return tuple(sorted(one.pair for one in self.felt))
+
+    def without(self, sequences: set[int]) -> State:
+        """The state after a row that takes observations back."""
+        left = tuple(one for one in self.felt if one.sequence not in sequences)
+        gone = any(sequence <= self.tuned_upto for sequence in sequences)
+        return replace(self, felt=left, last=self.last + 1, tuned=None if gone else self.tuned)
+
+    def with_one(self, material: str, touch: Touch, *, fixed: bool = False) -> State:
+        """The state after an observation."""
+        one = Felt(self.last + 1, material, touch, fixed)
+        return replace(self, felt=(*self.felt, one), last=self.last + 1)
+
+    @property
+    def loose(self) -> list[Felt]:
+        """What can still be taken back."""
+        return [one for one in self.felt if not one.fixed]
+
+
+@dataclass(frozen=True)
+class Other:
+    """A memory to be merged. felt: what it holds, of which the first `fixed` were compacted. based: any row was."""
+
+    felt: Pairs
+    fixed: int
+    based: bool
+
+
+def after(state: State, operation: Operation, others: dict[str, Other]) -> tuple[State, Any]:
+    """What an operation makes of a state, and what the call returns: JSON, or the name of the InputError it raises."""
+    kind, *rest = operation
+    return _AFTER[kind](state, others, *rest)
+
+
+def _observe(state: State, _: Any, material: str, touch: Touch) -> tuple[State, Any]:
+    then = state.with_one(material, touch)
+    return then, then.last
+
+
+def _batch(state: State, others: dict[str, Other], operations: tuple[Operation, ...]) -> tuple[State, Any]:
+    results = []
+    for one in operations:
+        state, result = after(state, one, others)
+        results.append(result)
+    return state, results
+
+
+def _retract(state: State, _: Any, sequence: int) -> tuple[State, Any]:
+    if sequence not in {one.sequence for one in state.loose}:
+        return state, "ObservationError"
+    return state.without({sequence}), None
+
+
+def _forget(state: State, _: Any, material: str) -> tuple[State, Any]:
+    found = [one for one in state.felt if one.material == material]
+    if not found:
+        return state, "UnknownMaterialError"
+    if any(one.fixed for one in found):
+        return state, "ObservationError"
+    return state.without({one.sequence for one in found}), len(found)
+
+
+def _merge(state: State, others: dict[str, Other], name: str, shared: str) -> tuple[State, Any]:
+    other = others[name]
+    ours = {one.pair for one in state.felt}
+    both = [at for at, pair in enumerate(other.felt) if pair in ours]
+    if shared == "once" and any(at < other.fixed for at in both):
+        return state, "ObservationError"
+    coming = [at for at in range(len(other.felt)) if shared == "twice" or at not in both]
+    state = replace(state, last=state.last + other.based)
+    for at in coming:
+        state = state.with_one(*other.felt[at], fixed=at < other.fixed)
+    return state, [len(coming), len(both)]
+
+
+def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
+    loose = state.loose
+    upto = state.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
+    upto = max(upto, state.base)
+    felt = tuple(replace(one, fixed=one.fixed or one.sequence <= upto) for one in state.felt)
+    return replace(state, felt=felt, base=upto), upto
+
+
+def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
+    digest = tuned_digest(state.pairs)
+    if digest is None:
+        return state, "InputError"
+    return replace(state, tuned=state.pairs, tuned_upto=state.last), digest
+
+
+_AFTER = {
+    "observe": _observe,
+    "batch": _batch,
+    "retract": _retract,
+    "forget": _forget,
+    "merge": _merge,
+    "compact": _compact,
+    "fine_tune": _fine_tune,
+}
+
+
+def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
+    """Do an operation, and return what `after` says of it; others to be merged lie in folder `home`."""
+    kind, *rest = operation
+    try:
+        return _CALLS[kind](learner, home, *rest)
+    except InputError as error:
+        return type(error).__name__
+
+
+def _do_observe(learner: TactileLearner, _: Path, material: str, touch: Touch) -> int:
+    return learner.observe(material, stream(touch)).sequence
+
+
+def _do_batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...]) -> list[Any]:
+    with learner.batch():
+        return [perform(learner, one, home) for one in operations]
+
+
+def _do_merge(learner: TactileLearner, home: Path, name: str, shared: Any) -> list[int]:
+    merged = learner.merge(home / name, shared=shared)
+    return [merged.observations, merged.shared]
+
+
+_CALLS = {
+    "observe": _do_observe,
+    "batch": _do_batch,
+    "retract": lambda learner, _, sequence: learner.retract(sequence),
+    "forget": lambda learner, _, material: learner.forget(material),
+    "merge": _do_merge,
+    "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,
+    "fine_tune": lambda learner, _: learner.fine_tune(epochs=1).digest,
+}
+
+
+def seen(learner: TactileLearner) -> dict[str, Any]:
+    """What can be seen of a learner, as JSON."""
+    memory, store = learner._ledger.memory, learner._ledger.store
+    return {
+        "materials": learner.materials,
+        "digest": learner.digest(),
+        "exemplars": {name: [key.hex() for key in keys] for name, keys in learner.exemplars.items()},
+        "tuned": learner.tuned_digest(),
+        "pool": _pool(learner),
+        "last": memory.sequence,
+        "base": memory.base if store is None else store.compacted,
+    }
+
+
+def _pool(learner: TactileLearner) -> str:
+    digest = hashlib.sha256()
+    for name, key, touch in learner._ledger.memory.pool:
+        digest.update(repr((name, key, touch.sums.tobytes(), touch.pairs.tobytes())).encode())
+    return digest.hexdigest()
+
+
+def expected(state: State) -> dict[str, Any]:
+    """What must be seen of a learner in this state."""
+    counted = dict(sorted(Counter(one.material for one in state.felt).items()))
+    tuned = None if state.tuned is None else tuned_digest(state.tuned)
+    return _felt(state.pairs) | {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base}
+
+
+def _taught(pairs: Pairs) -> TactileLearner:
+    learner = TactileLearner(**settings())
+    for material, touch in pairs:
+        learner.observe(material, stream(touch))
+    return learner
+
+
+@functools.lru_cache(maxsize=4096)
+def _felt(pairs: Pairs) -> dict[str, Any]:
+    return seen(_taught(pairs))
+
+
+@functools.lru_cache(maxsize=4096)
+def tuned_digest(pairs: Pairs) -> str | None:
+    """The digest of the f* that is made from touches; None where none can be."""
+    try:
+        return _taught(pairs).fine_tune(epochs=1).digest
+    except InputError:
+        return None

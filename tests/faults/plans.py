@@ -1,0 +1,77 @@
+"""Random operations on a memory, and the small memories that are merged into it."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened, stream
+
+KINDS = ("observe", "batch", "retract", "forget", "merge", "compact", "fine_tune")
+
+# Few touches, so that the same stream is felt again, by this memory and by those merged into it.
+SEEDS = 6
+
+
+def touch(rng: random.Random) -> Touch:
+    """A random touch."""
+    return rng.randrange(SEEDS), rng.choice(LENGTHS)
+
+
+def prepare(home: Path) -> dict[str, Other]:
+    """Make the memories to be merged in folder `home`: as observed, with some taken back, and compacted."""
+    rng = random.Random(17)
+    others = {}
+    for name, count, taken, keep in (("plain", 3, (), None), ("taken", 4, (1,), None), ("compacted", 4, (0,), 2)):
+        felt = [(rng.choice(MATERIALS), touch(rng)) for _ in range(count)]
+        with opened(home / name) as learner:
+            receipts = [learner.observe(material, stream(one)) for material, one in felt]
+            for at in taken:
+                learner.retract(receipts[at])
+            left = tuple(one for at, one in enumerate(felt) if at not in taken)
+            if keep is not None:
+                learner.compact(keep=keep)
+            fixed = 0 if keep is None else max(0, len(left) - keep)
+            others[name] = Other(left, fixed, learner._ledger.memory.base > 0)
+    return others
+
+
+def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) -> Operation:
+    """A random operation of a kind; now and then one that is refused."""
+    if kind == "observe":
+        return kind, rng.choice(MATERIALS), touch(rng)
+    if kind == "batch":
+        return kind, _together(rng, state, others)
+    if kind in ("retract", "forget"):
+        return kind, _to_take_back(rng, state, kind)
+    if kind == "merge":
+        return kind, rng.choice(sorted(others)), rng.choice(("twice", "once"))
+    return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)
+
+
+def _to_take_back(rng: random.Random, state: State, kind: str) -> int | str:
+    """A sequence, or a material."""
+    loose: list[int] | list[str] = [one.sequence for one in state.loose]
+    if kind == "forget":
+        loose = sorted({one.material for one in state.felt} - {one.material for one in state.felt if one.fixed})
+    if loose and rng.random() < 0.95:
+        return rng.choice(loose)
+    return rng.choice(MATERIALS) if kind == "forget" else state.last + 3
+
+
+def _together(rng: random.Random, state: State, others: dict[str, Other]) -> tuple[Operation, ...]:
+    operations: list[Operation] = []
+    for _ in range(rng.randrange(1, 7)):
+        kind = rng.choice(("observe", "observe", "observe", "retract", "forget"))
+        operations.append(draw(rng, state, others, kind))
+        state, _ = after(state, operations[-1], others)
+    return tuple(operations)
+
+
+def history(rng: random.Random, state: State, others: dict[str, Other], kinds: list[str]) -> list[Operation]:
+    """Random operations of these kinds, one after another."""
+    operations = []
+    for kind in kinds:
+        operations.append(draw(rng, state, others, kind))
+        state, _ = after(state, operations[-1], others)
+    return operations

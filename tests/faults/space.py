@@ -1,0 +1,126 @@
+"""What a memory takes on the disk, and how long one of a million observations takes to open: `python
+tests/faults/space.py --observations 1000000`.
+
+With the default kernels and simulated BioTac touches: bytes of an observation (a row of the journal), of a material
+and of an exemplar (in each generation, of which two are kept), before and after compaction. Then synthetic features
+of 64 dimensions, in batches of 10 000, without exemplars; compacted; opened three times, each in a fresh process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from faults.common import file_system, folder, parser, progress, run
+from faults.feeding import BIOTAC, TINY, endless, observe, touches
+from scroll_tactile import TactileLearner
+
+BATCH = 10_000
+BAR = 2.0  # seconds to open
+
+OPEN = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from faults.feeding import TINY
+from scroll_tactile import TactileLearner
+begun = time.perf_counter()
+learner = TactileLearner.open({path!r}, exemplars=0, **TINY)
+print(time.perf_counter() - begun, learner.digest())
+learner.close()
+"""
+
+
+def sizes(path: Path, materials: int, of_each: int, exemplars: int | None, keep: int | None = None) -> dict[str, int]:
+    """Bytes of the journal and of the newest generation of a memory, after it was closed."""
+    fed = islice(endless(touches(BIOTAC, materials, 1)), materials * of_each)
+    with TactileLearner.open(path, **BIOTAC, exemplars=exemplars) as learner:
+        with learner.batch():
+            for one in fed:
+                observe(learner, one)
+        if keep is not None:
+            learner.compact(keep=keep)
+    generations = sorted((path / "generations").iterdir())
+    return {
+        "journal": (path / "journal.sqlite").stat().st_size,
+        "generation": sum(file.stat().st_size for file in generations[-1].rglob("*") if file.is_file()),
+        "all": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
+    }
+
+
+def apiece(home: Path, count: int) -> dict[str, float]:
+    """Bytes of one more of each."""
+    few, many = sizes(home / "1", 2, count, 0), sizes(home / "2", 2, 2 * count, 0)
+    raw = sizes(home / "3", 2, 2 * count, None)
+    more = sizes(home / "4", 8, count // 2, 0)
+    compacted = sizes(home / "5", 2, 2 * count, None, keep=0)
+    bare = sizes(home / "6", 2, 2 * count, 0, keep=0)
+    kept = min(4 * count, 1200)  # three candidates for each of 400 exemplars
+    return {
+        "an observation, without readings": (many["journal"] - few["journal"]) / (2 * count),
+        "an observation, with readings": raw["journal"] / (4 * count),
+        "a material, in a generation": (more["generation"] - few["generation"]) / 6,
+        "a candidate for an exemplar, in a generation": (raw["generation"] - many["generation"]) / kept,
+        f"all of {4 * count} observations": raw["all"],
+        "the same, compacted": compacted["all"],
+        "an observation, compacted (what is known of it)": bare["journal"] / (4 * count),
+    }
+
+
+def million(home: Path, observations: int, minutes: float) -> dict[str, Any]:
+    """A large memory: as many observations as asked, or as fit into the time."""
+    path, figures = home / "large", {"asked": observations}
+    feed = endless(touches(TINY, 20, 10))
+    begun, done = time.perf_counter(), 0
+    with TactileLearner.open(path, **TINY, exemplars=0) as learner:
+        while done < observations and time.perf_counter() - begun < 60 * minutes:
+            fed = list(islice(feed, min(BATCH, observations - done)))
+            with learner.batch():
+                for one in fed:
+                    observe(learner, one)
+            done += len(fed)
+            progress(f"{done} observations, {done / (time.perf_counter() - begun):.0f} a second")
+        figures |= {"observations": done, "a second": done / (time.perf_counter() - begun)}
+        begun = time.perf_counter()
+        compacted = learner.compact(keep=0)
+        figures |= {
+            "seconds to compact": time.perf_counter() - begun,
+            "bytes before": compacted.bytes_before,
+            "bytes after": compacted.bytes_after,
+        }
+        digest = learner.digest()
+    command = OPEN.format(tests=str(Path(__file__).resolve().parents[1]), path=str(path))
+    figures["seconds to open"] = []
+    for _ in range(3):
+        said = subprocess.run(
+            [sys.executable, "-c", command], check=True, capture_output=True, text=True
+        ).stdout.split()
+        figures["seconds to open"].append(float(said[0]))
+        figures["digest is the same"] = said[1] == digest
+    return figures
+
+
+def main(options: argparse.Namespace) -> dict[str, Any]:
+    """Both."""
+    observations, count = (500, 2) if options.quick else (options.observations, 100)
+    with folder(options) as home:
+        figures: dict[str, Any] = {"disk": file_system(home), "load before": os.getloadavg()[0]}
+        figures["bytes"] = apiece(home, count)
+        progress(str(figures["bytes"]))
+        figures["large"] = large = million(home, observations, options.minutes)
+        figures["load after"] = os.getloadavg()[0]
+    failures = [f"opened in {took:.2f} s" for took in large["seconds to open"] if took > BAR]
+    if not large["digest is the same"]:
+        failures.append("the large memory is not what it was when it is opened again")
+    return figures | {"failures": failures}
+
+
+if __name__ == "__main__":
+    run("space", parser(__doc__, observations=1_000_000, minutes=8.0).parse_args(), main)

@@ -159,12 +159,21 @@ class Memory:
         touches = {(material, key): touch for material, key, touch in self.pool}
         kept = {(one.material, one.key): one for one in self.exemplars or ()}
         fresh = Memory(self.statistics.dimension, self.reading, self.capacity)
-        if (base := store.base()) is not None:
+        base = store.base()
+        if base is not None:
             fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
-        for head in store.heads(after=self.base, kind=MERGE):
+        if self.base != (base.upto if base is not None else 0):
+            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+        # No further than was read: a writer may have gone on since.
+        merged = [one for one in store.heads(self.base, kind=MERGE) if one.sequence <= self.sequence]
+        for head in merged:
             record = store.record(head.sequence)
             fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
-        heads = [one for one in store.heads(self.base, kind=OBSERVE) if one.sequence not in self.withdrawn]
+        heads = [
+            one
+            for one in store.heads(self.base, kind=OBSERVE)
+            if one.sequence <= self.sequence and one.sequence not in self.withdrawn
+        ]
         felt = [(one.label, one.key, cast(int, one.attributes.get("nbytes", 0)), one.sequence) for one in heads]
 
         def touch(material: str, key: bytes, sequence: int) -> Touch:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,5 +72,7 @@ class WriterLock:
     def release(self) -> None:
         """Let the next writer in; a second call does nothing."""
         if self._lock.is_locked:
-            (self._folder / HOLDER_FILE).unlink(missing_ok=True)
+            # A note that cannot be removed, on a disk that became read-only, must not keep the lock.
+            with suppress(OSError):
+                (self._folder / HOLDER_FILE).unlink(missing_ok=True)
             self._lock.release()

@@ -1,5 +1,6 @@
 """Who may open what: one writer, any readers, and nothing that is not a store of ours."""
 
+import errno
 import json
 import multiprocessing
 import os
@@ -350,3 +351,20 @@ def test_sizes_are_those_on_the_disk(tmp_path):
         assert found["journal"] == sum(path.stat().st_size for path in tmp_path.glob("journal.sqlite*"))
         files = [path for path in (tmp_path / "generations").rglob("*") if path.is_file()]
         assert found["generations"] == sum(path.stat().st_size for path in files) > 0
+
+
+def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_path, monkeypatch):
+    opened = Store.open(tmp_path / "s", identity={})
+    opened.append("a", "b", b"")
+
+    def read_only(self, missing_ok=False):
+        raise OSError(errno.EROFS, "Read-only file system", str(self))
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "unlink", read_only)
+        broken.setattr("store.generations._write_group", lambda *_: read_only(tmp_path))
+        with pytest.raises(StoreError):
+            opened.commit({}, upto=1)
+        opened.close()
+    with Store.open(tmp_path / "s") as again:
+        assert again.last == 1

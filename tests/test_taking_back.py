@@ -16,7 +16,7 @@ from scroll_tactile.errors import (
     UnknownMaterialError,
 )
 from scroll_tactile.streams import validate
-from store import LockedError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
+from store import CompactedError, LockedError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
 
 FELT = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
 
@@ -533,3 +533,24 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
             learner.retract(receipts[0])
         learner.retract(receipts[-1])
         require_same(learner, without(11))
+
+
+def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(path):
+    learner, receipts = filled(path)
+    with learner:
+        learner.retract(receipts[0])
+        reader = TactileLearner.open(path, mode="read", **SETTINGS)
+        with reader:
+            require_same(reader, without(0))
+            learner.observe("d", stream((9, 60)))
+            learner.retract(receipts[1])
+            memory = reader._memory
+            memory._stale = True  # as when the retraction is replayed while the writer goes on
+            memory.refill(reader._ledger.store)
+            require_same(reader, without(0))
+            learner.compact()
+            memory._stale = True
+            with pytest.raises(CompactedError):
+                memory.refill(reader._ledger.store)
+            reader.refresh()
+            require_same(reader, [*without(0, 1), ("d", (9, 60))])

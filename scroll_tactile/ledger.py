@@ -166,7 +166,8 @@ class Ledger:
         return len(found)
 
     def _withdraw(self, store: Store, sequences: list[int], material: str) -> None:
-        # Verified before it is written down that they are taken back: a damaged one would stop every opening.
+        # Verified before it is written down that they are taken back: what is damaged could not be looked at again.
+        store.base()
         for sequence in sequences:
             store.record(sequence)
         self._whole = False

@@ -19,7 +19,7 @@ from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.tuned import Tuned
 from scroll_tactile.windows import Reading
-from store import CompactedError, Record, Store
+from store import CompactedError, DamageError, Record, Store
 
 __all__ = [
     "FELT",
@@ -158,12 +158,7 @@ class Memory:
             return
         touches = {(material, key): touch for material, key, touch in self.pool}
         kept = {(one.material, one.key): one for one in self.exemplars or ()}
-        fresh = Memory(self.statistics.dimension, self.reading, self.capacity)
-        base = store.base()
-        if base is not None:
-            fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
-        if self.base != (base.upto if base is not None else 0):
-            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+        fresh = self._base_samples(store)
         # No further than was read: a writer may have gone on since.
         merged = [one for one in store.heads(self.base, kind=MERGE) if one.sequence <= self.sequence]
         for head in merged:
@@ -188,6 +183,34 @@ class Memory:
             fresh.exemplars.refill((one for one in felt if one[2]), exemplar)
             self.exemplars = fresh.exemplars
         self._stale = False
+
+    def _base_samples(self, store: Store) -> Memory:
+        """A memory with pool and exemplars of the base, empty ones without a base."""
+        fresh = Memory(self.statistics.dimension, self.reading, self.capacity)
+        if store.compacted != self.base:
+            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+        try:
+            base = store.base()
+        except DamageError as damage:
+            # Statistics need no base. Not to open for the samples' sake would lose more than they are.
+            logger.warning(
+                "%s; of what was compacted pool and exemplars now hold only what they held: repair it (scroll-tactile "
+                "memory repair)",
+                damage,
+            )
+            kinds = (OBSERVE, FELT)
+            compacted = {
+                (one.label, one.key) for one in store.heads() if one.sequence <= self.base and one.kind in kinds
+            }
+            fresh.pool.update({}, ((name, key, one, 0) for name, key, one in self.pool if (name, key) in compacted))
+            if fresh.exemplars is not None:
+                for one in self.exemplars or ():
+                    if (one.material, one.key) in compacted:
+                        fresh.exemplars.add(one)
+            return fresh
+        if base is not None:
+            fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
+        return fresh
 
     def _touch(self, record: Record) -> Touch:
         columns = cast(int, record.attributes["columns"])

@@ -16,7 +16,16 @@ from scroll_tactile.errors import (
     UnknownMaterialError,
 )
 from scroll_tactile.streams import validate
-from store import CompactedError, LockedError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
+from store import (
+    CompactedError,
+    DamageError,
+    LockedError,
+    ReadOnlyError,
+    Store,
+    StoreError,
+    StoreFullError,
+    repair_store,
+)
 
 FELT = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
 
@@ -554,3 +563,45 @@ def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(p
                 memory.refill(reader._ledger.store)
             reader.refresh()
             require_same(reader, [*without(0, 1), ("d", (9, 60))])
+
+
+def spoil(path, number):
+    """Damage a generation's array on the disk."""
+    (path / "generations" / f"{number:08d}" / "observations" / "c" / "0" / "0").unlink()
+
+
+def test_with_a_damaged_base_nothing_is_taken_back(path):
+    learner, receipts = filled(path)
+    with learner:
+        learner.compact(keep=6)
+        base = learner._ledger.store.base().number
+        spoil(path, base)
+        for call in (lambda: learner.retract(receipts[-1]), lambda: learner.forget("a")):
+            with pytest.raises((DamageError, ObservationError)):
+                call()
+        require_same(learner, FELT)
+        learner.observe("a", stream((9, 60)))
+    with TactileLearner.open(path, **SETTINGS) as again:
+        require_same(again, [*FELT, ("a", (9, 60))])
+
+
+def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
+    learner, receipts = filled(path)
+    learner.compact(keep=6)
+    learner.retract(receipts[-1])
+    learner.retract(receipts[-4])
+    base = learner._ledger.store.base().number
+    learner._ledger.store.close()  # as if the power failed: the retractions are to be replayed
+    spoil(path, base)
+    with TactileLearner.open(path, **SETTINGS) as again:
+        whole = fed(without(11, 8))
+        assert again.digest() == whole.digest()
+        assert again.materials == whole.materials
+        for at in (11, 8):
+            gone = FELT[at][0], learner_key(FELT[at])
+            assert gone not in {(one.material, one.key) for one in again._memory.exemplars}
+            assert gone not in {(name, key) for name, key, _ in again._memory.pool}
+    assert "pool and exemplars now hold only what they held" in caplog.text
+    assert repair_store(path).lost
+    with TactileLearner.open(path, **SETTINGS) as again:
+        assert again.digest() == whole.digest()

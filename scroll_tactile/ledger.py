@@ -45,7 +45,7 @@ class Ledger:
         self.added: list[Added] | None = []
         self._load = load
         self._memory = load()
-        self._saved = self._memory.sequence
+        self._saved = self._memory.saved
         self._closed = False
         self._whole = True
         self._batching = False

@@ -70,6 +70,7 @@ class Memory:
     excluded: of a base, the sequences up to it that had been taken back when it was made.
     taken_back: how often anything was, since it was loaded.
     base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
+    saved: the last sequence that a generation is known to hold.
     """
 
     def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
@@ -84,6 +85,7 @@ class Memory:
         self.excluded: set[int] = set()
         self.base = 0
         self.generation: int | None = None
+        self.saved = 0
         self.sequence = 0
         self.taken_back = 0
         self._stale = False
@@ -272,7 +274,8 @@ class Memory:
         generation = store.latest() or store.base()
         if generation is not None:
             memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
-            memory.sequence, memory.generation = generation.upto, generation.number
+            memory.sequence = memory.saved = generation.upto
+            memory.generation = generation.number
         replayed = memory.catch_up(store)
         logger.info(
             "%s: generation %s, %d rows of the journal replayed, %d compacted",

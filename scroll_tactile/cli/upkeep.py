@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,9 +12,10 @@ import typer
 from rich.markup import escape
 
 from scroll_tactile.cli.terminal import Commands, progress_bar, say
+from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.pipelines.memories import open_for_upkeep
 from scroll_tactile.plain import export_plain
-from store import check_store, repair_store
+from store import StoreError, check_store, repair_store
 
 __all__ = ["memory"]
 
@@ -52,6 +54,9 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 @memory.command()
 def repair(folder: MemoryFolder) -> None:
     """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
+    # Where it can still be opened, what it knows is written down first: a repair may give up what led to it.
+    with suppress(ScrollTactileError, StoreError), open_for_upkeep(folder):
+        pass
     with progress_bar() as progress:
         done = repair_store(folder, progress=progress)
     for what in done.lost:

@@ -15,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from scroll_tactile import Sensor, TactileLearner
 from scroll_tactile.bench.timing import circumstances
+from scroll_tactile.learner import TactileLearner
 from scroll_tactile.ridge.readouts import fit_readout
 from scroll_tactile.ridge.selection import DEFAULT, task_of
 from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.ridge.tracking import Tracked
+from scroll_tactile.sensors import Sensor
 
 __all__ = ["run_interleaved"]
 

@@ -10,7 +10,8 @@ Of a memory that was closed, and of one left as after a crash, with a log. Each 
 Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Of a
 damaged log SQLite drops the end (FORMAT.md): where the memory is then as it was at an earlier instant, without a
 word, that is counted apart. So is a damaged row of a base: what was compacted is then not known. An f* in a damaged
-generation is gone, with the warning, where an older one is taken.
+generation is gone, with the warning, where an older one is taken; and with a damaged base, with a warning, exemplars
+are those that are left.
 """
 
 from __future__ import annotations
@@ -198,8 +199,11 @@ class Flipping:
             return "warned and right" if warned else "right", memory.state
         if found | {"base": 0} == told | {"base": 0}:
             return "right, but what was compacted is not known", memory.state
-        if warned and found | {"tuned": None} == told | {"tuned": None}:
+        differ = {key for key in found if found[key] != told[key]}
+        if warned and differ == {"tuned"}:
             return "warned, and f* is gone", None
+        if warned and differ <= {"exemplars", "pool"} and kind.startswith("base"):
+            return "warned, and samples could not be chosen again", None
         if kind.endswith("-wal") and any(found == expected(state) for state in memory.earlier):
             return "the end of the log dropped" + (", warned" if warned else ", in silence"), None
         return None

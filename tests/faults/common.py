@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import logging
 import os
@@ -13,6 +14,7 @@ import sqlite3
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -85,6 +87,18 @@ def warnings_told(hear: Callable[[str], object]) -> Iterator[None]:
         for logger in loggers:
             logger.removeHandler(heard)
             logger.propagate = True
+
+
+def quiet_coroutines() -> None:
+    """Say nothing of the coroutines that zarr leaves behind where the one before them failed."""
+    warnings.filterwarnings("ignore", message="coroutine .* was never awaited")
+    told = sys.unraisablehook
+
+    def others(about: Any) -> None:
+        if not inspect.iscoroutine(about.object):
+            told(about)
+
+    sys.unraisablehook = others
 
 
 def _machine() -> dict[str, Any]:

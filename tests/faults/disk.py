@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import scroll_tactile.ledger
 from faults import shim as watch
-from faults.common import folder, parser, progress, run, warnings_told
+from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
 from faults.model import Operation, State, after, expected, opened, perform, seen, warm
 from faults.plans import prepare
 from faults.shim import Shim
@@ -218,6 +218,7 @@ def from_now_on(bench: Bench, path: Path, name: str, error: int, allowed: tuple[
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """All of it; what needs a mount is left out where there may be none."""
+    quiet_coroutines()
     warm()
     skipped = []
     with folder(options, in_memory=True) as home:

@@ -20,7 +20,6 @@ import argparse
 import errno
 import shutil
 import sys
-import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -32,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import scroll_tactile.ledger
 from faults import shim as watch
-from faults.common import folder, parser, progress, run, warnings_told
+from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
 from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, warm
 from faults.plans import prepare
 from faults.shim import Shim
@@ -311,8 +310,7 @@ class Trial:
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """Every call of every step, or every so-many-th."""
     every = 200 if options.quick else options.every
-    # zarr leaves coroutines behind when the one before them fails.
-    warnings.filterwarnings("ignore", message="coroutine .* was never awaited")
+    quiet_coroutines()
     one_scale()
     warm()
     with folder(options, in_memory=True) as home, Zygote() as zygote:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from hypothesis import HealthCheck, Phase, seed, settings  # noqa: E402  # after the path to the tests
-from hypothesis.stateful import run_state_machine_as_test  # noqa: E402
-from test_learner_machine import History  # noqa: E402
+from hypothesis import HealthCheck, Phase, seed, settings  # after the path to the tests
+from hypothesis.stateful import run_state_machine_as_test
+from test_learner_machine import History
 
 LENGTH = 50
 
@@ -24,6 +24,8 @@ def main() -> dict[str, int]:
     class Counted(History):
         def agrees(self) -> None:
             done["steps"] += 1
+            if done["steps"] % 1000 == 0:
+                print(done, flush=True)
             super().agrees()
 
         def teardown(self) -> None:

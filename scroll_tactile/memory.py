@@ -43,7 +43,7 @@ OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kep
 RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
 MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
 FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
-ATTEMPTS = 5
+ATTEMPTS = 20
 LARGE = 2**13  # codes
 READINGS = "readings"  # the array of a row that keeps a stream raw
 Codes = dict[int, npt.NDArray[np.int32]]
@@ -260,10 +260,14 @@ class Memory:
     def load(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None = None) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
+            newest = store.newest
             try:
-                return cls._loaded(store, dimension, reading, capacity)
+                memory = cls._loaded(store, dimension, reading, capacity)
             except CompactedError:  # a writer compacted it between two looks of this reader
                 continue
+            # A generation that came between the looks may hold an f* from before the rows that were read.
+            if store.newest == newest:
+                return memory
         return cls._loaded(store, dimension, reading, capacity)
 
     @classmethod

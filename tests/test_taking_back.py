@@ -605,3 +605,23 @@ def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
     assert repair_store(path).lost
     with TactileLearner.open(path, **SETTINGS) as again:
         assert again.digest() == whole.digest()
+
+
+def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
+    learner, _ = filled(path)
+    learner.fine_tune(epochs=1)
+    latest, looks = Store.latest, []
+
+    def slow(store):
+        found = latest(store)
+        if store.mode == "read" and not looks:
+            looks.append(1)  # between the reader's two looks the writer goes on
+            learner.observe("a", stream((8, 60)))
+            learner.fine_tune(epochs=1)
+            learner.observe("b", stream((9, 60)))
+        return found
+
+    monkeypatch.setattr(Store, "latest", slow)
+    with learner, TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+        require_same(reader, [*FELT, ("a", (8, 60)), ("b", (9, 60))])
+        assert reader.tuned_digest() == learner.tuned_digest()

@@ -34,7 +34,7 @@ doubles = st.floats(allow_nan=False, allow_infinity=False)
 moderate = st.floats(-1e6, 1e6, allow_subnormal=False)
 # Codes and their neighbours: values of one limb, of two, of none.
 codes = st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0, 2.0**-20, 1 - 2.0**-20, 2.0**-21, 2.0, 1e-3])
-few = settings(max_examples=400, deadline=None)
+few = settings(max_examples=60, deadline=None)
 
 
 def table(values, columns):

@@ -52,6 +52,6 @@ with tempfile.TemporaryDirectory() as folder:
     with TactileLearner.open(left) as learner:
         learner.merge(right, shared="once")
         print(f"put together, the same bytes: {learner.digest() == expected}")
-        slip = learner.observe(scene.materials[0], scene.touch("something else", 0))
+        slip = learner.observe(scene.materials[0], scene.touch(scene.materials[9], 0))
         learner.retract(slip)
         print(f"a slip taken back, the same bytes: {learner.digest() == expected}")

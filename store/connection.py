@@ -42,6 +42,10 @@ def connect(path: Path, *, write: bool) -> sqlite3.Connection:
             (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
             if mode != b"wal":
                 raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")
+            # Where opening to write fails, SQLite opens to read and says nothing until something is written.
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute("DELETE FROM meta WHERE 0")
+            connection.execute("ROLLBACK")
     except BaseException:
         connection.close()
         raise

@@ -368,3 +368,19 @@ def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_p
         opened.close()
     with Store.open(tmp_path / "s") as again:
         assert again.last == 1
+
+
+def test_a_journal_that_sqlite_could_only_open_to_read_is_not_opened_to_write(tmp_path, monkeypatch):
+    Store.open(tmp_path / "s", identity={}).close()
+    connect = sqlite3.connect
+
+    def read_only(database, **options):
+        # As SQLite does by itself where opening the file to write fails.
+        return connect(database.replace("mode=rw", "mode=ro"), **options)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(sqlite3, "connect", read_only)
+        with pytest.raises(ReadOnlyError, match="may not be written while opening the journal"):
+            Store.open(tmp_path / "s")
+    with Store.open(tmp_path / "s") as again:
+        assert again.append("a", "b", b"").sequence == 1

@@ -309,7 +309,7 @@ class Trial:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """Every call of every step, or every so-many-th."""
-    every = 200 if options.quick else options.every
+    every = 400 if options.quick else options.every
     quiet_coroutines()
     one_scale()
     warm()

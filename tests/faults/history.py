@@ -7,7 +7,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from hypothesis import HealthCheck, Phase, seed, settings  # after the path to the tests
-from hypothesis.stateful import run_state_machine_as_test
+from hypothesis.stateful import invariant, run_state_machine_as_test
 from test_learner_machine import History
 
 LENGTH = 50
@@ -22,11 +22,11 @@ def main() -> dict[str, int]:
     done = {"steps": 0, "histories": 0}
 
     class Counted(History):
-        def agrees(self) -> None:
+        @invariant()
+        def counted(self) -> None:
             done["steps"] += 1
             if done["steps"] % 1000 == 0:
                 print(done, flush=True)
-            super().agrees()
 
         def teardown(self) -> None:
             done["histories"] += 1

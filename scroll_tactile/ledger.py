@@ -99,10 +99,13 @@ class Ledger:
             raise InputError("no generation can be written in a batch: end it first")
         if self.store.mode == "read":
             raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
+        self._pass_over_failures(self.store)
+
+    def _pass_over_failures(self, store: Store) -> None:
         try:
-            self.store.flush()
+            store.flush()
         except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
-            logger.warning("%s: no generation could be written: %s", self.store.path, error)
+            logger.warning("%s: no generation could be written: %s", store.path, error)
 
     def observe(self, material: str, felt: Stream, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> Receipt:
         """Write an observation down, then add it."""
@@ -166,16 +169,24 @@ class Ledger:
         return len(found)
 
     def _withdraw(self, store: Store, sequences: list[int], material: str) -> None:
-        # Verified before it is written down that they are taken back: what is damaged could not be looked at again.
+        # In the memory first: what that reads again may be damaged, and once it is written down that they are taken
+        # back, every opening would have to read it.
         store.base()
-        for sequence in sequences:
-            store.record(sequence)
+        memory, taken = self._memory, [store.record(sequence) for sequence in sequences]
+        before = memory.pool, memory.exemplars, memory.tuned
         self._whole = False
-        row = self._appended(store, RETRACT, material, b"", {"sequences": spans(sequences)}, {})
-        for sequence in sequences:
-            self._memory.withdraw(store.record(sequence))
-        self._memory.refill(store)
-        self._memory.sequence = row
+        try:
+            for record in taken:
+                memory.withdraw(record)
+            memory.refill(store)
+            row = self._appended(store, RETRACT, material, b"", {"sequences": spans(sequences)}, {})
+        except StoreError:
+            for record in taken:
+                memory.put_back(record)
+            memory.pool, memory.exemplars, memory.tuned = before
+            self._whole = not self._batching
+            raise
+        memory.sequence = row
         self._changed()
         self._snapshot_if_due()
 
@@ -305,6 +316,7 @@ class Ledger:
             try:
                 # Half a change is never saved: the journal has the whole of it, or nothing.
                 if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
+                    self._pass_over_failures(store)
                     self._snapshot()
             finally:
                 store.close()

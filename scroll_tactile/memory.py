@@ -154,6 +154,13 @@ class Memory:
         if record.sequence <= self.tuned_upto:
             self.tuned = None
 
+    def put_back(self, record: Record) -> None:
+        """Undo `withdraw` in the sums, exactly; the samples and f* are the caller's to put back."""
+        columns = cast(int, record.attributes["columns"])
+        self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), columns)
+        self.withdrawn.discard(record.sequence)
+        self._stale = False
+
     def refill(self, store: Store) -> None:
         """Choose pool and exemplars again, as if what was withdrawn had never been felt, where that can matter."""
         if not self._stale:

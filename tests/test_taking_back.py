@@ -1,10 +1,12 @@
 """What was observed is taken back, brought together, made small and made durable in bulk: exactly."""
 
+import sqlite3
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
-from test_learner_machine import PAD, SETTINGS, SMALL, fed, require_same, stream
+from test_learner_machine import PAD, SETTINGS, SMALL, SmallPool, fed, require_same, stream
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import (
@@ -625,3 +627,22 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
     with learner, TactileLearner.open(path, mode="read", **SETTINGS) as reader:
         require_same(reader, [*FELT, ("a", (8, 60)), ("b", (9, 60))])
         assert reader.tuned_digest() == learner.tuned_digest()
+
+
+@pytest.mark.parametrize("at", range(12))
+def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, monkeypatch):
+    monkeypatch.setattr("scroll_tactile.memory.Pool", SmallPool)
+    felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]
+    learner, receipts = filled(path, felt)
+    with learner:
+        with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+            connection.execute("UPDATE payload SET bytes = x'00' WHERE sequence > 12")
+        left = felt
+        try:
+            learner.retract(receipts[at])
+            left = felt[:at] + felt[at + 1 :]
+        except DamageError as damage:
+            assert "fail their checksum" in str(damage)
+        require_same(learner, left)
+    with TactileLearner.open(path, **SETTINGS) as again:
+        require_same(again, left)

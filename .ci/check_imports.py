@@ -18,7 +18,7 @@ LAYERS = [
     {"images", "windows", "prediction", "requests"},
     {"augment"},
     {"embeddings", "ridge"},
-    {"exemplars", "tuned"},
+    {"exemplars", "tuned", "packing"},
     {"memory", "tuning"},
     {"model", "identity", "history"},
     {"training", "following"},

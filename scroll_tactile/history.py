@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory import FELT, MERGE, OBSERVE, RETRACT, Memory, unspanned
+from scroll_tactile.memory import FELT, MERGE, OBSERVE, RETRACT, Memory
+from scroll_tactile.packing import unspanned
 from scroll_tactile.prediction import Receipt
 from store import Head, Record, Store
 
-__all__ = ["Incoming", "compaction_point", "observation_of", "observations_of"]
+__all__ = ["Incoming", "compaction_point", "observation_of", "observations_of", "withdrawn_in"]
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
@@ -48,8 +49,7 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
     felt = memory.statistics.materials.get(material, 0)
     if not felt:
         raise UnknownMaterialError(f"{material!r} was never felt; felt were {list(memory.statistics.materials)[:30]}")
-    rows = store.heads(memory.base, kind=OBSERVE, label=material)
-    found = [head.sequence for head in rows if head.sequence not in memory.withdrawn]
+    found = [head.sequence for head in memory.retractable(store, material)]
     if len(found) != felt:
         raise ObservationError(
             f"{material!r} cannot be forgotten: {felt - len(found)} of its {felt} observations in {store.path} were "
@@ -64,8 +64,7 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     if keep == 0:
         return store.last
-    rows = store.heads(memory.base, kind=OBSERVE)
-    sequences = [head.sequence for head in rows if head.sequence not in memory.withdrawn]
+    sequences = [head.sequence for head in memory.retractable(store)]
     return memory.base if len(sequences) <= keep else sequences[-keep] - 1
 
 
@@ -88,16 +87,8 @@ class Incoming:
         theirs cannot be a part of ours, ObservationError where a shared one cannot be left out.
         """
         _require_mergeable(ours, memory, theirs)
-        withdrawn = _withdrawn(theirs)
-        base = theirs.compacted
-        there = [head for head in theirs.heads() if head.kind in (OBSERVE, MERGE, FELT)]
-        there = [head for head in there if head.sequence not in withdrawn]
-        gone = _withdrawn(ours)
-        known = {
-            (head.label, head.key)
-            for head in ours.heads()
-            if head.kind in (OBSERVE, FELT) and head.sequence not in gone
-        }
+        base, there = theirs.compacted, _standing(theirs)
+        known = {(head.label, head.key) for head in _standing(ours) if head.kind != MERGE}
         both = [head for head in there if head.kind != MERGE and (head.label, head.key) in known]
         fixed = [head for head in both if head.sequence <= base or head.kind == FELT]
         if once and fixed:
@@ -134,7 +125,7 @@ class Incoming:
         if base is not None:
             attributes = {name: value for name, value in base.attributes.items() if not name.startswith("tuned")}
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
-            yield MERGE, "", b"", attributes, arrays, _first_time(self.rows)
+            yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
         for head in self.rows:
             if base is not None and head.sequence <= base.upto:
                 if head.kind != MERGE:  # a merge before the base is a part of it
@@ -144,13 +135,16 @@ class Incoming:
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
 
 
-def _first_time(rows: list[Head]) -> float | None:
-    return rows[0].time if rows else None
+def withdrawn_in(heads: Iterable[Head]) -> set[int]:
+    """All sequences that these rows took back."""
+    return {at for head in heads if head.kind == RETRACT for at in unspanned(head.attributes["sequences"])}
 
 
-def _withdrawn(store: Store) -> set[int]:
-    """All sequences that were ever taken back."""
-    return {sequence for head in store.heads(kind=RETRACT) for sequence in unspanned(head.attributes["sequences"])}
+def _standing(store: Store) -> list[Head]:
+    """The rows by which anything is known, compacted ones too, without what was ever taken back."""
+    heads = list(store.heads())
+    gone = withdrawn_in(heads)
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, FELT) and head.sequence not in gone]
 
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:

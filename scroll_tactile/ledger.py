@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +15,12 @@ import numpy.typing as npt
 from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
 from scroll_tactile.following import Added
 from scroll_tactile.history import Incoming, compaction_point, observation_of, observations_of
-from scroll_tactile.memory import OBSERVE, READINGS, RETRACT, Memory, give_back_scratch, pack_codes, spans
+from scroll_tactile.memory import OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
+from scroll_tactile.packing import Codes, pack_codes, spans
 from scroll_tactile.prediction import Compacted, Merged, Receipt
 from scroll_tactile.streams import Stream
 from scroll_tactile.tuned import Tuned
-from store import ReadOnlyError, Store, StoreClosedError, StoreError
+from store import ReadOnlyError, Record, Store, StoreClosedError, StoreError
 
 __all__ = ["Ledger"]
 
@@ -107,7 +108,7 @@ class Ledger:
         except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
             logger.warning("%s: no generation could be written: %s", store.path, error)
 
-    def observe(self, material: str, felt: Stream, columns: int, codes: dict[int, npt.NDArray[np.int32]]) -> Receipt:
+    def observe(self, material: str, felt: Stream, columns: int, codes: Codes) -> Receipt:
         """Write an observation down, then add it."""
         with self.lock:
             self.require_open()
@@ -127,7 +128,7 @@ class Ledger:
         material: str,
         key: bytes,
         columns: int,
-        codes: dict[int, npt.NDArray[np.int32]],
+        codes: Codes,
         readings: npt.NDArray[np.float32] | None,
     ) -> int:
         if self.store is None:
@@ -136,19 +137,8 @@ class Ledger:
         if readings is not None:
             # All, and not only those that are exemplars now: one taken back leaves its place to any other.
             attributes["nbytes"], arrays[READINGS] = readings.nbytes, readings
-        return self._appended(self.store, OBSERVE, material, key, attributes, arrays)
-
-    def _appended(
-        self,
-        store: Store,
-        kind: str,
-        label: str,
-        key: bytes,
-        attributes: dict[str, Any],
-        arrays: dict[str, npt.NDArray[Any]],
-    ) -> int:
         try:
-            return store.append(kind, label, key, attributes=attributes, arrays=arrays).sequence
+            return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
         except StoreError:
             # The journal refused it and the memory never had it; but of a batch all is lost that was added before.
             self._whole = not self._batching
@@ -158,28 +148,28 @@ class Ledger:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_store("take anything back")
-            self._withdraw(store, [observation_of(store, self.memory, receipt).sequence], "")
+            self._withdraw(store, [observation_of(store, self.memory, receipt)], "")
 
     def forget(self, material: str) -> int:
         """As `TactileLearner.forget`."""
         with self.lock:
             store = self.require_store("forget anything")
             found = observations_of(store, self.memory, material)
-            self._withdraw(store, found, material)
+            self._withdraw(store, [store.record(sequence) for sequence in found], material)
         return len(found)
 
-    def _withdraw(self, store: Store, sequences: list[int], material: str) -> None:
+    def _withdraw(self, store: Store, taken: list[Record], material: str) -> None:
         # In the memory first: what that reads again may be damaged, and once it is written down that they are taken
         # back, every opening would have to read it.
         store.base()
-        memory, taken = self._memory, [store.record(sequence) for sequence in sequences]
+        memory, sequences = self._memory, spans(record.sequence for record in taken)
         before = memory.pool, memory.exemplars, memory.tuned
         self._whole = False
         try:
             for record in taken:
                 memory.withdraw(record)
             memory.refill(store)
-            row = self._appended(store, RETRACT, material, b"", {"sequences": spans(sequences)}, {})
+            row = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
         except StoreError:
             for record in taken:
                 memory.put_back(record)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.exemplars import Exemplar, ExemplarPool
-from scroll_tactile.ridge.codes import BITS
+from scroll_tactile.packing import Codes, unpack_codes, unspanned
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.tuned import Tuned
 from scroll_tactile.windows import Reading
-from store import CompactedError, DamageError, Record, Store
+from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
     "FELT",
@@ -30,10 +30,6 @@ __all__ = [
     "Capacity",
     "Memory",
     "give_back_scratch",
-    "pack_codes",
-    "spans",
-    "unpack_codes",
-    "unspanned",
 ]
 
 logger = logging.getLogger(__name__)
@@ -43,10 +39,8 @@ OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kep
 RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
 MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
 FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
-ATTEMPTS = 20
-LARGE = 2**13  # codes
 READINGS = "readings"  # the array of a row that keeps a stream raw
-Codes = dict[int, npt.NDArray[np.int32]]
+ATTEMPTS = 20  # of a reader to read what a writer goes on changing
 
 
 @dataclass(frozen=True)
@@ -105,8 +99,7 @@ class Memory:
         """
         self.statistics.add(material, fold_of(key), codes, columns)
         if self.pool.wants(material, key):
-            scored_at = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-            self.pool.add(material, key, Touch.of(scored_at, codes))
+            self.pool.add(material, key, self._touch(columns, codes))
         if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key, readings.nbytes):
             self.exemplars.add(Exemplar.of(material, key, readings, codes))
         self.sequence = sequence
@@ -118,9 +111,8 @@ class Memory:
         does not know.
         """
         if record.kind == OBSERVE:
-            columns = cast(int, record.attributes["columns"])
             codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
-            self.add(record.label, record.key, columns, codes, record.sequence, readings)
+            self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
         elif record.kind == RETRACT:
             for sequence in unspanned(record.attributes["sequences"]):
                 if sequence > self.base:
@@ -145,8 +137,7 @@ class Memory:
     def withdraw(self, record: Record) -> None:
         """Take an observation out of the sums; `refill` then mends the pools."""
         material, key = record.label, record.key
-        columns = cast(int, record.attributes["columns"])
-        self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), columns)
+        self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
         self.withdrawn.add(record.sequence)
         self.taken_back += 1
         if self.pool.depends_on(material, key) or (self.exemplars and self.exemplars.depends_on(material, key)):
@@ -154,10 +145,14 @@ class Memory:
         if record.sequence <= self.tuned_upto:
             self.tuned = None
 
+    def retractable(self, store: Store, material: str | None = None) -> list[Head]:
+        """The observations in the journal, of one material or all, that can be taken back and were not; in order."""
+        rows = store.heads(self.base, kind=OBSERVE, label=material)
+        return [head for head in rows if head.sequence not in self.withdrawn]
+
     def put_back(self, record: Record) -> None:
         """Undo `withdraw` in the sums, exactly; the samples and f* are the caller's to put back."""
-        columns = cast(int, record.attributes["columns"])
-        self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), columns)
+        self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), _columns(record))
         self.withdrawn.discard(record.sequence)
         self._stale = False
 
@@ -173,15 +168,14 @@ class Memory:
         for head in merged:
             record = store.record(head.sequence)
             fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
-        heads = [
-            one
-            for one in store.heads(self.base, kind=OBSERVE)
-            if one.sequence <= self.sequence and one.sequence not in self.withdrawn
-        ]
+        heads = [one for one in self.retractable(store) if one.sequence <= self.sequence]
         felt = [(one.label, one.key, cast(int, one.attributes.get("nbytes", 0)), one.sequence) for one in heads]
 
         def touch(material: str, key: bytes, sequence: int) -> Touch:
-            return touches.get((material, key)) or self._touch(store.record(sequence))
+            if (there := touches.get((material, key))) is not None:
+                return there
+            record = store.record(sequence)
+            return self._touch(_columns(record), unpack_codes(record.arrays))
 
         def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
             return kept.get((material, key)) or _exemplar(store.record(sequence))
@@ -193,9 +187,13 @@ class Memory:
             self.exemplars = fresh.exemplars
         self._stale = False
 
+    def _empty(self) -> Memory:
+        """Another memory of the same making."""
+        return Memory(self.statistics.dimension, self.reading, self.capacity)
+
     def _base_samples(self, store: Store) -> Memory:
         """A memory with pool and exemplars of the base, empty ones without a base."""
-        fresh = Memory(self.statistics.dimension, self.reading, self.capacity)
+        fresh = self._empty()
         if store.compacted != self.base:
             raise CompactedError(f"{store.path} was compacted since it was read: read it again")
         try:
@@ -221,14 +219,13 @@ class Memory:
             fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
         return fresh
 
-    def _touch(self, record: Record) -> Touch:
-        columns = cast(int, record.attributes["columns"])
+    def _touch(self, columns: int, codes: Codes) -> Touch:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-        return Touch.of(stages, unpack_codes(record.arrays))
+        return Touch.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         """Add all that another memory of the same making held: arrays and attributes of one of its generations."""
-        other = Memory(self.statistics.dimension, self.reading, self.capacity)
+        other = self._empty()
         other._take(arrays, attributes)
         self.statistics = self.statistics + other.statistics
         self.pool.update({}, ((material, key, touch, 0) for material, key, touch in other.pool))
@@ -287,7 +284,11 @@ class Memory:
             memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
             memory.sequence = memory.saved = generation.upto
             memory.generation = generation.number
-        replayed = memory.catch_up(store)
+        replayed = 0
+        for record in store.records(after=memory.sequence):
+            memory.replay(record, store)
+            replayed += 1
+        memory.refill(store)
         logger.info(
             "%s: generation %s, %d rows of the journal replayed, %d compacted",
             store.path,
@@ -297,18 +298,9 @@ class Memory:
         )
         return memory
 
-    def catch_up(self, store: Store) -> int:
-        """Replay the journal's rows that came since; how many there were."""
-        replayed = 0
-        for record in store.records(after=self.sequence):
-            self.replay(record, store)
-            replayed += 1
-        self.refill(store)
-        return replayed
-
     def until(self, store: Store, upto: int) -> Memory:
         """The memory of the observations up to `upto` that were not taken back since: what a base there holds."""
-        memory = Memory(self.statistics.dimension, self.reading, self.capacity)
+        memory = self._empty()
         memory.base, memory.sequence = self.base, self.base
         if (base := store.base()) is not None:
             memory._take(base.arrays, cast(dict[str, Any], base.attributes))
@@ -333,68 +325,12 @@ class Memory:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
 
 
-def spans(sequences: Iterable[int]) -> list[list[int]]:
-    """Whole numbers as [first, last] pairs of those that follow each other: 1, 2, 3, 7 → [[1, 3], [7, 7]]."""
-    pairs: list[list[int]] = []
-    for sequence in sorted(sequences):
-        if pairs and pairs[-1][1] == sequence - 1:
-            pairs[-1][1] = sequence
-        else:
-            pairs.append([sequence, sequence])
-    return pairs
-
-
-def unspanned(pairs: Any) -> list[int]:
-    """The numbers that `spans` made pairs of."""
-    return [sequence for first, last in pairs for sequence in range(first, last + 1)]
+def _columns(record: Record) -> int:
+    return cast(int, record.attributes["columns"])
 
 
 def _exemplar(record: Record) -> Exemplar:
     return Exemplar.of(record.label, record.key, record.arrays[READINGS], unpack_codes(record.arrays))
-
-
-def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
-    """Codes by scale as the arrays of a journal row: their distinct values, and places among them.
-
-    Windows hold few distinct values (a proportion of 22 positions has 23), so a place is a byte and packs well.
-    A network's features hardly repeat: they are kept as they are.
-    """
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    for scale, rows in codes.items():
-        values, places = _distinct(rows)
-        if 4 * len(values) > rows.size and rows.size > 2**8:
-            arrays[f"codes-{scale}"] = rows
-            continue
-        kind = np.uint8 if len(values) <= 2**8 else np.uint16 if len(values) <= 2**16 else np.uint32
-        arrays[f"values-{scale}"] = values
-        # Feature by feature: one feature's values in neighbouring windows are alike.
-        arrays[f"places-{scale}"] = np.ascontiguousarray(places.reshape(rows.shape).T.astype(kind))
-    return arrays
-
-
-def _distinct(rows: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.integer]]:
-    """The distinct codes, ascending, and for each of the rows' codes its place among them."""
-    if rows.size < LARGE:
-        return np.unique(rows, return_inverse=True)
-    # By a table of all codes there can be, not by sorting: a third of the time for a touch of BioTac.
-    at = rows + np.int32(2**BITS)
-    there = np.zeros(2 ** (BITS + 1) + 1, dtype=bool)
-    there[at] = True
-    values = np.flatnonzero(there)
-    table = np.empty(len(there), dtype=np.uint32)
-    table[values] = np.arange(len(values), dtype=np.uint32)
-    return (values - 2**BITS).astype(np.int32), table[at]
-
-
-def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
-    """The codes that `pack_codes` packed."""
-    plain = {int(name.removeprefix("codes-")): rows for name, rows in arrays.items() if name.startswith("codes-")}
-    scales = [int(name.removeprefix("values-")) for name in arrays if name.startswith("values-")]
-    packed = {
-        scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
-        for scale in scales
-    }
-    return dict(sorted((plain | packed).items()))
 
 
 def give_back_scratch() -> None:

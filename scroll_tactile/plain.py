@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.history import withdrawn_in
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory import FELT, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory import FELT, OBSERVE
 from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.ridge.statistics import FOLDS, Statistics
 from store import Store
@@ -88,7 +89,7 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
 
 def _told(store: Store) -> list[list[Any]]:
     heads, compacted = list(store.heads()), store.compacted
-    gone = {at for one in heads if one.kind == RETRACT for at in unspanned(one.attributes["sequences"])}
+    gone = withdrawn_in(heads)
 
     def state(sequence: int, kind: str) -> str:
         if sequence in gone:

@@ -272,8 +272,7 @@ class Store:
         ReadOnlyError or another StoreError; the generation before then stays current.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
-        self._background.wait()
-        self._background.check()
+        self._idle()
         return self._snapshots.commit(checked, upto, text, pieces)
 
     def compact(
@@ -293,8 +292,7 @@ class Store:
         where there is not.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
-        self._background.wait()
-        self._background.check()
+        self._idle()
         newest = self._snapshots.latest()
         if newest is None or newest.upto != self._journal.last():
             there = "there is none" if newest is None else f"the newest has those up to {newest.upto}"
@@ -350,6 +348,10 @@ class Store:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
         self._check_open()
         self._journal.refuse_in_batch("waiting for the background commit")
+        self._idle()
+
+    def _idle(self) -> None:
+        """Wait for the background commit and raise its failure."""
         self._background.wait()
         self._background.check()
 

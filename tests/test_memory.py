@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from scroll_tactile.errors import CapacityError
-from scroll_tactile.memory import OBSERVE, Memory, pack_codes, unpack_codes
+from scroll_tactile.memory import OBSERVE, Memory
+from scroll_tactile.packing import pack_codes, unpack_codes
 from scroll_tactile.ridge.moments import MOST_ROWS, SecondMoment
 from scroll_tactile.windows import Reading, extent
 from store import Store

@@ -22,7 +22,8 @@ from scroll_tactile.bench.timing import Timing, circumstances, take_turns
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.images import tactile_image, three_planes
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory import OBSERVE, pack_codes
+from scroll_tactile.memory import OBSERVE
+from scroll_tactile.packing import pack_codes
 from scroll_tactile.ridge.codes import to_codes
 from scroll_tactile.ridge.moments import SecondMoment
 from scroll_tactile.windows import extent, scales

@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.ridge.moments import one_thread
 
-__all__ = ["Readout", "ReadoutName", "Task", "fit_readout"]
+__all__ = ["Readout", "ReadoutName", "Task", "centred_means", "fit_readout"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -53,10 +53,7 @@ class Task:
         """Make the task of a scatter within classes (taken over, see `within_scatter`), n_y and c_y."""
         total = int(counts.sum())
         shares = counts / total
-        # Long double: a class mean keeps the digits that its distance from the centre needs.
-        exact = sums.astype(np.longdouble) / counts[:, None]
-        center = shares.astype(np.longdouble) @ exact
-        means = (exact - center).astype(np.float64)
+        center, means = centred_means(counts, sums)
         variance = np.diagonal(scatter) / total + shares @ np.square(means)
         # Rows of integers that differ at all differ by more than this: below it is only the means' rounding.
         constant = variance < 0.25 / total
@@ -64,7 +61,15 @@ class Task:
         means[:, constant] = 0.0
         scatter *= (1.0 / (total * scale))[:, None]
         scatter *= 1.0 / scale
-        return cls(scatter, means / scale, center.astype(np.float64), scale, shares, total)
+        return cls(scatter, means / scale, center, scale, shares, total)
+
+
+def centred_means(counts: IntArray, sums: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The mean of all rows, shape (d,), and the class means about it, shape (C, d), of n_y and c_y."""
+    # Long double: a class mean keeps the digits that its distance from the centre needs.
+    exact = sums.astype(np.longdouble) / counts[:, None]
+    center = (counts / counts.sum()).astype(np.longdouble) @ exact
+    return center.astype(np.float64), (exact - center).astype(np.float64)
 
 
 @dataclass(frozen=True)

@@ -84,8 +84,7 @@ def select(statistics: Statistics, scale: int, kind: ReadoutName) -> Selection |
 
 def task_of(statistics: Statistics, scale: int) -> Task:
     """The task of all that was felt at a scale."""
-    names = statistics.names(scale)
-    counts, sums = statistics.counts(scale, names).sum(axis=1), statistics.sums(scale, names).sum(axis=1)
+    counts, sums = statistics.totals(scale)
     return Task.of(within_scatter(statistics.total_second(scale), counts, sums), counts, sums)
 
 

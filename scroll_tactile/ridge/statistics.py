@@ -131,6 +131,11 @@ class Statistics:
         """Sums of codes of each material in each fold, shape (C, FOLDS, d)."""
         return self._sums[scale][[self._places[name] for name in names]]
 
+    def totals(self, scale: int) -> tuple[IntArray, IntArray]:
+        """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`, over all folds."""
+        names = self.names(scale)
+        return self.counts(scale, names).sum(axis=1), self.sums(scale, names).sum(axis=1)
+
     def second(self, scale: int, fold: int) -> SecondMoment:
         """The second moment of a scale and fold, over all materials."""
         return self._seconds[scale][fold]

@@ -16,13 +16,12 @@ import numpy.typing as npt
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.ridge.moments import one_thread, within_scatter
-from scroll_tactile.ridge.readouts import Readout
+from scroll_tactile.ridge.readouts import Readout, centred_means
 from scroll_tactile.ridge.statistics import Statistics
 
 __all__ = ["Tracked"]
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # Of d, and at least so many rows: beyond it what the rows since cost is more than a factorisation (d = 512, 50 classes:
 # an update takes 0.3 ms with none, 0.9 ms with 64, a factorisation from the integers 6).
@@ -49,13 +48,10 @@ class Tracked:
 
         Raises numpy.linalg.LinAlgError where S_w + P is not positive definite to working precision.
         """
-        names = statistics.names(self._scale)
-        counts = statistics.counts(self._scale, names).sum(axis=1)
-        sums = statistics.sums(self._scale, names).sum(axis=1)
+        counts, sums = statistics.totals(self._scale)
         system = within_scatter(statistics.total_second(self._scale), counts, sums)
         system[np.diag_indices_from(system)] += self._penalties
-        exact = sums.astype(np.longdouble) / counts[:, None]
-        center = (counts / counts.sum()).astype(np.longdouble) @ exact
+        center, means = centred_means(counts, sums)
         with one_thread():
             self._factor, failed = dpotrf(system, lower=0, overwrite_a=1)
             if failed:
@@ -63,9 +59,9 @@ class Tracked:
                     f"the scatter with the penalties of λ = {self._penalty:g} is not positive definite at row {failed}"
                 )
             # About a fixed point, the mean of all rows when this began: about zero the digits of a large mean are lost.
-            self._origin = center.astype(np.float64)
+            self._origin = center
             self._counts = counts.astype(np.float64)
-            self._means = (exact - center).astype(np.float64)
+            self._means = means
             self._solved, _ = dpotrs(self._factor, self._means.T, lower=0)
             self._gram = self._means @ self._solved
         dimension, classes = self._solved.shape
@@ -73,11 +69,6 @@ class Tracked:
         room = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
         self._b, self._s = np.empty((room, classes)), np.eye(room)
-
-    @property
-    def classes(self) -> int:
-        """How many materials it tells apart."""
-        return len(self._counts)
 
     def add(self, rows: npt.NDArray[np.integer], place: int) -> bool:
         """Follow rows of codes, shape (k, d), of the class at a place; False where `anchor` is due instead.

@@ -13,7 +13,7 @@ from scroll_tactile.ridge.codes import BITS
 __all__ = ["Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
 
 Codes = dict[int, npt.NDArray[np.int32]]
-LARGE = 2**13  # codes
+LARGE, BLOCK = 2**13, 2**10  # codes
 
 
 def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
@@ -24,29 +24,33 @@ def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDAr
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     for scale, rows in codes.items():
-        values, places = _distinct(rows)
+        first = rows.min(initial=2**BITS)
+        # Feature by feature: one feature's values in neighbouring windows are alike.
+        above = np.subtract(rows.T, first, order="C")
+        values = _distinct(above)
         if 4 * len(values) > rows.size and rows.size > 2**8:
             arrays[f"codes-{scale}"] = rows
             continue
         kind = np.uint8 if len(values) <= 2**8 else np.uint16 if len(values) <= 2**16 else np.uint32
-        arrays[f"values-{scale}"] = values
-        # Feature by feature: one feature's values in neighbouring windows are alike.
-        arrays[f"places-{scale}"] = np.ascontiguousarray(places.reshape(rows.shape).T.astype(kind))
+        # A table of all the codes there can be, of which only the pages with one of these are ever made.
+        table = np.empty(int(values.max(initial=0)) + 1, dtype=kind)
+        table[values] = np.arange(len(values), dtype=kind)
+        arrays[f"values-{scale}"] = (values + first).astype(np.int32)
+        arrays[f"places-{scale}"] = table[above]
     return arrays
 
 
-def _distinct(rows: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.integer]]:
-    """The distinct codes, ascending, and for each of the rows' codes its place among them."""
-    if rows.size < LARGE:
-        return np.unique(rows, return_inverse=True)
-    # By a table of all codes there can be, not by sorting: a third of the time for a touch of BioTac.
-    at = rows + np.int32(2**BITS)
-    there = np.zeros(2 ** (BITS + 1) + 1, dtype=bool)
-    there[at] = True
-    values = np.flatnonzero(there)
-    table = np.empty(len(there), dtype=np.uint32)
-    table[values] = np.arange(len(values), dtype=np.uint32)
-    return (values - 2**BITS).astype(np.int32), table[at]
+def _distinct(numbers: npt.NDArray[np.int32]) -> npt.NDArray[np.integer]:
+    """The distinct ones of numbers from 0 up, ascending."""
+    if numbers.size < LARGE:
+        return np.unique(numbers)
+    # Marked in a table and in one of its blocks, and not by sorting: half of the time for a touch of BioTac.
+    marked = np.zeros((int(numbers.max()) // BLOCK + 1) * BLOCK, dtype=bool)
+    filled = np.zeros(len(marked) // BLOCK, dtype=bool)
+    marked[numbers] = filled[numbers // BLOCK] = True
+    blocks = np.flatnonzero(filled)
+    block, within = np.divmod(np.flatnonzero(marked.reshape(-1, BLOCK)[blocks]), BLOCK)
+    return np.asarray(blocks[block] * BLOCK + within)
 
 
 def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:

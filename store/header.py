@@ -72,7 +72,12 @@ def holds_store(folder: Path) -> bool:
             if (fault := header_fault(journal)) is not None:
                 raise DamageError(f"{fault}: repair the store (repair_store)", path=journal)
             return True
-        _refuse_foreign(folder)
+        try:
+            _refuse_foreign(folder)
+        except (DamageError, NotAStoreError):
+            if journal.is_file():  # another process has just made the store
+                return holds_store(folder)
+            raise
         return False
 
 

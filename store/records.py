@@ -88,7 +88,7 @@ def check_time(time: float) -> float:
     """Return `time`, Unix seconds, as a float; raise RecordError when it is not a finite number."""
     if isinstance(time, bool) or not isinstance(time, int | float) or not math.isfinite(time):
         raise RecordError(f"the time must be a finite number of seconds since 1970, not {time!r}")
-    return float(time)
+    return float(time) + 0.0  # SQLite gives -0.0 back as 0.0, and the checksum is over its sign, too
 
 
 def to_json(what: str, value: Mapping[str, JSON] | None) -> str:

@@ -18,6 +18,7 @@ from store.arrays import check_arrays, check_chunks, encode_payload
 from store.background import Background
 from store.errors import (
     CompactedError,
+    DamageError,
     NotAStoreError,
     ReadOnlyError,
     RecordError,
@@ -25,6 +26,7 @@ from store.errors import (
     StoreError,
 )
 from store.files import file_size, tree_size
+from store.generations import folder_name
 from store.header import holds_store
 from store.journal import Journal
 from store.lock import WriterLock
@@ -96,7 +98,19 @@ class Store:
             self._snapshots = Snapshots(folder / GENERATIONS, self._journal)
             if mode == "write":
                 self._snapshots.remove_unfinished()
+            self._warn_of_damaged_generations()
             undo.pop_all()
+
+    def _warn_of_damaged_generations(self) -> None:
+        # It may be the base's: nothing else would tell of that until a generation behind it is damaged, too.
+        for row in self._journal.generations():
+            if not row.sound:
+                logger.warning(
+                    "%s: the row of generation %s fails its checksum and does not count: check_store tells what it is "
+                    "needed for",
+                    self.path,
+                    row.number,
+                )
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -287,13 +301,19 @@ class Store:
 
         The base is a generation like others, but kept until the next one; whoever goes through the
         records begins with it. It takes effect whole or not at all. A generation with all records has to
-        be committed before, so that one damaged file cannot take everything: RecordError otherwise, and as
-        `commit`. The space is given back to the disk where there is room to do so; a warning is logged
-        where there is not.
+        be committed before, so that one damaged file cannot take everything: RecordError otherwise, DamageError
+        where that one cannot be read back, and as `commit`. The space is given back to the disk where there is
+        room to do so; a warning is logged where there is not.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._idle()
-        newest = self._snapshots.latest()
+        newest, named = self._snapshots.latest(), self._journal.newest()
+        if named is not None and (newest is None or newest.number != named):
+            raise DamageError(
+                f"{self.path} cannot be compacted: generation {named}, which has to be whole beside the base, could "
+                "not be read back; nothing was given up. Commit another, and compact again",
+                path=self.path / GENERATIONS / folder_name(named),
+            )
         if newest is None or newest.upto != self._journal.last():
             there = "there is none" if newest is None else f"the newest has those up to {newest.upto}"
             raise RecordError(

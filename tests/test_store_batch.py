@@ -56,7 +56,7 @@ def test_a_large_batch_leaves_no_large_log(opened):
     log = opened.path / "journal.sqlite-wal"
     noise = np.random.default_rng(0)
     with opened.batch():
-        for _ in range(5):
+        for _ in range(6):
             opened.append("a", "b", b"", arrays={"x": noise.integers(0, 2**63, 2**19)})
     assert log.stat().st_size > 20 * 2**20
     for _ in range(3):

@@ -148,13 +148,12 @@ def test_a_generation_with_all_rows_has_to_be_there_first(opened):
     with pytest.raises(RecordError, match=f"all {LAST + 1} records; the newest has those up to {LAST}: commit one"):
         opened.compact(sums(5), upto=5)
     opened.commit(sums(LAST + 1), upto=LAST + 1)
-    spoil(opened, 3)
-    with pytest.raises(RecordError, match=f"the newest has those up to {LAST}"):
-        opened.compact(sums(5), upto=5)
-    spoil(opened, 2)
-    with pytest.raises(RecordError, match="there is none"):
-        opened.compact(sums(5), upto=5)
     assert payloads(opened.path) == list(range(1, LAST + 2))
+    opened.compact(sums(5), upto=5)
+    with Store.open(opened.path.with_name("fresh"), identity={}) as fresh:
+        add(fresh, 1)
+        with pytest.raises(RecordError, match="all 1 records; there is none"):
+            fresh.compact(sums(1), upto=1)
 
 
 @pytest.mark.parametrize("upto", [4, -1, LAST + 1, True, 5.0])
@@ -180,6 +179,17 @@ def test_a_damaged_base_is_named_and_the_newest_generation_gone_on_from(opened, 
     assert caplog.records == []
 
 
+def test_nothing_is_given_up_beside_a_newest_generation_that_cannot_be_read(opened):
+    spoil(opened, 2)
+    with pytest.raises(DamageError, match=r"generation 2, .* nothing was given up") as caught:
+        opened.compact(sums(5), upto=5)
+    assert caught.value.path == opened.path / "generations" / "00000002"
+    assert payloads(opened.path) == list(range(1, LAST + 1))
+    opened.commit(sums(LAST), upto=LAST)
+    opened.compact(sums(5), upto=5)
+    assert agrees(opened, 5)
+
+
 def test_a_damaged_newest_generation_is_passed_over_for_the_base(opened, caplog):
     opened.compact(sums(5), upto=5)
     spoil(opened, 2)
@@ -197,6 +207,9 @@ def test_a_damaged_row_of_the_base_is_not_believed(opened, assignment, caplog):
     assert opened.compacted == 0
     with pytest.raises(DamageError, match="the arrays of row 1 are missing"):
         list(opened.records())
+    # Whoever goes on from the newest generation would not meet that: opening says it.
+    with Store.open(opened.path, mode="read"):
+        assert f"{opened.path}: the row of generation 3 fails its checksum" in caplog.text
     if assignment != "base = 0":
         with pytest.raises(DamageError, match="row of generation 3"):
             opened.base()

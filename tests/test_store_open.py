@@ -231,6 +231,19 @@ def test_other_things_are_left_alone(tmp_path, mode):
         assert before == (contents(path) if path.is_dir() else None)
 
 
+def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_path, monkeypatch):
+    Store.open(tmp_path / "s", identity={}).close()
+    there, looks = Path.is_file, []
+
+    def not_yet(path):
+        looks.append(path)
+        return len(looks) > 1 and there(path)
+
+    monkeypatch.setattr(Path, "is_file", not_yet)
+    with Store.open(tmp_path / "s", mode="read") as opened:
+        assert opened.last == 0
+
+
 def test_a_mode_is_read_or_write(tmp_path):
     with pytest.raises(ValueError, match="append"):
         Store.open(tmp_path, identity={}, mode="append")

@@ -6,8 +6,9 @@ fdatasync, and as many inserted into a bare SQLite database with a write-ahead l
 
     overhead = (ours - append and fdatasync) / (append and fdatasync), of the medians
 
-Of ours the store's part is told by itself, too: the rest is arithmetic, adding to the memory's sums. The bulk: as many
-observations in one `batch()`, against one by one.
+Of ours the store's part is told by itself, too, and packing the codes for it: the rest is arithmetic, adding to the
+memory's sums. The bulk: as many observations in one `batch()`, against one by one, on this disk and on one on which
+each sync is made to take longer (5 ms: a good card; 30 ms: a cheap card, or a disk that turns).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from faults.common import file_system, folder, parser, progress, run
 from faults.feeding import BIOTAC, TINY, endless, observe, touches
+from faults.shim import Shim, begin_again_watched
 from scroll_tactile import TactileLearner
+from scroll_tactile.packing import pack_codes
 
 INSERT = "INSERT INTO kept (bytes) VALUES (?)"
 TOGETHER = 25  # of one kind in a row
+SLOWER = (5.0, 30.0)  # milliseconds
 
 
 def told(seconds: list[float]) -> dict[str, float]:
@@ -55,7 +59,7 @@ def one_by_one(home: Path, settings: dict[str, Any], count: int, **more: Any) ->
     """Observations, and in turns with them what durability costs at least."""
     rng = random.Random(0)
     feed = endless(touches(settings, 4, 3))
-    seconds: dict[str, list[float]] = {"observe": [], "store.append": [], "file": [], "sqlite": []}
+    seconds: dict[str, list[float]] = {"observe": [], "packing": [], "store.append": [], "file": [], "sqlite": []}
     with (
         TactileLearner.open(home / "memory", **settings, **more) as learner,
         (home / "file").open("ab", buffering=0) as file,
@@ -84,6 +88,7 @@ def one_by_one(home: Path, settings: dict[str, Any], count: int, **more: Any) ->
         while len(seconds["observe"]) < count:
             fed = [next(feed) for _ in range(TOGETHER)]
             seconds["observe"] += [timed(lambda one=one: observe(learner, one)) for one in fed]
+            seconds["packing"] += [timed(lambda one=one: pack_codes(one.codes)) for one in fed]
             parts = [rng.randbytes(size) for size in sizes[-TOGETHER:]]
             seconds["file"] += [timed(lambda part=part: to_file(part)) for part in parts]
             seconds["sqlite"] += [timed(lambda part=part: bare.execute(INSERT, (part,))) for part in parts]
@@ -97,22 +102,21 @@ def one_by_one(home: Path, settings: dict[str, Any], count: int, **more: Any) ->
     return figures
 
 
-def bulk(home: Path, settings: dict[str, Any], count: int, **more: Any) -> dict[str, float]:
-    """Observations a second, one by one and in a batch."""
-    feed, rates = endless(touches(settings, 4, 3)), {}
+def bulk(home: Path, settings: dict[str, Any], count: int, slower: float, **more: Any) -> dict[str, float]:
+    """Observations a second, one by one and in a batch, where each sync takes some milliseconds more."""
+    feed, rates, shim = endless(touches(settings, 4, 3)), {}, Shim()
     for name in ("one by one", "batch"):
-        fed = [next(feed) for _ in range(count)]
-        with TactileLearner.open(home / name, **settings, **more) as learner:
+        of = min(count, 100) if slower and name == "one by one" else count
+        fed = [next(feed) for _ in range(of)]
+        with TactileLearner.open(home / f"{name}, {slower:g} ms", **settings, **more) as learner:
             observe(learner, fed[0])
+            shim.slow(slower)
             begun = time.perf_counter()
-            if name == "batch":
-                with learner.batch():
-                    for one in fed:
-                        observe(learner, one)
-            else:
+            with learner.batch() if name == "batch" else nullcontext():
                 for one in fed:
                     observe(learner, one)
-            rates[f"{name}, a second"] = count / (time.perf_counter() - begun)
+            rates[f"{name}, a second"] = of / (time.perf_counter() - begun)
+            shim.slow(0)
     return rates | {"ratio": rates["batch, a second"] / rates["one by one, a second"]}
 
 
@@ -134,11 +138,14 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
             (where := home / str(number)).mkdir()
             figures[name] = one_by_one(where, settings, count, **more)
             progress(f"{name}: {figures[name]['observe']}")
-            figures[f"bulk: {name}"] = bulk(where, settings, count, **more)
-            progress(f"bulk: {figures[f'bulk: {name}']}")
+            for slower in (0.0, *SLOWER):
+                told_as = f"bulk: {name}" + (f", each sync {slower:g} ms longer" if slower else "")
+                figures[told_as] = bulk(where, settings, count, slower, **more)
+                progress(f"{told_as}: {figures[told_as]}")
         figures["load after"] = os.getloadavg()[0]
     return figures
 
 
 if __name__ == "__main__":
+    begin_again_watched()
     run("latency", parser(__doc__, count=1000).parse_args(), main)

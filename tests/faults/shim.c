@@ -30,6 +30,7 @@ static enum mode mode = OFF;
 static int watched, error_given, log_file = -1;
 static long first, last, counted, halved_file = -1;
 static char hit[4400];
+static useconds_t slowness;
 static pthread_mutex_t lock = PTHREAD_RECURSIVE_MUTEX_INITIALIZER_NP;
 
 #define REAL(name) ((__typeof__(&name))real(#name))
@@ -49,6 +50,9 @@ void shim_arm(const char *folder, int how, int what, long from, long to, int num
     counted = 0, halved_file = -1, hit[0] = 0;
     pthread_mutex_unlock(&lock);
 }
+
+/* Let each sync, of any file, take so many microseconds more. */
+void shim_slow(unsigned microseconds) { slowness = microseconds; }
 
 long shim_count(void) { return counted; }
 
@@ -261,8 +265,12 @@ int posix_fallocate(int file, off_t at, off_t length) {
         note(folder ? 'F' : kind, inode, offset, path, "", 0);                                                  \
     pthread_mutex_unlock(&lock);                                                                                \
     return result;
-int fsync(int file) { ON_FILE(REAL(fsync)(file), "fsync", 'S', 0) }
-int fdatasync(int file) { ON_FILE(REAL(fdatasync)(file), "fdatasync", 'S', 0) }
+static int slowed(int result) {
+    if (slowness > 0) usleep(slowness);
+    return result;
+}
+int fsync(int file) { ON_FILE(slowed(REAL(fsync)(file)), "fsync", 'S', 0) }
+int fdatasync(int file) { ON_FILE(slowed(REAL(fdatasync)(file)), "fdatasync", 'S', 0) }
 int ftruncate(int file, off_t length) { ON_FILE(REAL(ftruncate)(file, length), "ftruncate", 'T', length) }
 int ftruncate64(int file, off_t length) { return ftruncate(file, length); }
 

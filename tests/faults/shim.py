@@ -66,6 +66,10 @@ class Shim:
         self._library.shim_arm(b"/nowhere", OFF, 0, 0, 0, 0)
         return count, hit
 
+    def slow(self, milliseconds: float) -> None:
+        """Let each sync take so much longer, as on a card or a turning disk."""
+        self._library.shim_slow(round(1e3 * milliseconds))
+
     def log(self, file: Path) -> None:
         """Append what is done while the mode is LOG to a file."""
         if self._library.shim_log(os.fsencode(file)) < 0:

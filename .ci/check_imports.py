@@ -27,8 +27,9 @@ LAYERS = [
     {"export", "plain"},
     {"datasets"},
     {"plots"},
-    {"plots_continual", "plots_numerics"},
-    {"pipelines", "bench"},
+    {"plots_continual", "plots_frontier", "plots_numerics"},
+    {"pipelines"},
+    {"bench"},
     {"cli", "__main__"},
     {""},  # the package's own __init__
 ]

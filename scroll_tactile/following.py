@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
+from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.tracking import Tracked
 
-__all__ = ["Added", "Following"]
+__all__ = ["Added", "Following", "SolverName"]
+
+SolverName = Literal["exact", "recursive"]
+FOLLOWERS: dict[SolverName, type[Tracked | Recursive]] = {"exact": Tracked, "recursive": Recursive}
 
 Added = tuple[str, dict[int, npt.NDArray[np.int32]]]
 """A material, and the codes of a touch of it by scale."""
@@ -26,13 +31,15 @@ class Following:
     """What a model that was fitted to a memory becomes as touches are added.
 
     model: fitted to the memory as it is now. refit: the share by which the memory may grow before `follow` refuses.
+    solver: "exact", against a factor of the exact statistics, or "recursive", by the paper's recursion.
     """
 
-    def __init__(self, model: Model, memory: Memory, refit: float) -> None:
+    def __init__(self, model: Model, memory: Memory, refit: float, solver: SolverName) -> None:
         self.model = model
+        self._follower = FOLLOWERS[solver]
         self._felt = sum(memory.statistics.materials.values())
         self._most = (1 + refit) * self._felt
-        self._tracked: dict[int, Tracked] = {}
+        self._tracked: dict[int, Tracked | Recursive] = {}
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in the touches that were added since; False where the model has to be fitted again.
@@ -49,7 +56,7 @@ class Following:
             if not rows:
                 continue
             if (tracked := self._tracked.get(scale)) is None:
-                tracked = self._tracked[scale] = Tracked(statistics, scale, selection.readout)
+                tracked = self._tracked[scale] = self._follower(statistics, scale, selection.readout)
             elif not all(tracked.add(codes, place) for place, codes in rows):
                 tracked.anchor(statistics)
             selections[scale] = replace(selection, readout=tracked.readout())

@@ -17,7 +17,7 @@ from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.finetune import fine_tune
-from scroll_tactile.following import Following
+from scroll_tactile.following import Following, SolverName
 from scroll_tactile.identity import capacity_of, identity_of, kept_capacity, require_same
 from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
@@ -40,8 +40,6 @@ Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 
 logger = logging.getLogger(__name__)
 
-SNAPSHOT_EVERY = 1024  # observations between generations: replaying so many takes about a second on opening
-
 
 class TactileLearner:
     """A memory of how materials feel: exact, durable where it has a path, and honest about what it never felt.
@@ -60,6 +58,9 @@ class TactileLearner:
     refit: the share by which the memory may grow before λ and the calibration are chosen again. 0: they are at each
     change, and every answer is a function of the memory alone. With 0.1, say, a `predict` just after an `observe` is a
     hundred times as fast: the readouts are of all that was felt, λ and the calibration of a little less.
+    solver: how the readouts follow between two such fits. "exact": against a factor of the exact statistics, equal to a
+    fresh solve to rounding. "recursive": the paper's recursive least squares, whose rounding errors add up until the
+    next fit; it is there to be compared with, and what the memory keeps is exact all the same.
     exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
     choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
 
@@ -74,15 +75,17 @@ class TactileLearner:
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
         refit: float = 0.0,
+        solver: SolverName = "exact",
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
     ) -> None:
-        require_settings(readout, false_alarms, refit)
+        require_settings(readout, false_alarms, refit, solver)
         self.sensor = sensor
         self.embedding: Embedding = Kernels() if embedding is None else embedding
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
         self.refit = refit
+        self.solver: SolverName = solver
         self._reading = Reading.of(sensor, self.embedding)
         self._capacity = capacity_of(exemplars, exemplar_bytes)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
@@ -100,6 +103,7 @@ class TactileLearner:
         readout: ReadoutName = "lda",
         false_alarms: float = 0.05,
         refit: float = 0.0,
+        solver: SolverName = "exact",
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
         mode: Literal["write", "read"] = "write",
@@ -112,7 +116,7 @@ class TactileLearner:
         Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
         new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
         """
-        require_settings(readout, false_alarms, refit)
+        require_settings(readout, false_alarms, refit, solver)
         chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
@@ -131,6 +135,7 @@ class TactileLearner:
                 readout=readout,
                 false_alarms=false_alarms,
                 refit=refit,
+                solver=solver,
                 exemplars=capacity.streams,
                 exemplar_bytes=capacity.nbytes,
             )
@@ -324,7 +329,7 @@ class TactileLearner:
             return self._following[1].model
         following, added = self._following and self._following[1], ledger.added
         if following is None or added is None or not following.follow(ledger.memory, added):
-            following = Following(self.model(), ledger.memory, self.refit)
+            following = Following(self.model(), ledger.memory, self.refit, self.solver)
         self._following = ledger.version, following
         ledger.follow, ledger.added = True, []
         return following.model

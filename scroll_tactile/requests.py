@@ -11,14 +11,21 @@ __all__ = ["candidates_of", "require_name", "require_settings"]
 LONGEST_NAME = 200  # characters
 
 
-def require_settings(readout: str, false_alarms: float, refit: float) -> None:
-    """Raise InputError for another readout than "lda" and "ridge", and shares that are none."""
+def require_settings(readout: str, false_alarms: float, refit: float, solver: str) -> None:
+    """Raise InputError for readouts and solvers that there are not, and shares that are none."""
     if readout not in ("lda", "ridge"):
         raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
     if not 0 < false_alarms < 1:
         raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
     if not 0 <= refit <= 1:
         raise InputError(f"refit must be a share from 0 to 1; came {refit!r}")
+    if solver not in ("exact", "recursive"):
+        raise InputError(f"solver must be 'exact' or 'recursive'; came {solver!r}")
+    if solver == "recursive" and not refit:
+        raise InputError(
+            "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by one: "
+            "give refit=1.0, say, to fit again when the memory has doubled"
+        )
 
 
 def require_name(material: str) -> None:

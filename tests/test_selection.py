@@ -5,6 +5,7 @@ import pytest
 from scipy.special import log_ndtr, logsumexp
 
 from scroll_tactile.ridge.moments import SecondMoment, within_scatter
+from scroll_tactile.ridge.path import fit_path
 from scroll_tactile.ridge.readouts import Task, fit_readout
 from scroll_tactile.ridge.selection import PENALTIES, select
 from scroll_tactile.ridge.statistics import FOLDS, Statistics
@@ -82,6 +83,33 @@ def pairwise_error(felt, penalty):
     return total
 
 
+@pytest.mark.parametrize(("dimension", "materials"), [(1, 2), (2, 3), (6, 4), (70, 9)])
+def test_a_path_gives_the_readout_of_each_penalty(dimension, materials):
+    rng = np.random.default_rng(dimension)
+    counts = rng.integers(1, 40, materials)
+    groups = [np.rint(rng.normal(rng.normal(0, 1e5, dimension), 4e4, (n, dimension))).astype(np.int32) for n in counts]
+    moment = SecondMoment(dimension)
+    for rows in groups:
+        moment.add(rows)
+    sums = np.stack([rows.sum(axis=0, dtype=np.int64) for rows in groups])
+    task = Task.of(within_scatter(moment.packed(), counts, sums), counts, sums)
+    before = task.covariance.tobytes(), task.means.tobytes()
+    penalties = [1e-6, 1e-3, 3e-2, 10.0]
+    for penalty, found in zip(penalties, fit_path(task, penalties), strict=True):
+        expected = fit_readout(task, penalty)
+        assert found.penalty == penalty
+        for name in ("center", "weights", "gram", "ridge", "shares", "penalties"):
+            ours, theirs = getattr(found, name), getattr(expected, name)
+            assert np.abs(ours - theirs).max() <= 1e-10 * np.abs(theirs).max()
+    assert (task.covariance.tobytes(), task.means.tobytes()) == before
+
+
+def test_a_path_to_a_system_that_is_not_definite_says_so():
+    task = Task(np.asfortranarray(-np.eye(3)), np.eye(2, 3), np.zeros(3), np.ones(3), np.full(2, 0.5), 10)
+    with pytest.raises(np.linalg.LinAlgError, match=r"λ = 0\.5 is not positive definite"):
+        fit_path(task, [2.0, 0.5])
+
+
 FELT = {
     "easy": list(touches(noise=15_000)),
     "hard": list(touches(noise=90_000)),
@@ -96,6 +124,16 @@ FELT = {
 def test_the_loss_is_that_of_a_loop_over_the_rows_held_out(felt, kind, error):
     selection = select(statistics_of(felt), SCALE, kind)
     expected = {penalty: error(felt, penalty) for penalty in PENALTIES}
+    assert selection.losses == pytest.approx(expected, rel=1e-7)
+    assert selection.readout.penalty == min(expected, key=expected.__getitem__)
+
+
+@pytest.mark.parametrize("kind", ["ridge", "lda"])
+def test_of_any_grid_the_choice_is_that_of_refitting(kind):
+    felt, grid = FELT["hard"], [*np.geomspace(1e-5, 1.0, 11).tolist()]
+    selection = select(statistics_of(felt), SCALE, kind, grid)
+    error = squared_error if kind == "ridge" else pairwise_error
+    expected = {penalty: error(felt, penalty) for penalty in grid}
     assert selection.losses == pytest.approx(expected, rel=1e-7)
     assert selection.readout.penalty == min(expected, key=expected.__getitem__)
 
@@ -129,6 +167,17 @@ def test_nothing_to_hold_out_still_gives_a_readout(kind):
         assert not selection.held_out
         assert not selection.losses
         assert np.isfinite(selection.readout.weights).all()
+
+
+@pytest.mark.parametrize("kind", ["ridge", "lda"])
+def test_materials_that_nothing_confuses_are_chosen_for_without_a_warning(kind):
+    # One row a touch, always the same: nothing varies, and the logs of the errors are at the end of all numbers.
+    statistics, rows = Statistics(64, (SCALE,)), np.random.default_rng(0).integers(0, 2**20, (3, 1, 64), dtype=np.int32)
+    for at in range(18):
+        statistics.add("abc"[at % 3], at // 3 % FOLDS, {SCALE: rows[at % 3]})
+    selection = select(statistics, SCALE, kind)
+    assert selection.readout.penalty in PENALTIES
+    assert not any(np.isnan(loss) for loss in selection.losses.values())
 
 
 def test_nothing_felt_gives_none():

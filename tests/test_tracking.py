@@ -11,6 +11,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.model import Model
 from scroll_tactile.ridge.moments import within_scatter
 from scroll_tactile.ridge.readouts import Readout, Task, fit_readout
+from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.ridge.tracking import Tracked
 
@@ -67,23 +68,25 @@ class Source:
         return statistics
 
 
-def test_it_begins_as_the_readout_that_it_starts_from():
+@pytest.mark.parametrize("follower", [Tracked, Recursive])
+def test_it_begins_as_the_readout_that_it_starts_from(follower):
     statistics = Source(20, 3).fill(60)
     start = fitted(statistics)
-    assert distance(Tracked(statistics, SCALE, start).readout(), start) < 1e-12
+    assert distance(follower(statistics, SCALE, start).readout(), start) < 1e-12
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
+    st.sampled_from([Tracked, Recursive]),
     st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), max_size=12),
     st.sampled_from([0, 8 * 10**5]),
     st.integers(0, 9),
 )
-def test_it_equals_a_fresh_solve_after_any_rows(added, offset, seed):
+def test_it_equals_a_fresh_solve_after_any_rows(follower, added, offset, seed):
     source = Source(24, 4, seed, offset)
     statistics = source.fill(40)
     start = fitted(statistics)
-    tracked = Tracked(statistics, SCALE, start)
+    tracked = follower(statistics, SCALE, start)
     for place, count in added:
         rows = source.rows(place, count)
         statistics.add(source.names[place], place % 3, {SCALE: rows})
@@ -107,6 +110,24 @@ def test_nothing_drifts_in_ten_thousand_interleavings():
         if at % 500 == 499:
             worst = max(worst, distance(readout, dense(statistics, start.penalties)))
     assert worst < 1e-10
+
+
+def test_rounding_adds_up_in_the_recursion_until_it_is_anchored():
+    source = Source(24, 4, offset=8e5)
+    statistics = source.fill(60)
+    start = fitted(statistics, 1e-9)
+    tracked, recursive = Tracked(statistics, SCALE, start), Recursive(statistics, SCALE, start)
+    for at in range(3000):
+        place = at % 4
+        rows = source.rows(place)
+        statistics.add(source.names[place], at % 3, {SCALE: rows})
+        assert recursive.add(rows, place)
+        if not tracked.add(rows, place):
+            tracked.anchor(statistics)
+    truth = dense(statistics, start.penalties)
+    assert distance(recursive.readout(), truth) > 10 * distance(tracked.readout(), truth)
+    recursive.anchor(statistics)
+    assert distance(recursive.readout(), truth) < 1e-9
 
 
 def test_where_it_cannot_follow_it_says_so_and_stays_as_it_was():
@@ -142,8 +163,8 @@ def test_a_feature_that_begins_to_vary_is_penalised_like_the_others():
 class TestLearner:
     FELT = tuple((name, (seed, 60)) for seed in range(8) for name in "abc")
 
-    def learner(self, refit, felt=FELT):
-        learner = TactileLearner(sensor=PAD, embedding=SMALL, refit=refit)
+    def learner(self, refit, felt=FELT, **settings):
+        learner = TactileLearner(sensor=PAD, embedding=SMALL, refit=refit, **settings)
         for name, touch in felt:
             learner.observe(name, stream(touch))
         return learner
@@ -204,6 +225,29 @@ class TestLearner:
             answer = learner.predict(stream((50, 60)))
             learner.refit = 0.0
             assert answer == learner.predict(stream((50, 60)))
+
+    def test_the_papers_recursion_can_be_chosen_and_gives_the_same_answers_while_it_is_well(self):
+        exact, recursive = self.learner(1.0), self.learner(1.0, solver="recursive")
+        for learner in (exact, recursive):
+            learner.predict(stream((50, 60)))
+            for at in range(12):
+                learner.observe("abc"[at % 3], stream((20 + at, 60)))
+        assert exact.digest() == recursive.digest()
+        model = recursive._present()
+        for scale, selection in exact._present().selections.items():
+            found = model.selections[scale].readout
+            assert found.weights.tobytes() != selection.readout.weights.tobytes()
+            assert distance(found, selection.readout) < 1e-8
+        answers = [learner.predict(stream((50, 60))) for learner in (exact, recursive)]
+        assert answers[0].material == answers[1].material
+        assert answers[0].probability == pytest.approx(answers[1].probability, abs=1e-8)
+
+    @pytest.mark.parametrize(
+        ("settings", "said"), [({"solver": "svd"}, "solver must be"), ({"solver": "recursive"}, "refit=1.0")]
+    )
+    def test_a_solver_that_there_is_not_or_that_has_nothing_to_do_is_refused(self, settings, said):
+        with pytest.raises(InputError, match=said):
+            TactileLearner(sensor=PAD, **settings)
 
     @pytest.mark.parametrize("refit", [-0.1, 1.5, float("nan")])
     def test_a_share_that_is_none_is_refused(self, refit):

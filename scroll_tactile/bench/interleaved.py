@@ -9,15 +9,16 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
+from scroll_tactile.bench.peers import GradientSteps, Peer, PseudoInverse, Refitted, lacking
 from scroll_tactile.bench.timing import circumstances
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.ridge.readouts import fit_readout
+from scroll_tactile.ridge.readouts import Readout, fit_readout
+from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.selection import DEFAULT, task_of
 from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.ridge.tracking import Tracked
@@ -50,84 +51,15 @@ class AsIs:
         return features
 
 
-class _Learner(Protocol):
-    def observe(self, place: int, row: FloatArray) -> None: ...
-    def predict(self, row: FloatArray) -> int: ...
-
-
 class _Ours:
-    def __init__(self, refit: float) -> None:
-        self.learner = TactileLearner(sensor=SENSOR, embedding=AsIs(), exemplars=0, refit=refit)
+    def __init__(self, **settings: Any) -> None:
+        self.learner = TactileLearner(sensor=SENSOR, embedding=AsIs(), exemplars=0, **settings)
 
     def observe(self, place: int, row: FloatArray) -> None:
         self.learner.observe(f"{place:03d}", row.reshape(CHANNELS, READINGS).T)
 
     def predict(self, row: FloatArray) -> int:
         return int(self.learner.predict(row.reshape(CHANNELS, READINGS).T).material or -1)
-
-
-class _PseudoInverse:
-    """Deep SLDA's recursion (Hayes and Kanan 2020) with the pseudo-inverse at each prediction, in torch's float32.
-
-    So Avalanche's StreamingLDA runs it when asked after every example.
-    """
-
-    def __init__(self, classes: int, dimension: int) -> None:
-        self.means = torch.zeros(classes, dimension)
-        self.counts = torch.zeros(classes)
-        self.covariance = torch.ones(dimension, dimension)
-        self.seen = 0
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        x = torch.from_numpy(row.astype(np.float32))
-        delta = x - self.means[place]
-        self.covariance = (self.seen * self.covariance + self.seen / (self.seen + 1) * torch.outer(delta, delta)) / (
-            self.seen + 1
-        )
-        self.means[place] += delta / (self.counts[place] + 1)
-        self.counts[place] += 1
-        self.seen += 1
-
-    def predict(self, row: FloatArray) -> int:
-        shrunk = (1 - 1e-4) * self.covariance + 1e-4 * torch.eye(len(self.covariance))
-        inverse = torch.linalg.pinv(shrunk)
-        weights = inverse @ self.means.T
-        scores = torch.from_numpy(row.astype(np.float32)) @ weights - 0.5 * (self.means * weights.T).sum(dim=1)
-        return int(scores.argmax())
-
-
-class _Refitted:
-    """scikit-learn's RidgeClassifier, fitted again to all rows so far at each prediction."""
-
-    def __init__(self) -> None:
-        self.rows: list[FloatArray] = []
-        self.places: list[int] = []
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        self.rows.append(row)
-        self.places.append(place)
-
-    def predict(self, row: FloatArray) -> int:
-        from sklearn.linear_model import RidgeClassifier
-
-        model = RidgeClassifier(alpha=1.0).fit(np.stack(self.rows), self.places)
-        return int(model.predict(row[None])[0])
-
-
-class _Gradient:
-    """scikit-learn's SGDClassifier, one step a row."""
-
-    def __init__(self, classes: int, seed: int) -> None:
-        from sklearn.linear_model import SGDClassifier
-
-        self.model = SGDClassifier(loss="log_loss", random_state=seed)
-        self.classes = np.arange(classes)
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        self.model.partial_fit(row[None], [place], classes=self.classes)
-
-    def predict(self, row: FloatArray) -> int:
-        return int(self.model.predict(row[None])[0])
 
 
 def run_interleaved(
@@ -147,12 +79,12 @@ def run_interleaved(
     taught = [(at % materials, source.row(at % materials)) for at in range(streams)]
     asked = [(place, source.row(place), source.row(place)) for place in source.places(pairs)]
     records = []
-    for name, make, timed in _learners(materials, pairs, seed):
+    for name, package, make, timed in _learners(materials, pairs, seed):
+        if why := lacking(package):
+            records.append({"learner": name, "measured": False, "why": why})
+            continue
         note(f"{name}: {streams} streams")
         learner = make()
-        if learner is None:
-            records.append({"learner": name, "measured": False, "why": "scikit-learn is not installed"})
-            continue
         for place, row in taught:
             learner.observe(place, row)
         learner.predict(asked[0][1])  # the first fit is not a pair's
@@ -182,26 +114,17 @@ def run_interleaved(
     }
 
 
-def _learners(materials: int, pairs: int, seed: int) -> list[tuple[str, Callable[[], _Learner | None], int]]:
-    few = max(2, pairs // 50)
+def _learners(materials: int, pairs: int, seed: int) -> list[tuple[str, str, Callable[[], Peer], int]]:
+    """Name, the package that it needs, how it is made, and how many pairs are timed."""
+    few, d = max(2, pairs // 50), AsIs.dimension
     return [
-        ("ours, refit=0.1", lambda: _Ours(0.1), pairs),
-        ("ours, refit=0 (λ and calibration at every pair)", lambda: _Ours(0.0), few),
-        ("streaming LDA, pseudo-inverse at each prediction", lambda: _PseudoInverse(materials, AsIs.dimension), few),
-        ("RidgeClassifier, fitted again", _if_there(_Refitted), few),
-        ("SGDClassifier.partial_fit", _if_there(lambda: _Gradient(materials, seed)), pairs),
+        ("ours, refit=0.1", "torch", lambda: _Ours(refit=0.1), pairs),
+        ("ours, refit=0.1, solver='recursive'", "torch", lambda: _Ours(refit=0.1, solver="recursive"), pairs),
+        ("ours, refit=0 (λ and calibration at every pair)", "torch", lambda: _Ours(refit=0.0), few),
+        ("streaming LDA, pseudo-inverse at each prediction", "torch", lambda: PseudoInverse(materials, d), few),
+        ("RidgeClassifier, fitted again", "sklearn", Refitted, few),
+        ("SGDClassifier.partial_fit", "sklearn", lambda: GradientSteps(materials, seed), pairs),
     ]
-
-
-def _if_there(make: Callable[[], _Learner]) -> Callable[[], _Learner | None]:
-    def made() -> _Learner | None:
-        try:
-            import sklearn  # noqa: F401  # whether it is there
-        except ImportError:
-            return None
-        return make()
-
-    return made
 
 
 def _with_ratios(records: list[Record]) -> list[Record]:
@@ -229,7 +152,9 @@ class _Source:
 
 
 def _drift(interleavings: int, seed: int) -> Record:
-    """The largest relative difference, of weights and Gram matrix, between following and solving anew."""
+    """The largest relative difference, of weights and Gram matrix, between following and solving anew; and of the
+    paper's recursion, which is not anchored in between.
+    """
     dimension, materials, scale = 64, 5, 1
     source = _Source(materials, dimension, seed)
     names = [str(place) for place in range(materials)]
@@ -241,15 +166,27 @@ def _drift(interleavings: int, seed: int) -> Record:
     for at in range(200):
         statistics.add(names[at % materials], at % 3, {scale: codes(at % materials)})
     start = fit_readout(task_of(statistics, scale), DEFAULT)
-    tracked, worst = Tracked(statistics, scale, start), 0.0
+    tracked, recursive = Tracked(statistics, scale, start), Recursive(statistics, scale, start)
+    worst = {"exact": 0.0, "recursive": 0.0}
     for at, place in enumerate(source.places(interleavings)):
         rows = codes(place)
         statistics.add(names[place], at % 3, {scale: rows})
         if not tracked.add(rows, place):
             tracked.anchor(statistics)
-        found = tracked.readout()
+        recursive.add(rows, place)
+        found = {"exact": tracked.readout()}
         if at % max(1, interleavings // 100) == 0 or at + 1 == interleavings:
             anew = Tracked(statistics, scale, start).readout()
-            pairs = ((found.weights, anew.weights), (found.gram, anew.gram))
-            worst = max(worst, *(float(np.abs(one - two).max() / np.abs(two).max()) for one, two in pairs))
-    return {"interleavings": interleavings, "features": dimension, "largest_relative_difference": worst}
+            found["recursive"] = recursive.readout()
+            worst = {name: max(worst[name], _difference(readout, anew)) for name, readout in found.items()}
+    return {
+        "interleavings": interleavings,
+        "features": dimension,
+        "largest_relative_difference": worst["exact"],
+        "of_the_recursion": worst["recursive"],
+    }
+
+
+def _difference(one: Readout, two: Readout) -> float:
+    pairs = ((one.weights, two.weights), (one.gram, two.gram))
+    return max(float(np.abs(ours - theirs).max() / np.abs(theirs).max()) for ours, theirs in pairs)

@@ -1,4 +1,4 @@
-"""`scroll-tactile bench speed`: what a prediction, a statistics update and a large memory cost, as ratios.
+"""`scroll-tactile bench speed`: what a prediction, a statistics update, λ and a large memory cost, as ratios.
 
 Every pair is timed in turns in one run; the error stands beside the time. Streams are simulated: their content
 does not change the cost.
@@ -25,7 +25,11 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory import OBSERVE
 from scroll_tactile.packing import pack_codes
 from scroll_tactile.ridge.codes import to_codes
-from scroll_tactile.ridge.moments import SecondMoment
+from scroll_tactile.ridge.moments import SecondMoment, one_thread
+from scroll_tactile.ridge.path import fit_path
+from scroll_tactile.ridge.readouts import fit_readout
+from scroll_tactile.ridge.selection import PENALTIES, task_of
+from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.windows import extent, scales
 
 __all__ = ["run_speed"]
@@ -41,6 +45,8 @@ def run_speed(*, seed: int = 0, observations: int = 100_000, rounds: int = 50, n
     records = [_predict_and_resnet(seed, rounds)]
     note("a statistics update beside a plain dsyrk")
     records.append(_update_and_dsyrk(seed, rounds))
+    note("many λ from one factorisation beside one of each")
+    records += [_path_and_refits(seed, count, max(3, rounds // 10)) for count in (4, 16)]
     note(f"a memory of {observations} observations beside one of 1000")
     records += _large_and_small(seed, observations, rounds)
     return {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads(), "records": records}
@@ -124,6 +130,33 @@ def _update_and_dsyrk(seed: int, rounds: int) -> Record:
         "plain float64 dsyrk of the same rows",
         f"exact; plain: {100 * differing:.0f} % of entries differ between two orders",
         "ratio ≤ 1.5",
+    )
+
+
+def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
+    rng = np.random.default_rng(seed)
+    dimension, classes, rows = 1008, 20, 3000
+    places = np.arange(rows) % classes
+    values = np.clip(rng.normal(0, 0.05, (classes, dimension))[places] + rng.normal(0, 0.2, (rows, dimension)), -1, 1)
+    statistics = Statistics(dimension, [1])
+    for place in range(classes):
+        statistics.add(f"{place:02d}", 0, {1: to_codes(values[places == place], 1.0)})
+    task, penalties = task_of(statistics, 1), np.geomspace(min(PENALTIES), max(PENALTIES), count).tolist()
+    with one_thread():
+        calls: dict[str, Callable[[], object]] = {
+            "path": lambda: fit_path(task, penalties),
+            "each": lambda: [fit_readout(task, penalty) for penalty in penalties],
+        }
+        timings = take_turns(calls, rounds, warm_up=1)
+    pairs = zip(fit_path(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
+    worst = max(float(np.abs(one.weights - two.weights).max() / np.abs(two.weights).max()) for one, two in pairs)
+    return _record(
+        f"readouts of {count} λ, {dimension} features, {classes} materials: one tridiagonalisation",
+        timings["path"],
+        timings["each"],
+        "a Cholesky factorisation for each",
+        f"weights differ by {worst:.0e}",
+        "no bar",
     )
 
 

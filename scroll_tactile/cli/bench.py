@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from scroll_tactile.bench.buffer_study import run_buffers
+from scroll_tactile.bench.frontier import measure_frontier
 from scroll_tactile.bench.interleaved import run_interleaved
 from scroll_tactile.bench.numerics import find_nist, run_numerics
 from scroll_tactile.bench.speed import run_speed
@@ -16,8 +17,11 @@ from scroll_tactile.bench.timing import circumstances
 from scroll_tactile.bench.vision import run_vision
 from scroll_tactile.cli.numerics import show_numerics
 from scroll_tactile.cli.results import Dataset, read, require_folders
+from scroll_tactile.cli.speed import show_speed
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import InputError
+from scroll_tactile.plots_frontier import draw_frontier
 from scroll_tactile.plots_numerics import draw_numerics
 
 __all__ = ["bench"]
@@ -29,27 +33,31 @@ bench = typer.Typer(cls=Commands, no_args_is_help=True, help="Measure speed besi
 def speed(
     observations: Annotated[int, typer.Option(min=1000, help="Size of the large memory.")] = 100_000,
     rounds: Annotated[int, typer.Option(min=5, help="How often each is timed; the least counts.")] = 50,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
+    data: Annotated[
+        Path | None, typer.Option(help="BioTac_slide_20_50: also error against time on both recorded sets. Minutes.")
+    ] = None,
+    quick: Annotated[bool, typer.Option(help="Of the recorded sets one fold and two widths.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches, and of the peers.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the result to this file.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw error against time into this file; needs --data.")] = None,
 ) -> None:
-    """Time a prediction beside a ResNet-18, an update beside a plain dsyrk, a large memory beside a small one.
+    """Time a prediction, an update, λ and a large memory beside what they are to be compared with.
 
-    Filling the large memory takes a few minutes; 10000 observations take twenty seconds.
+    With --data, also the frontier: width of the embedding, readout and length of a touch, and other libraries'
+    learners on the same features. Filling the large memory takes a few minutes; 10000 observations take twenty seconds.
     """
+    require_folders(json, plot)
+    if plot is not None and data is None:
+        raise InputError("expected --data with --plot: what is drawn is measured on recorded touches")
     with progress_bar() as progress:
         result = run_speed(seed=seed, observations=observations, rounds=rounds, note=lambda what: progress(what, 0, 1))
-    table = Table("what", "ms", "beside", "ms", "ratio", "bar", "error")
-    for record in result["records"]:
-        table.add_row(
-            record["case"],
-            f"{record['milliseconds']:.2f}",
-            record["against"],
-            f"{record['against_milliseconds']:.2f}",
-            f"{record['ratio']:.2f}",
-            record["bar"],
-            record["error"],
-        )
-    console().print(table)
+        if data is not None:
+            sets = [read(dataset, data, seed) for dataset in Dataset]
+            result |= measure_frontier(sets, seed=seed, quick=quick, note=lambda what: progress(what, 0, 1))
+    show_speed(result)
+    if plot is not None:
+        draw_frontier(plot, result["frontier"], result["peers"], default=result["knee"]["default"])
+        say(f"drawn to {plot}")
     if json is not None:
         write_json(json, result)
         say(f"written to {json}")
@@ -145,7 +153,7 @@ def interleaved(
     drift = result["drift"]
     say(
         f"after {drift['interleavings']} interleavings the weights differ from those solved anew by "
-        f"{drift['largest_relative_difference']:.0e} at most"
+        f"{drift['largest_relative_difference']:.0e} at most; by the paper's recursion {drift['of_the_recursion']:.0e}"
     )
     if json is not None:
         write_json(json, result)

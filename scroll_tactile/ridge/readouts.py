@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from scroll_tactile.ridge.codes import BITS
 from scroll_tactile.ridge.moments import one_thread
 
-__all__ = ["Readout", "ReadoutName", "Task", "centred_means", "fit_readout"]
+__all__ = ["Readout", "ReadoutName", "Task", "centred_means", "fit_readout", "require_definite"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -91,6 +91,16 @@ class Readout:
     shares: FloatArray
     penalties: FloatArray
 
+    @classmethod
+    def of(cls, task: Task, penalty: float, solved: FloatArray) -> Readout:
+        """The readout of a task, from Σ⁻¹ Mᵀ of its scaled features, shape (d, C)."""
+        gram = task.means @ solved
+        gram = (gram + gram.T) / 2
+        ridge = np.linalg.inv(np.diag(1.0 / task.shares) + gram)
+        penalties = task.rows * penalty * np.square(task.scale)
+        weights = solved / task.scale[:, None]
+        return cls(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares, penalties)
+
     def project(self, codes: npt.NDArray[np.floating]) -> FloatArray:
         """z of codes of shape (…, d), shape (…, C): all that any answer needs."""
         z: FloatArray = (codes - self.center) @ self.weights
@@ -121,14 +131,14 @@ def fit_readout(task: Task, penalty: float) -> Readout:
     system[np.diag_indices_from(system)] += penalty
     with one_thread():
         factor, failed = dpotrf(system, lower=0, overwrite_a=1)
-        if failed:
-            raise np.linalg.LinAlgError(
-                f"the covariance with λ = {penalty:g} is not positive definite at row {failed}: λ is too small"
-            )
+        require_definite(penalty, failed)
         solved, _ = dpotrs(factor, task.means.T, lower=0)
-        gram = task.means @ solved
-    gram = (gram + gram.T) / 2
-    weights = solved / task.scale[:, None]
-    ridge = np.linalg.inv(np.diag(1.0 / task.shares) + gram)
-    penalties = task.rows * penalty * np.square(task.scale)
-    return Readout(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares, penalties)
+        return Readout.of(task, penalty, solved)
+
+
+def require_definite(penalty: float, failed: int) -> None:
+    """Raise numpy.linalg.LinAlgError where a factorisation says at which row Σ + λ I failed; 0 where it did not."""
+    if failed:
+        raise np.linalg.LinAlgError(
+            f"the covariance with λ = {penalty:g} is not positive definite at row {failed}: λ is too small"
+        )

@@ -14,7 +14,7 @@ exact, exact24, exact20  A and B in integers, Cholesky, refinement against the e
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,19 @@ class Covariance(RidgeBase):
             raise InputError("expected λ > 0: the covariance form begins with P = I / λ. Take the exact or the QR form")
         self._covariance: FloatArray = np.eye(self.dimension) / self.penalty
         self._weights = np.zeros((self.dimension, self.outputs))
+
+    @classmethod
+    def resume(cls, covariance: FloatArray, weights: FloatArray) -> Self:
+        """Go on from a P of shape (d, d) and a W of shape (d, C) that were come by otherwise; they are taken over."""
+        made = cls()
+        made.start(len(weights), weights.shape[1], 1.0)
+        made._covariance, made._weights = covariance, weights
+        return made
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """W of shape (d, C) as it is now, not a copy and without a diagnosis."""
+        return self._weights
 
     def _take(self, x: FloatArray, y: FloatArray) -> None:
         # Where P has lost its definiteness numbers grow without bound: the diagnosis says so, not a warning.

@@ -19,7 +19,7 @@ from scroll_tactile.ridge.moments import one_thread, within_scatter
 from scroll_tactile.ridge.readouts import Readout, centred_means
 from scroll_tactile.ridge.statistics import Statistics
 
-__all__ = ["Tracked"]
+__all__ = ["Tracked", "penalties_from"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,6 +27,13 @@ FloatArray = npt.NDArray[np.float64]
 # an update takes 0.3 ms with none, 0.9 ms with 64, a factorisation from the integers 6).
 LARGEST_RANK = 8
 LEAST_RANK = 32
+
+
+def penalties_from(start: Readout) -> FloatArray:
+    """The penalties with which to go on from a readout, in codes², shape (d,)."""
+    # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.
+    varied = start.weights.any(axis=1)
+    return np.where(varied, start.penalties, start.penalties[varied].mean() if varied.any() else 1.0)
 
 
 class Tracked:
@@ -38,9 +45,7 @@ class Tracked:
     def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
         self._scale = scale
         self._penalty = start.penalty
-        # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.
-        varied = start.weights.any(axis=1)
-        self._penalties = np.where(varied, start.penalties, start.penalties[varied].mean() if varied.any() else 1.0)
+        self._penalties = penalties_from(start)
         self.anchor(statistics)
 
     def anchor(self, statistics: Statistics) -> None:

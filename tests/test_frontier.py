@@ -126,7 +126,8 @@ def test_the_command_measures_prints_and_draws_it_all(recordings, tmp_path, monk
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "r.json").read_text())
     assert {"records", "frontier", "peers", "knee", "date", "versions", "machine", "seed"} <= found.keys()
-    assert [one["case"].split(",")[0] for one in found["records"]][-2:] == ["readouts of 4 λ", "readouts of 16 λ"]
+    cases = [one["case"].split(",")[0] for one in found["records"]]
+    assert cases[-3:] == ["statistics update", "readouts of 4 λ", "readouts of 16 λ"]
     assert (tmp_path / "r.png").read_bytes().startswith(b"\x89PNG")
     assert "the knee is at" in result.output
 

@@ -27,7 +27,7 @@ QUICK = 0.2  # of the cases' sizes
 UPDATES = {
     32: {"covariance": 10**6, "covariance-symmetric": 10**5, "qr": 10**5, "gram64": 10**6, "gram32": 10**6}
     | {"exact": 10**6, "exact24": 10**5, "exact20": 10**5},
-    512: {"covariance": 10**4, "qr": 10**4, "gram64": 10**6, "exact": 10**6},
+    512: {"covariance": 10**6, "qr": 10**4, "gram64": 10**6, "exact": 10**6},
 }
 QUICK_UPDATES = {32: dict.fromkeys(SOLVERS, 10**4)}
 SCHEDULED = ("exact", "exact24", "exact20", "gram64", "gram32", "qr", "covariance")

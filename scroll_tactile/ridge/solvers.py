@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dsyrk, ssyrk
+from scipy.linalg.blas import dgemm, dger, dsyrk, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtpqrt, spotrf, spotrs
 
 from scroll_tactile.errors import InputError, SingularError
@@ -46,7 +46,7 @@ class Covariance(RidgeBase):
     def _begin(self) -> None:
         if not self.penalty:
             raise InputError("expected λ > 0: the covariance form begins with P = I / λ. Take the exact or the QR form")
-        self._covariance: FloatArray = np.eye(self.dimension) / self.penalty
+        self._covariance: FloatArray = np.asfortranarray(np.eye(self.dimension) / self.penalty)
         self._weights = np.zeros((self.dimension, self.outputs))
 
     @classmethod
@@ -54,7 +54,7 @@ class Covariance(RidgeBase):
         """Go on from a P of shape (d, d) and a W of shape (d, C) that were come by otherwise; they are taken over."""
         made = cls()
         made.start(len(weights), weights.shape[1], 1.0)
-        made._covariance, made._weights = covariance, weights
+        made._covariance, made._weights = np.asfortranarray(covariance), weights
         return made
 
     @property
@@ -68,7 +68,11 @@ class Covariance(RidgeBase):
             projected = x @ self._covariance
             gain = _gain(x, projected)
             self._weights += gain @ (y - x @ self._weights)
-            self._covariance -= gain @ projected
+            # In place: a product that is subtracted afterwards goes over P three times.
+            if len(x) == 1:
+                self._covariance = dger(-1.0, gain[:, 0], projected[0], a=self._covariance, overwrite_a=1)
+            else:
+                self._covariance = dgemm(-1.0, gain, projected, beta=1.0, c=self._covariance, overwrite_c=1)
             if self.symmetric:
                 self._covariance = (self._covariance + self._covariance.T) / 2
 

@@ -10,9 +10,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import run
+
+from scroll_tactile.bench.tables import SECTIONS, made_from_results
+from scroll_tactile.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+RESULTS = ROOT / "examples" / "results"
 
 
 def test_the_session_gives_what_it_shows(tmp_path, monkeypatch):
@@ -59,32 +64,43 @@ def test_commands_in_the_readme_exist():
     assert all(name in helped for name in named)
 
 
-def test_the_tables_come_from_the_results():
-    shown = README.split("<!-- results -->")[1].split("<!-- /results -->")[0]
-    for name in ("biotac-20", "roboskin-20"):
-        result = json.loads((ROOT / "examples" / "results" / f"{name}.json").read_text())
-        assert f"{100 * result['means']['accuracy']['mean']:.1f}" in shown
-        assert {"command", "seed", "versions", "date"} <= result.keys()
-    speed = json.loads((ROOT / "examples" / "results" / "speed.json").read_text())
-    table = README.split("<!-- speed -->")[1].split("<!-- /speed -->")[0]
-    for record in speed["records"]:
-        assert f"{record['ratio']:.2f}" in table
+def test_the_tables_are_what_the_results_say():
+    assert set(re.findall(r"<!-- ([a-z]+) -->", README)) == set(SECTIONS)
+    assert made_from_results(README, RESULTS) == README
+    result = run("bench", "tables", "--check", "--readme", ROOT / "README.md", "--results", RESULTS)
+    assert result.exit_code == 0, result.output
 
 
-def test_the_continual_and_vision_tables_come_from_their_results():
-    shown = README.split("<!-- continual -->")[1].split("<!-- /continual -->")[0]
-    for name in ("biotac-20", "roboskin-20"):
-        result = json.loads((ROOT / "examples" / "results" / f"{name}-continual.json").read_text())
-        for row in result["means"]:
-            if row["method"] in ("f", "streaming LDA") or (row["method"], row["size"]) == ("f*", "400"):
-                assert f"{100 * row['accuracy']['mean']:.1f} ± {100 * row['accuracy']['sd']:.1f}" in shown
-        assert {"command", "seed", "versions", "date"} <= result.keys()
-        sizes = README.split("<!-- buffers -->")[1].split("<!-- /buffers -->")[0]
-        for row in result["means"] if f"{'BioTac' if name[0] == 'b' else 'RoboSkin'}-20: f" in sizes else ():
-            if row["size"] not in (None, "0"):
-                assert f"{100 * row['accuracy']['mean']:.1f}" in sizes
-    vision = json.loads((ROOT / "examples" / "results" / "vision.json").read_text())
-    table = README.split("<!-- vision -->")[1].split("<!-- /vision -->")[0]
-    for record in vision["records"]:
-        if "400" in record["image"]:
-            assert f"| {record['case']} | {record['milliseconds']:.1f} | {record['ratio']:.2f} |" in table
+def test_a_table_that_is_not_what_the_results_say_is_noticed_and_mended(tmp_path):
+    readme = tmp_path / "README.md"
+    readme.write_text(README.replace("| 99.2 ± 0.7 |", "| 99.9 ± 0.7 |"))
+    assert readme.read_text() != README
+    result = run("bench", "tables", "--check", "--readme", readme, "--results", RESULTS)
+    assert result.exit_code != 0
+    assert "bench tables" in result.output
+    assert run("bench", "tables", "--readme", readme, "--results", RESULTS).exit_code == 0
+    assert readme.read_text() == README
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<!-- speed -->\n", "no end"),
+        ("<!-- other -->\n<!-- /other -->\n", "nothing makes a section 'other'"),
+        ("<!-- speed -->\n<!-- /speed -->", "expected a result in"),
+    ],
+)
+def test_sections_that_cannot_be_made_are_named(text, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        made_from_results(text, tmp_path)
+
+
+def test_a_result_that_lacks_something_is_named(tmp_path):
+    (tmp_path / "speed.json").write_text('{"records": [{}]}')
+    with pytest.raises(InputError, match="the results for the section 'speed' lack 'case'"):
+        made_from_results("<!-- speed -->\n<!-- /speed -->", tmp_path)
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.json")), ids=lambda path: path.stem)
+def test_every_result_says_what_made_it(path):
+    assert {"seed", "versions", "date"} <= json.loads(path.read_text()).keys()

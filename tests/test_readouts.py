@@ -3,9 +3,14 @@
 import mpmath
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.special import softmax
 
+from scroll_tactile.ridge.exact import Exact
 from scroll_tactile.ridge.moments import SecondMoment, within_scatter
-from scroll_tactile.ridge.readouts import Task, fit_readout
+from scroll_tactile.ridge.readouts import Task, centred_means, fit_readout
 
 EDGE = 2**20
 
@@ -123,6 +128,45 @@ def test_all_answers_are_the_textbooks(groups, penalty):
         assert (scores - scores[0]).tolist() == pytest.approx(dense.lda(x), **close)
         assert float(readout.novelty(z)) == pytest.approx(dense.novelty(x), **close)
         assert float(readout.novelty(z, np.array([1]))) == pytest.approx(dense.novelty(x, [1]), **close)
+
+
+FELT = st.lists(
+    hnp.arrays(np.int32, st.tuples(st.integers(1, 6), st.just(3)), elements=st.integers(-EDGE, EDGE)),
+    min_size=2,
+    max_size=5,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(FELT)
+def test_the_scatter_is_that_within_classes_and_that_of_their_means(groups):
+    """Σ (x − m)(x − m)ᵀ = S_w + Σ n_y (m_y − m)(m_y − m)ᵀ: of integers the left side times N is one, exactly."""
+    moment, rows = SecondMoment(3), np.concatenate(groups).astype(object)
+    for group in groups:
+        moment.add(group)
+    counts = np.array([len(group) for group in groups])
+    sums = np.stack([group.sum(axis=0, dtype=np.int64) for group in groups])
+    within = np.triu(within_scatter(moment.packed(), counts, sums))
+    _, means = centred_means(counts, sums)
+    total, whole = len(rows) * rows.T @ rows - np.outer(rows.sum(axis=0), rows.sum(axis=0)), (means.T * counts) @ means
+    expected = np.triu((total / len(rows)).astype(np.float64))
+    size = np.abs(expected).max() + 1.0
+    assert np.abs(within + np.triu(whole) - expected).max() <= 1e-12 * size
+
+
+@settings(max_examples=40, deadline=None)
+@given(FELT, st.sampled_from([1e-3, 1.0, 1e6]))
+def test_targets_of_plus_and_minus_one_are_those_of_0_and_1_at_temperature_2(groups, penalty):
+    rows, places = np.concatenate(groups) / EDGE, np.repeat(np.arange(len(groups)), [len(one) for one in groups])
+    targets = np.eye(len(groups))[places]
+    scores = []
+    for wanted in (targets, 2 * targets - 1):
+        solver = Exact()
+        solver.start(3, len(groups), penalty)
+        solver.update(rows, wanted)
+        weights, _ = solver.solve(centred=True)
+        scores.append((rows - rows.mean(axis=0)) @ weights + wanted.mean(axis=0))
+    assert softmax(scores[0], axis=1) == pytest.approx(softmax(scores[1] / 2, axis=1), rel=1e-12, abs=1e-15)
 
 
 def test_many_rows_are_answered_as_each_alone():

@@ -13,6 +13,7 @@ from scroll_tactile.bench.frontier import measure_frontier
 from scroll_tactile.bench.interleaved import run_interleaved
 from scroll_tactile.bench.numerics import find_nist, run_numerics
 from scroll_tactile.bench.speed import run_speed
+from scroll_tactile.bench.tables import made_from_results
 from scroll_tactile.bench.timing import circumstances
 from scroll_tactile.bench.vision import run_vision
 from scroll_tactile.cli.numerics import show_numerics
@@ -158,6 +159,27 @@ def interleaved(
     if json is not None:
         write_json(json, result)
         say(f"written to {json}")
+
+
+@bench.command()
+def tables(
+    readme: Annotated[Path, typer.Option(help="The text whose tables are made.")] = Path("README.md"),
+    results: Annotated[Path, typer.Option(help="The folder of results.")] = Path("examples/results"),
+    check: Annotated[bool, typer.Option(help="Write nothing; fail where a table is not as the results say.")] = False,
+) -> None:
+    """Make the README's tables from the files of results, between the marks <!-- name --> and <!-- /name -->."""
+    try:
+        text = readme.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{readme} cannot be read: {error.strerror}") from error
+    made = made_from_results(text, results)
+    if made == text:
+        say(f"{readme} is as {results} says")
+        return
+    if check:
+        raise InputError(f"{readme} is not as {results} says: make its tables with scroll-tactile bench tables")
+    readme.write_text(made, encoding="utf-8")
+    say(f"written to {readme}")
 
 
 @bench.command()

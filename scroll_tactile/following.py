@@ -15,7 +15,10 @@ import numpy.typing as npt
 
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
+from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.recursive import Recursive
+from scroll_tactile.ridge.selection import Selection
+from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.ridge.tracking import Tracked
 
 __all__ = ["Added", "Following", "SolverName"]
@@ -50,6 +53,11 @@ class Following:
         self._felt += len(added)
         if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in statistics.scales):
             return False
+        with one_thread():
+            self.model = replace(self.model, selections=self._followed(statistics, added))
+        return True
+
+    def _followed(self, statistics: Statistics, added: Sequence[Added]) -> dict[int, Selection]:
         selections = dict(self.model.selections)
         for scale, selection in selections.items():
             rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]
@@ -60,8 +68,7 @@ class Following:
             elif not all(tracked.add(codes, place) for place, codes in rows):
                 tracked.anchor(statistics)
             selections[scale] = replace(selection, readout=tracked.readout())
-        self.model = replace(self.model, selections=selections)
-        return True
+        return selections
 
     def _names(self, scale: int) -> list[str]:
         selection = self.model.selections.get(scale)

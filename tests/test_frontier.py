@@ -8,8 +8,9 @@ import pytest
 from commands import run
 
 from scroll_tactile import sensors
-from scroll_tactile.bench import frontier, speed
+from scroll_tactile.bench import speed
 from scroll_tactile.bench.frontier import knee, measure_frontier, run_frontier, run_peers
+from scroll_tactile.bench.ours import Ours
 from scroll_tactile.bench.peers import PseudoInverse, Refitted, lacking
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.simulator import Scene
@@ -66,7 +67,7 @@ def test_peers_learn_the_same_vectors(recordings, monkeypatch):
 def test_ours_follows_between_fits_and_says_the_same():
     rng = np.random.default_rng(0)
     rows = np.clip(rng.normal(rng.random((3, 16))[np.arange(60) % 3], 0.1), 0, 1)
-    following, refitting = frontier._Ours(16, 1.0), frontier._Ours(16, 0.0)
+    following, refitting = Ours(16, 1.0), Ours(16, 0.0)
     for at, row in enumerate(rows):
         for learner in (following, refitting):
             learner.observe(at % 3, row)

@@ -17,6 +17,7 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.bench.ours import Ours
 from scroll_tactile.bench.peers import (
     GradientSteps,
     OneVsRest,
@@ -31,12 +32,8 @@ from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.peers import touch_features
-from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.moments import one_thread
-from scroll_tactile.ridge.readouts import Readout, ReadoutName
-from scroll_tactile.ridge.selection import select
-from scroll_tactile.ridge.statistics import Statistics, fold_of
-from scroll_tactile.ridge.tracking import Tracked
+from scroll_tactile.ridge.readouts import ReadoutName
 
 __all__ = ["WIDTHS", "knee", "measure_frontier", "run_frontier", "run_peers"]
 
@@ -133,51 +130,6 @@ def _timed(call: Callable[[], object]) -> float:
     return time.perf_counter() - begun
 
 
-class _Ours:
-    """The statistics and the readout of the memory, fed vectors.
-
-    λ is chosen again where there is a new class or the rows have grown by the share `refit`; in between the readout
-    follows, as a learner's does.
-    """
-
-    def __init__(self, dimension: int, refit: float) -> None:
-        self.statistics = Statistics(dimension, [1])
-        self.refit = refit
-        self._waiting: list[tuple[str, npt.NDArray[np.int32]]] = []
-        self._fitted_at = self._seen = 0
-        self._names: dict[str, int] = {}
-        self._tracked: Tracked | None = None
-        self._readout: Readout | None = None
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        name, codes = f"{place:03d}", to_codes(row[None], 1.0)
-        self.statistics.add(name, fold_of(codes.tobytes()), {1: codes})
-        self._seen += 1
-        self._waiting.append((name, codes))
-
-    def predict(self, row: FloatArray) -> int:
-        if self._waiting:
-            self._take_in()
-        assert self._readout is not None
-        z = self._readout.project(in_units(row[None], 1.0))
-        return int(list(self._names)[int(self._readout.scores(z, "lda").argmax())])
-
-    def _take_in(self) -> None:
-        new = any(name not in self._names for name, _ in self._waiting)
-        if new or self._readout is None or self._seen > (1 + self.refit) * self._fitted_at:
-            selection = select(self.statistics, 1, "lda")
-            assert selection is not None
-            self._names, self._readout = selection.places, selection.readout
-            self._fitted_at, self._tracked = self._seen, None
-        else:
-            if self._tracked is None:
-                self._tracked = Tracked(self.statistics, 1, self._readout)
-            elif not all(self._tracked.add(codes, self._names[name]) for name, codes in self._waiting):
-                self._tracked.anchor(self.statistics)
-            self._readout = self._tracked.readout()
-        self._waiting.clear()
-
-
 def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lambda what: None) -> list[Record]:
     """Ours and others on the same vectors, the mean of a touch's windows: wrong share of a fold, and milliseconds.
 
@@ -208,8 +160,8 @@ def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lamb
 def _peers(classes: int, seed: int) -> list[tuple[str, str, Callable[[], Peer]]]:
     """Name, the package that it needs, how it is made."""
     return [
-        ("ours, refit=0: λ at every change", "torch", lambda: _Ours(PEERS_WIDTH, 0.0)),
-        ("ours, refit=0.1: λ where it has grown by a tenth", "torch", lambda: _Ours(PEERS_WIDTH, 0.1)),
+        ("ours, refit=0: λ at every change", "torch", lambda: Ours(PEERS_WIDTH, 0.0)),
+        ("ours, refit=0.1: λ where it has grown by a tenth", "torch", lambda: Ours(PEERS_WIDTH, 0.1)),
         ("streaming LDA, pseudo-inverse on predict", "torch", lambda: PseudoInverse(classes, PEERS_WIDTH)),
         ("scikit-learn RidgeClassifier, fitted again", "sklearn", Refitted),
         ("scikit-learn SGDClassifier.partial_fit", "sklearn", lambda: GradientSteps(classes, seed)),

@@ -68,9 +68,8 @@ class Recursive:
         values = rows - self._origin
         targets = np.zeros((1, len(self._counts)))
         targets[0, place] = 1.0
-        with one_thread():
-            for row in values / np.sqrt(self._penalties):
-                self._recursion.update(np.concatenate([[1.0], row])[None], targets)
+        for row in values / np.sqrt(self._penalties):
+            self._recursion.update(np.concatenate([[1.0], row])[None], targets)
         self._counts[place] += len(rows)
         self._means[place] += (values - self._means[place]).sum(axis=0) / self._counts[place]
         return True
@@ -81,10 +80,9 @@ class Recursive:
         offset = shares @ self._means
         means = self._means - offset
         body = self._recursion.coefficients[1:] / np.sqrt(self._penalties)[:, None]
-        with one_thread():
-            ridge = shares[:, None] * (np.eye(len(shares)) - means @ body)
-            weights = np.linalg.solve(ridge.T, body.T).T
-            gram = means @ weights
+        ridge = shares[:, None] * (np.eye(len(shares)) - means @ body)
+        weights = np.linalg.solve(ridge.T, body.T).T
+        gram = means @ weights
         return Readout(
             self._penalty,
             self._origin + offset,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.blas import dtrsv
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.ridge.moments import one_thread, within_scatter
@@ -27,6 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 # an update takes 0.3 ms with none, 0.9 ms with 64, a factorisation from the integers 6).
 LARGEST_RANK = 8
 LEAST_RANK = 32
+FEW = 4  # columns that are solved for one by one
 
 
 def penalties_from(start: Readout) -> FloatArray:
@@ -39,7 +41,8 @@ def penalties_from(start: Readout) -> FloatArray:
 class Tracked:
     """The readout of one scale as rows come, with the penalties of the readout that it starts from.
 
-    Equal, but for rounding, to a fresh solve of (S_w + P) W = M on the statistics with all rows added.
+    Equal, but for rounding, to a fresh solve of (S_w + P) W = M on the statistics with all rows added. Its products are
+    small: whoever calls it with BLAS on one thread (`one_thread`) is answered soonest.
     """
 
     def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
@@ -67,9 +70,10 @@ class Tracked:
             self._origin = center
             self._counts = counts.astype(np.float64)
             self._means = means
-            self._solved, _ = dpotrs(self._factor, self._means.T, lower=0)
-            self._gram = self._means @ self._solved
-        dimension, classes = self._solved.shape
+            # Of shape (C, d), class by class, as all that is added to it.
+            self._solved = np.ascontiguousarray(dpotrs(self._factor, self._means.T, lower=0)[0].T)
+            self._gram = self._means @ self._solved.T
+        classes, dimension = self._solved.shape
         self._rank = 0
         room = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
@@ -85,24 +89,31 @@ class Tracked:
         if last > len(self._u) or not self._counts[place]:
             return False
         before, count = self._counts[place], len(rows)
-        with one_thread():
-            solved = dpotrs(self._factor, new.T, lower=0)[0].T
-            self._u[first:last], self._v[first:last] = new, solved
-            # The last column is the way of the class mean, so the mean's own solution follows from it.
-            share = np.sqrt(count / (before * (before + count)))
-            self._means[place] += share * new[-1]
-            self._solved[:, place] += share * solved[-1]
-            self._counts[place] += count
-            column = self._means @ self._solved[:, place]
-            self._gram[place], self._gram[:, place] = column, column
-            self._b[first:last] = new @ self._solved
-            self._b[:last, place] = self._u[:last] @ self._solved[:, place]
-            cross = self._u[:last] @ solved.T
-            self._s[:last, first:last] = cross
-            self._s[first:last, :last] = cross.T
-            self._s[range(first, last), range(first, last)] += 1.0
+        solved = self._solve(new)
+        self._u[first:last], self._v[first:last] = new, solved
+        # The last column is the way of the class mean, so the mean's own solution follows from it.
+        share = np.sqrt(count / (before * (before + count)))
+        self._means[place] += share * new[-1]
+        self._solved[place] += share * solved[-1]
+        self._counts[place] += count
+        column = self._means @ self._solved[place]
+        self._gram[place], self._gram[:, place] = column, column
+        self._b[first:last] = new @ self._solved.T
+        self._b[:last, place] = self._u[:last] @ self._solved[place]
+        cross = self._u[:last] @ solved.T
+        self._s[:last, first:last] = cross
+        self._s[first:last, :last] = cross.T
+        self._s[range(first, last), range(first, last)] += 1.0
         self._rank = last
         return True
+
+    def _solve(self, new: FloatArray) -> FloatArray:
+        """K₀⁻¹ times each of the rows, shape (k, d)."""
+        if len(new) > FEW:
+            solved: FloatArray = dpotrs(self._factor, new.T, lower=0)[0].T
+            return solved
+        # A triangle against one vector is read once; as a matrix of one column LAPACK takes four times as long.
+        return np.stack([dtrsv(self._factor, dtrsv(self._factor, one, trans=1)) for one in new])
 
     def _columns(self, rows: npt.NDArray[np.integer], place: int) -> FloatArray:
         """What is to be added to U for these rows, transposed, (k, d): Σ over them of the scatter's change.
@@ -122,15 +133,14 @@ class Tracked:
         """The readout of all rows so far."""
         rank, total = self._rank, self._counts.sum()
         shares = self._counts / total
-        with one_thread():
-            inner = np.linalg.solve(self._s[:rank, :rank], self._b[:rank])
-            solved = self._solved - self._v[:rank].T @ inner
-            gram = self._gram - self._b[:rank].T @ inner
-            offset = shares @ self._means
-            weights = total * (solved - (solved @ shares)[:, None])
-            towards = gram @ shares
-            gram = total * (gram - towards[:, None] - towards + shares @ towards)
-            gram = (gram + gram.T) / 2
-            ridge = np.linalg.inv(np.diag(1.0 / shares) + gram)
+        inner = np.linalg.solve(self._s[:rank, :rank], self._b[:rank])
+        solved = self._solved - inner.T @ self._v[:rank]
+        gram = self._gram - self._b[:rank].T @ inner
+        offset = shares @ self._means
+        weights = total * (solved - shares @ solved).T
+        towards = gram @ shares
+        gram = total * (gram - towards[:, None] - towards + shares @ towards)
+        gram = (gram + gram.T) / 2
+        ridge = np.linalg.inv(np.diag(1.0 / shares) + gram)
         center = self._origin + offset
         return Readout(self._penalty, center, weights, gram, (ridge + ridge.T) / 2, shares, self._penalties)

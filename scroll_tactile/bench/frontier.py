@@ -1,8 +1,9 @@
 """The frontier of `scroll-tactile bench speed`: error against milliseconds, on recorded touches.
 
 Width of the embedding × readout × length of the touch asked about, learned from one pass over the other folds; and
-beside it other libraries' learners on the same feature vectors, one for each touch. Times are medians over the touches
-of one fold, and single-threaded; errors are of all folds asked for.
+beside it other libraries' learners on the same feature vectors, one for each touch. Times are of the processor, on one
+thread, and medians over the touches of one fold: what others do on a shared machine must not count. Errors are of all
+folds asked for.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from scroll_tactile.bench.ours import Ours
 from scroll_tactile.bench.peers import (
@@ -32,7 +34,6 @@ from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.peers import touch_features
-from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.readouts import ReadoutName
 
 __all__ = ["WIDTHS", "knee", "measure_frontier", "run_frontier", "run_peers"]
@@ -83,7 +84,7 @@ def run_frontier(
 def _one_fold(recordings: Recordings, fold: int, width: int) -> list[tuple[tuple[str, str], float, Record]]:
     learned, asked = _split(recordings, fold)
     found = []
-    with tempfile.TemporaryDirectory() as folder, one_thread():
+    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         path, embedding = Path(folder, "memory"), Kernels(dimension=width)
         with TactileLearner.open(path, sensor=recordings.sensor, embedding=embedding, exemplars=0) as learner:
             observing = [_timed(partial(learner.observe, *one)) for one in learned]
@@ -106,9 +107,9 @@ def _answered(learner: TactileLearner, asked: Sequence[Labelled], seconds: float
     wrong, taken = 0, []
     for name, stream in asked:
         cut = stream if seconds is None else stream.first(seconds)
-        begun = time.perf_counter()
+        begun = time.process_time()
         said = learner.predict(cut).material
-        taken.append(time.perf_counter() - begun)
+        taken.append(time.process_time() - begun)
         wrong += said != name
     return wrong / len(asked), taken
 
@@ -125,9 +126,9 @@ def _split(recordings: Recordings, fold: int) -> tuple[list[Labelled], list[Labe
 
 
 def _timed(call: Callable[[], object]) -> float:
-    begun = time.perf_counter()
+    begun = time.process_time()
     call()
-    return time.perf_counter() - begun
+    return time.process_time() - begun
 
 
 def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lambda what: None) -> list[Record]:
@@ -152,7 +153,7 @@ def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lamb
             records.append(told | {"measured": False, "why": why})
             continue
         note(f"{recordings.name}: {name}")
-        with one_thread():
+        with threadpool_limits(1):
             records.append(told | {"measured": True} | _measured(make(), rows, places, order, questions, truth))
     return records
 
@@ -185,9 +186,9 @@ def _measured(
             fresh.append(_timed(partial(peer.predict, questions[0])))
     taken, wrong = [], 0
     for row, place in zip(questions, truth, strict=True):
-        begun = time.perf_counter()
+        begun = time.process_time()
         said = peer.predict(row)
-        taken.append(time.perf_counter() - begun)
+        taken.append(time.process_time() - begun)
         wrong += said != place
     return {
         "wrong": wrong / len(truth),

@@ -25,10 +25,16 @@ class Timing:
     median: float
 
 
-def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, warm_up: int = 3) -> dict[str, Timing]:
+def take_turns(
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int,
+    warm_up: int = 3,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, Timing]:
     """Time calls by name; in every round each is called a few times, so that a slow moment of the machine hits all.
 
-    A few, not once: the first call after another's finds its data pushed out of the processor's cache.
+    A few, not once: the first call after another's finds its data pushed out of the processor's cache. clock: seconds;
+    `time.process_time` for what runs on one thread, where others are at work on the machine.
     """
     for call in calls.values():
         for _ in range(warm_up):
@@ -37,9 +43,9 @@ def take_turns(calls: Mapping[str, Callable[[], object]], rounds: int, warm_up: 
     for _ in range(rounds):
         for name, call in calls.items():
             for _ in range(IN_A_ROW):
-                begin = time.perf_counter()
+                begin = clock()
                 call()
-                seconds[name].append(time.perf_counter() - begin)
+                seconds[name].append(clock() - begin)
     return {name: Timing(min(taken), float(np.median(taken))) for name, taken in seconds.items()}
 
 

@@ -150,7 +150,7 @@ def _standing(store: Store) -> list[Head]:
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
     if ours.path.resolve() == theirs.path.resolve():
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
-    for part in ("sensor", "embedding", "reading", "grid"):
+    for part in ("sensor", "embedding", "reading", "grid", "augmentation"):
         mine, other = ours.identity.get(part), theirs.identity.get(part)
         if mine != other:
             raise MismatchError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
 from scroll_tactile.memory import Capacity
@@ -13,7 +14,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.windows import Reading
 from store import Store
 
-__all__ = ["capacity_of", "identity_of", "kept_capacity", "require_same"]
+__all__ = ["capacity_of", "identity_of", "kept_augmentation", "kept_capacity", "require_same"]
 
 
 def capacity_of(streams: int | None, nbytes: int | None) -> Capacity:
@@ -43,10 +44,29 @@ def kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
     return kept
 
 
-def identity_of(sensor: Sensor, embedding: Embedding, capacity: Capacity) -> dict[str, Any]:
+def kept_augmentation(store: Store, asked: Augmented | None) -> Augmented | None:
+    """The augmentation that a memory was made with, none where it was made before there was any.
+
+    Raises MismatchError where another one was asked for.
+    """
+    told = store.identity.get("augmentation")
+    kept = None if told is None else Augmented(**cast(dict[str, Any], told))
+    if asked is not None and asked != kept:
+        raise MismatchError(
+            f"{store.path} was made with {kept or 'no augmentation'}; it was opened with {asked}. Its touches were not "
+            "observed with those copies: leave the augmentation out, or take another path"
+        )
+    return kept
+
+
+def identity_of(
+    sensor: Sensor, embedding: Embedding, capacity: Capacity, augmentation: Augmented | None = None
+) -> dict[str, Any]:
     """What is written into a new memory for good, in JSON's types."""
     reading = Reading.of(sensor, embedding)
-    return {
+    # Left out where there is none: such a memory can be opened by the versions before it.
+    copies = {} if augmentation is None else {"augmentation": augmentation.to_json()}
+    return copies | {
         "exemplars": [capacity.streams, capacity.nbytes],
         "reading": [reading.partial, reading.judged],
         "sensor": sensor.model_dump(mode="json"),

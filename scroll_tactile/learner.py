@@ -13,18 +13,20 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.finetune import fine_tune
 from scroll_tactile.following import Following, SolverName
-from scroll_tactile.identity import capacity_of, identity_of, kept_capacity, require_same
+from scroll_tactile.identity import capacity_of, identity_of, kept_augmentation, kept_capacity, require_same
 from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
+from scroll_tactile.packing import Codes
 from scroll_tactile.prediction import Compacted, Merged, Prediction, Receipt
-from scroll_tactile.requests import candidates_of, require_name, require_settings
+from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.sensors import Sensor
@@ -63,6 +65,9 @@ class TactileLearner:
     next fit; it is there to be compared with, and what the memory keeps is exact all the same.
     exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
     choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
+    augmentation: the copies that each touch is observed with, see `Augmented`; none unless given. A touch and its
+    copies are one observation: it is taken back with them, and is as exact. Each copy costs as much time and space as
+    the touch does, when it is observed; `predict` reads what it is given and nothing else.
 
     In memory only; `TactileLearner.open` gives one with a path. Methods may be called from any thread.
     """
@@ -78,6 +83,7 @@ class TactileLearner:
         solver: SolverName = "exact",
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
+        augmentation: Augmented | None = None,
     ) -> None:
         require_settings(readout, false_alarms, refit, solver)
         self.sensor = sensor
@@ -85,6 +91,7 @@ class TactileLearner:
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
         self.refit = refit
+        self.augmentation = require_augmentable(sensor, augmentation)
         self.solver: SolverName = solver
         self._reading = Reading.of(sensor, self.embedding)
         self._capacity = capacity_of(exemplars, exemplar_bytes)
@@ -106,22 +113,23 @@ class TactileLearner:
         solver: SolverName = "exact",
         exemplars: int | None = None,
         exemplar_bytes: int | None = None,
+        augmentation: Augmented | None = None,
         mode: Literal["write", "read"] = "write",
     ) -> TactileLearner:
         """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
 
-        sensor: may be left out for a memory that is there, and so may the size of the buffer. mode: "read" for one
-        that another process writes; it shows what was committed when it was opened.
+        sensor: may be left out for a memory that is there, and so may the size of the buffer and the augmentation.
+        mode: "read" for one that another process writes; it shows what was committed when it was opened.
 
-        Raises SensorMismatchError, EmbeddingMismatchError for a memory made with others, InputError where a
-        new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
+        Raises SensorMismatchError, EmbeddingMismatchError, MismatchError for a memory made with others, InputError
+        where a new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
         """
         require_settings(readout, false_alarms, refit, solver)
         chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
         asked = capacity_of(exemplars, exemplar_bytes)
-        identity = None if sensor is None else identity_of(sensor, chosen, asked)
+        identity = None if sensor is None else identity_of(sensor, chosen, asked, augmentation)
         store = Store.open(path, identity=identity, mode=mode)
         try:
             if "sensor" not in store.identity:
@@ -138,6 +146,7 @@ class TactileLearner:
                 solver=solver,
                 exemplars=capacity.streams,
                 exemplar_bytes=capacity.nbytes,
+                augmentation=kept_augmentation(store, augmentation),
             )
             reading = learner._reading
             learner._ledger = Ledger(lambda: Memory.load(store, chosen.dimension, reading, capacity), store)
@@ -171,9 +180,18 @@ class TactileLearner:
         require_name(material)
         felt = validate(stream, self.sensor)
         image = tactile_image(felt)
-        bound = self.embedding.bound
-        codes = {width: to_codes(rows, bound) for width, rows in self._features(image).items()}
-        return self._ledger.observe(material, felt, image.shape[1], codes)
+        return self._ledger.observe(material, felt, image.shape[1], self._codes(image, felt))
+
+    def _codes(self, image: npt.NDArray[np.float32], felt: Stream) -> Codes:
+        """The codes of a touch's windows by scale, behind them those of its copies.
+
+        The touch's own come first: the pool finds them by their place. Copies are no longer than the touch, and so
+        have no scale that it has not.
+        """
+        copies = [] if self.augmentation is None else self.augmentation.copies_of(image, felt.key)
+        own, *others = [self._features(one) for one in (image, *copies)]
+        read = {width: [rows, *(one[width] for one in others if width in one)] for width, rows in own.items()}
+        return {width: to_codes(np.concatenate(rows), self.embedding.bound) for width, rows in read.items()}
 
     @contextmanager
     def batch(self) -> Iterator[None]:

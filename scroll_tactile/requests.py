@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from scroll_tactile.copies import Augmented
 from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialError
+from scroll_tactile.sensors import Sensor
 
-__all__ = ["candidates_of", "require_name", "require_settings"]
+__all__ = ["candidates_of", "require_augmentable", "require_name", "require_settings"]
 
 LONGEST_NAME = 200  # characters
 
@@ -26,6 +28,18 @@ def require_settings(readout: str, false_alarms: float, refit: float, solver: st
             "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by one: "
             "give refit=1.0, say, to fit again when the memory has doubled"
         )
+
+
+def require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> Augmented | None:
+    """The augmentation. Raises InputError for what is none, and for a camera, whose frames are not slid along time."""
+    if augmentation is not None and not isinstance(augmentation, Augmented):
+        raise InputError(f"expected an augmentation such as Augmented(copies=4); came {augmentation!r:.60}")
+    if augmentation is not None and sensor.camera:
+        raise InputError(
+            f"the copies of an augmentation differ in speed, noise and broken wires, and camera {sensor.name!r} takes "
+            "whole frames: leave the augmentation out"
+        )
+    return augmentation
 
 
 def require_name(material: str) -> None:

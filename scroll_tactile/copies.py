@@ -1,0 +1,109 @@
+"""Augmented observation: a touch is learned together with copies of it as they would have been felt otherwise.
+
+The copies are drawn with a generator that is seeded by the touch's content hash, so that what is learned of a touch
+is a function of the touch: in any order, on any machine, at any time the same bits. Only the four operations that
+IEEE 754 rounds correctly are used, and no power or logarithm, whose last bit differs between machines.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.augment import Image, crop, resize
+from scroll_tactile.errors import InputError
+
+__all__ = ["Augmented", "hiss", "silence", "wander"]
+
+FEWEST = 2  # columns of a copy: a touch is not sped up until nothing of it is left
+
+
+def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
+    """The touch felt by a noisy sensor: uniform noise in ± `amplitude`, a share of the range; clipped to the range.
+
+    image: float32 of shape (C, T) in [-1, 1], twice the share. Every value has noise of its own.
+    """
+    noise = rng.random(image.shape, dtype=np.float32) * np.float32(2) - np.float32(1)
+    noisy: Image = np.clip(image + noise * np.float32(2 * amplitude), np.float32(-1), np.float32(1))
+    return noisy
+
+
+def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
+    """The touch felt with broken wires: a `share` of the channels, rounded, reads the low end of the range throughout.
+
+    image: float32 of shape (C, T) in [-1, 1]. Which channels are broken is drawn.
+    """
+    silent = image.copy()
+    silent[rng.permutation(len(image))[: round(share * len(image))]] = -1
+    return silent
+
+
+def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -> Image:
+    """The touch felt by a sensor that warms up: each channel's gain and zero change along a straight line.
+
+    image: float32 of shape (C, T) in [-1, 1]. From nothing at the beginning to, at the end, an offset of at most
+    `offset` of the range and a gain of at most 1 ± `gain` about the low end of the range, drawn for each channel;
+    clipped to the range.
+    """
+    along = np.linspace(0, 1, image.shape[1], dtype=np.float32)
+    drawn = rng.random((2, len(image), 1), dtype=np.float32) * np.float32(2) - np.float32(1)
+    change = (image + 1) * (drawn[0] * np.float32(gain)) + drawn[1] * np.float32(2 * offset)
+    wandered: Image = np.clip(image + change * along, np.float32(-1), np.float32(1))
+    return wandered
+
+
+@dataclass(frozen=True)
+class Augmented:
+    """Which copies a touch is observed with.
+
+    copies: how many, 1 or more, the same for every touch, so that each counts alike. speed: the most that a copy is
+    slower, or faster, as a factor of 1 or more. dead: the largest share of channels that read the low end of the
+    range. noise: the largest amplitude of uniform noise, as a share of the range. offset, gain: the most that a
+    channel's zero (as a share of the range) and its gain drift by until the end of the touch.
+
+    A copy is no longer than the touch: what is slower is cut off there, as it is where it is asked about.
+
+    Raises InputError for strengths that cannot be.
+    """
+
+    copies: int = 4
+    speed: float = 2.0
+    dead: float = 0.3
+    noise: float = 0.0
+    offset: float = 0.0
+    gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.copies, int) and not isinstance(self.copies, bool) and self.copies >= 1
+        strengths = (self.speed - 1, self.dead, self.noise, self.offset, self.gain)
+        if not whole or not all(math.isfinite(one) and one >= 0 for one in strengths) or self.dead >= 1:
+            raise InputError(
+                f"expected 1 copy or more, a speed of 1 or more, dead in [0, 1), and noise, offset and gain of 0 or "
+                f"more; came {self}"
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it in JSON's types, as a memory keeps it."""
+        return asdict(self)
+
+    def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> list[Image]:
+        """The copies of a touch, each float32 of shape (C, T') in [-1, 1], T' ≤ T; the same for the same key.
+
+        image: the tactile image of the touch, shape (C, T). key: its content hash, see `Stream.key`.
+        """
+        rng = np.random.default_rng([1, int.from_bytes(key, "little")])
+        return [self._copy(image, rng) for _ in range(self.copies)]
+
+    def _copy(self, image: Image, rng: np.random.Generator) -> Image:
+        slower, much, dead, noise, offset, gain = rng.random(6)
+        factor = 1 + much * (self.speed - 1)
+        columns = image.shape[1]
+        copy = resize(image, max(factor if slower < 0.5 else 1 / factor, FEWEST / columns))
+        copy = crop(copy, 0, min(columns, copy.shape[1]))
+        copy = wander(copy, offset * self.offset, gain * self.gain, rng)
+        copy = silence(copy, dead * self.dead, rng)
+        return np.ascontiguousarray(hiss(copy, noise * self.noise, rng))

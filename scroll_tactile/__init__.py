@@ -9,12 +9,14 @@ from scroll_tactile import errors, sensors
 from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import Embedding, Joined, Kernels, ModuleEmbedding, Vision, check_embedding
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.prediction import Prediction, Receipt
+from scroll_tactile.prediction import Composition, Constituent, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream
 
 __all__ = [
     "Augmented",
+    "Composition",
+    "Constituent",
     "Embedding",
     "Joined",
     "Kernels",

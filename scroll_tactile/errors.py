@@ -11,6 +11,7 @@
     │   │   ├── NotFiniteError               NaN or infinity: leave the touch out, or repair the readings
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
     │   ├── MaterialError                    a material's name is not usable
+    │   ├── DescriptionError                 what a material is said to be made of cannot be
     │   ├── UnknownMaterialError (KeyError)  a material that was never felt is asked for
     │   └── ObservationError (KeyError)      an observation that is not there, or can no longer be taken back
     ├── MismatchError                        two things that do not belong together: open the right one
@@ -61,6 +62,10 @@ class ReadingsTypeError(StreamError, TypeError):
 
 class MaterialError(InputError):
     """A material's name is not usable: no string, empty, too long, or with characters that do not print."""
+
+
+class DescriptionError(InputError):
+    """What a material is said to be made of cannot be: shares that do not sum to one, or a name that is none."""
 
 
 class UnknownMaterialError(InputError, KeyError):

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, cast
 
+from scroll_tactile.descriptions import Description
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory import FELT, MERGE, OBSERVE, RETRACT, Memory
+from scroll_tactile.memory import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory
 from scroll_tactile.packing import unspanned
 from scroll_tactile.prediction import Receipt
 from store import Head, Record, Store
 
-__all__ = ["Incoming", "compaction_point", "observation_of", "observations_of", "withdrawn_in"]
+__all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations_of", "withdrawn_in"]
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
@@ -68,23 +69,30 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
     return memory.base if len(sequences) <= keep else sequences[-keep] - 1
 
 
+Choice = Literal["same", "ours", "theirs"]
+"""Whose description of a material is kept where two memories have one each; "same": it must be the same."""
+
+
 @dataclass(frozen=True)
 class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: its heads. shared: streams that both felt. Made by `Incoming.of`.
+    rows: its heads. shared: streams that both felt. descriptions: those that are not ours already, by material.
+    Made by `Incoming.of`.
     """
 
     source: Store
     rows: list[Head]
     shared: int
+    descriptions: dict[str, Description]
 
     @classmethod
-    def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool) -> Incoming:
+    def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool, descriptions: Choice) -> Incoming:
         """Look through both journals.
 
         once: leave out streams that both felt, of one material with one content hash. Raises MismatchError where
-        theirs cannot be a part of ours, ObservationError where a shared one cannot be left out.
+        theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
+        shared stream cannot be left out.
         """
         _require_mergeable(ours, memory, theirs)
         base, there = theirs.compacted, _standing(theirs)
@@ -104,7 +112,7 @@ class Incoming:
                 f"{theirs.path} kept no readings of what it felt (exemplars=0), of which {ours.path} keeps "
                 "exemplars: feel it again, or merge into a memory made with exemplars=0"
             )
-        return cls(theirs, rows, len(both))
+        return cls(theirs, rows, len(both), _descriptions(ours, memory, theirs, descriptions))
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -112,6 +120,9 @@ class Incoming:
         The caller makes a batch of it, and tells `each` (rows done, rows in all) what is shown.
         """
         total = len(self.rows)
+        for material, one in self.descriptions.items():
+            memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": one}).sequence
+            memory.describe(material, one)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._told(), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != FELT:
@@ -123,7 +134,8 @@ class Incoming:
     def _told(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         base = self.source.base()
         if base is not None:
-            attributes = {name: value for name, value in base.attributes.items() if not name.startswith("tuned")}
+            left_out = ("tuned", "descriptions")  # these come as rows of their own, where they do
+            attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
         for head in self.rows:
@@ -145,6 +157,26 @@ def _standing(store: Store) -> list[Head]:
     heads = list(store.heads())
     gone = withdrawn_in(heads)
     return [head for head in heads if head.kind in (OBSERVE, MERGE, FELT) and head.sequence not in gone]
+
+
+def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
+    """Their descriptions that are to come in."""
+    base = theirs.base()
+    said = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
+    for head in theirs.heads(0 if base is None else base.upto):
+        if head.kind == DESCRIBE and head.attributes["constituents"] is not None:
+            said[head.label] = cast(Description, dict(cast(dict[str, Any], head.attributes["constituents"])))
+        elif head.kind in (DESCRIBE, RETRACT):
+            said.pop(head.label, None)
+    new = {name: one for name, one in sorted(said.items()) if repr(memory.descriptions.get(name)) != repr(one)}
+    differing = [name for name in new if name in memory.descriptions]
+    if differing and choice == "same":
+        name = differing[0]
+        raise MismatchError(
+            f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
+            f"here it is {memory.descriptions[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
+        )
+    return {name: one for name, one in new.items() if choice != "ours" or name not in memory.descriptions}
 
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -13,19 +13,22 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.composing import Composer
 from scroll_tactile.copies import Augmented
+from scroll_tactile.descriptions import Description, checked, require_constituents
 from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
-from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
+from scroll_tactile.errors import DescriptionError, EmbeddingError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.finetune import fine_tune
 from scroll_tactile.following import Following, SolverName
+from scroll_tactile.history import Choice
 from scroll_tactile.identity import capacity_of, identity_of, kept_augmentation, kept_capacity, require_same
 from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
 from scroll_tactile.packing import Codes
-from scroll_tactile.prediction import Compacted, Merged, Prediction, Receipt
+from scroll_tactile.prediction import Compacted, Composition, Constituent, Merged, Prediction, Receipt
 from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
@@ -99,6 +102,7 @@ class TactileLearner:
         self._tuned_reader: TunedReader | None = None
         self._model: tuple[int, Model] | None = None
         self._following: tuple[int, Following] | None = None
+        self._composer: tuple[Model, int, Composer] | None = None
 
     @classmethod
     def open(
@@ -193,6 +197,29 @@ class TactileLearner:
         read = {width: [rows, *(one[width] for one in others if width in one)] for width, rows in own.items()}
         return {width: to_codes(np.concatenate(rows), self.embedding.bound) for width, rows in read.items()}
 
+    def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
+        """Say what a material is made of, before or after it is touched; durable when this returns.
+
+        constituents: each with its share by mass, from 0 to 1, all together one, and then what is not named is absent;
+        or, for attributes that are no masses, True where it is there and False where not. None: it is unknown, and so
+        is, of attributes, what is not named; the material takes no part then in what is learned of that constituent.
+        None for all: what was said of the material is taken back.
+
+        A later description replaces an earlier one as a whole; the same one again changes nothing. Statistics and
+        `digest` stay as they are. `forget` takes the description along, `retract` does not.
+
+        Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
+        that cannot be used (nothing was changed); StoreError.
+        """
+        require_name(material)
+        self._ledger.describe(material, None if constituents is None else checked(material, constituents))
+
+    @property
+    def descriptions(self) -> dict[str, Description]:
+        """Material → what it was said to be made of, as kept, in alphabetical order; felt or not."""
+        with self._ledger.lock:
+            return {name: dict(one) for name, one in sorted(self._memory.descriptions.items())}
+
     @contextmanager
     def batch(self) -> Iterator[None]:
         """Make what is observed, retracted or forgotten in the block durable together, when it ends.
@@ -218,7 +245,7 @@ class TactileLearner:
         self._ledger.retract(receipt)
 
     def forget(self, material: str) -> int:
-        """Take back all observations of a material, as `retract` does one; returns how many there were.
+        """Take back all observations of a material, as `retract` does one, and its description; returns how many.
 
         Raises UnknownMaterialError for a material never felt, and ObservationError (nothing was changed) where some
         of them were compacted; InputError in a memory without a path; StoreError.
@@ -230,21 +257,26 @@ class TactileLearner:
         other: TactileLearner | str | os.PathLike[str],
         *,
         shared: Literal["once", "twice"],
+        descriptions: Choice = "same",
         progress: Callable[[str, int, int], object] | None = None,
     ) -> Merged:
         """Make this memory the one that felt everything that both did; durable, whole, when this returns.
 
         other: a memory with a path, or its path; it stays as it is. shared: whether a stream that both felt (one
         material, one content hash) counts once or twice. Receipts of the other memory are not receipts of this one.
+        descriptions: whose is kept of a material that both describe: "ours", "theirs", or "same", where they must be.
 
-        Raises MismatchError for a memory of another sensor, embedding or grid, ObservationError where shared streams
+        Raises MismatchError for a memory of another sensor, embedding or grid, or one that describes a material
+        otherwise where nobody chose, ObservationError where shared streams
         cannot be told apart any more, CapacityError, InputError, StoreError: nothing was changed then.
         """
         if shared not in ("once", "twice"):
             raise InputError(f"expected shared as 'once' or 'twice'; came {shared!r}")
+        if descriptions not in ("same", "ours", "theirs"):
+            raise InputError(f"expected descriptions as 'same', 'ours' or 'theirs'; came {descriptions!r}")
         told = progress or (lambda what, done, of: None)
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        return self._ledger.merge(path, shared, told)
+        return self._ledger.merge(path, shared, descriptions, told)
 
     def compact(self, *, keep: int = 0) -> Compacted:
         """Give up the features and readings of old observations, for space; what was learned from them stays.
@@ -284,11 +316,7 @@ class TactileLearner:
         felt = self._as_far_as_learned(felt, longest)
         image = tactile_image(felt)
         columns = image.shape[1]
-        places, features = self._reading.places(columns), self._features(image, model.needed(candidates, columns))
-        # Not rounded: the grid is for sums, and would only add its error to what is asked about.
-        means = {
-            width: in_units(rows[places[width]], self.embedding.bound).mean(axis=0) for width, rows in features.items()
-        }
+        means = self._means(image, model.needed(candidates, columns))
         logits = None
         if (
             reader is not None
@@ -297,6 +325,64 @@ class TactileLearner:
             and reader.reads(columns)
         ):
             logits = reader.logits(image)
+        return self._told(model, candidates, means, felt, columns, logits)
+
+    def compose(self, stream: Readings, *, constituents: Sequence[str] | None = None) -> Composition:
+        """Say what a stream feels made of, of all that was described; the memory stays as it is.
+
+        stream: as for `observe`. constituents: those that are asked for; all where it is None.
+
+        A touch of a material that was felt is told by what it feels like and what that is made of, one of a material
+        never felt by heads over all that were (see `scroll_tactile.composing`). A constituent that all or none of the
+        materials have that were felt and of which it is known is named, in `Constituent.unlearned`, and not guessed.
+
+        Raises StreamError, and DescriptionError where nothing was described, or for a constituent that nothing names.
+        """
+        felt = validate(stream, self.sensor)
+        with self._ledger.lock:
+            described, longest = self._memory.descriptions, self._memory.statistics.longest
+            known = {name for one in described.values() for name in one}
+            if not known:
+                raise DescriptionError("nothing was described yet: say with describe() what some material is made of")
+            wanted = require_constituents(sorted(known) if constituents is None else constituents, known)
+            model = self._present()
+            if model.names:
+                composer = self._fitted_composer(model)
+        if not model.names:
+            nothing = tuple(Constituent(name, None, None, (), "nothing was felt yet") for name in wanted)
+            return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
+        felt = self._as_far_as_learned(felt, longest)
+        image = tactile_image(felt)
+        columns = image.shape[1]
+        means = self._means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
+        prediction = self._told(model, model.names, means, felt, columns, None)
+        made_of, unfamiliar = composer.compose(wanted, dict(prediction.ranking), means, columns)
+        return Composition(made_of, unfamiliar, prediction)
+
+    def _fitted_composer(self, model: Model) -> Composer:
+        described = self._ledger.described
+        if self._composer is None or self._composer[0] is not model or self._composer[1] != described:
+            self._composer = model, described, Composer.of(model, self._memory.pool, self._memory.descriptions)
+        return self._composer[2]
+
+    def _means(self, image: npt.NDArray[np.float32], widths: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
+        """A touch's mean features in the codes' unit, (d,) by scale."""
+        places = self._reading.places(image.shape[1])
+        # Not rounded: the grid is for sums, and would only add its error to what is asked about.
+        return {
+            width: in_units(rows[places[width]], self.embedding.bound).mean(axis=0)
+            for width, rows in self._features(image, widths).items()
+        }
+
+    def _told(
+        self,
+        model: Model,
+        candidates: Sequence[str],
+        means: Mapping[int, npt.NDArray[np.float64]],
+        felt: Stream,
+        columns: int,
+        logits: Mapping[str, float] | None,
+    ) -> Prediction:
         judgement = model.judge(candidates, means, columns, logits)
         ranking = sorted(
             zip(candidates, judgement.probability.tolist(), strict=True),

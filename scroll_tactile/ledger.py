@@ -12,10 +12,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.descriptions import Description
 from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
 from scroll_tactile.following import Added
-from scroll_tactile.history import Incoming, compaction_point, observation_of, observations_of
-from scroll_tactile.memory import OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
+from scroll_tactile.history import Choice, Incoming, compaction_point, observation_of, observations_of
+from scroll_tactile.memory import DESCRIBE, OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
 from scroll_tactile.packing import Codes, pack_codes, spans
 from scroll_tactile.prediction import Compacted, Merged, Receipt
 from scroll_tactile.streams import Stream
@@ -34,7 +35,8 @@ class Ledger:
     """The memory of one learner, and what is written down of it.
 
     load: makes the memory as it is in the store, or an empty one where there is no store. lock: held by whoever looks
-    at the memory or changes it. version: another number after each change, and only then. added: the observations
+    at the memory or changes it. version: another number after each change of what was felt, and only then. described:
+    likewise of what is said of materials. added: the observations
     since it was last cleared, where `follow` says that they are wanted; None where anything else has changed.
     """
 
@@ -42,6 +44,7 @@ class Ledger:
         self.store = store
         self.lock = threading.RLock()
         self.version = 0
+        self.described = 0
         self.follow = False
         self.added: list[Added] | None = []
         self._load = load
@@ -144,6 +147,27 @@ class Ledger:
             self._whole = not self._batching
             raise
 
+    def describe(self, material: str, constituents: Description | None) -> None:
+        """As `TactileLearner.describe`, of what was checked."""
+        with self.lock:
+            self.require_open()
+            memory = self.memory
+            if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but says another thing
+                return
+            self._whole = False
+            if self.store is not None:
+                try:
+                    attributes = {"constituents": constituents}
+                    row = self.store.append(DESCRIBE, material, b"", attributes=attributes)
+                except StoreError:
+                    self._whole = not self._batching
+                    raise
+                memory.sequence = row.sequence
+            memory.describe(material, constituents)
+            self._whole = True
+            self.described += 1
+            self._snapshot_if_due()
+
     def retract(self, receipt: Receipt | int) -> None:
         """As `TactileLearner.retract`."""
         with self.lock:
@@ -177,6 +201,7 @@ class Ledger:
             self._whole = not self._batching
             raise
         memory.sequence = row
+        memory.describe(material, None)
         self._changed()
         self._snapshot_if_due()
 
@@ -206,7 +231,11 @@ class Ledger:
                 raise raised
 
     def merge(
-        self, path: str | os.PathLike[str], shared: Literal["once", "twice"], told: Callable[[str, int, int], object]
+        self,
+        path: str | os.PathLike[str],
+        shared: Literal["once", "twice"],
+        descriptions: Choice,
+        told: Callable[[str, int, int], object],
     ) -> Merged:
         """As `TactileLearner.merge`."""
         with self.lock:
@@ -214,13 +243,13 @@ class Ledger:
             if self._batching:
                 raise InputError("a merge is a batch of its own: end the batch before it")
             with Store.open(path, mode="read") as source:
-                incoming = Incoming.of(store, memory, source, once=shared == "once")
+                incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
                 self._whole = False
                 with store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: told("merging", done, of))
             self._changed()
             self._snapshot_if_due()
-        return Merged(added, incoming.shared)
+        return Merged(added, incoming.shared, len(incoming.descriptions))
 
     def compact(self, keep: int) -> Compacted:
         """As `TactileLearner.compact`."""

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.descriptions import Description
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.exemplars import Exemplar, ExemplarPool
 from scroll_tactile.packing import Codes, unpack_codes, unspanned
@@ -22,6 +23,7 @@ from scroll_tactile.windows import Reading
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
+    "DESCRIBE",
     "FELT",
     "MERGE",
     "OBSERVE",
@@ -39,6 +41,8 @@ OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kep
 RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
 MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
 FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
+DESCRIBE = "describe"  # what a material is made of; the attribute "constituents" holds it, or null to take it away
+KINDS = [OBSERVE, RETRACT, MERGE, FELT, DESCRIBE]
 READINGS = "readings"  # the array of a row that keeps a stream raw
 ATTEMPTS = 20  # of a reader to read what a writer goes on changing
 
@@ -63,6 +67,7 @@ class Memory:
     tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
     excluded: of a base, the sequences up to it that had been taken back when it was made.
     taken_back: how often anything was, since it was loaded.
+    descriptions: material → what it is made of, whether it was felt or not.
     base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
     saved: the last sequence that a generation is known to hold.
     """
@@ -82,6 +87,7 @@ class Memory:
         self.saved = 0
         self.sequence = 0
         self.taken_back = 0
+        self.descriptions: dict[str, Description] = {}
         self._stale = False
 
     def add(
@@ -113,7 +119,10 @@ class Memory:
         if record.kind == OBSERVE:
             codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
             self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
+        elif record.kind == DESCRIBE:
+            self.describe(record.label, record.attributes["constituents"])
         elif record.kind == RETRACT:
+            self.descriptions.pop(record.label, None)  # of a material forgotten; single observations are of no label
             for sequence in unspanned(record.attributes["sequences"]):
                 if sequence > self.base:
                     self.withdraw(store.record(sequence))
@@ -130,9 +139,16 @@ class Memory:
         elif record.kind != FELT:
             raise MismatchError(
                 f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
-                f"{[OBSERVE, RETRACT, MERGE, FELT]}. Open the memory with the version that wrote it, or a newer one"
+                f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
             )
         self.sequence = record.sequence
+
+    def describe(self, material: str, constituents: Any) -> None:
+        """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
+        if constituents is None:
+            self.descriptions.pop(material, None)
+        else:
+            self.descriptions[material] = dict(constituents)
 
     def withdraw(self, record: Record) -> None:
         """Take an observation out of the sums; `refill` then mends the pools."""
@@ -243,6 +259,7 @@ class Memory:
             "pool": materials,
             "capacity": [self.capacity.streams, self.capacity.nbytes],
             "tuned_upto": self.tuned_upto,
+            "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= pooled
         # A base is gone on from with the rows behind it, which tell again what of them was taken back.
@@ -307,7 +324,9 @@ class Memory:
         for record in store.records(after=self.base):
             if record.sequence > upto:
                 break
-            if record.kind != RETRACT and record.sequence not in self.withdrawn:
+            if record.kind == RETRACT:
+                memory.descriptions.pop(record.label, None)
+            elif record.sequence not in self.withdrawn:
                 memory.replay(record, store)
         memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
         return memory
@@ -321,6 +340,7 @@ class Memory:
                 arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
             )
         self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
+        self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
         if "tuned" in attributes:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
 

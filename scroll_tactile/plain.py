@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.descriptions import Description
 from scroll_tactile.errors import InputError
 from scroll_tactile.history import withdrawn_in
 from scroll_tactile.learner import TactileLearner
@@ -36,6 +37,8 @@ def export_plain(
     - `statistics.npz`: `materials`; for each scale (a width of windows) `counts-<scale>` int64 (C,), `sums-<scale>`
       int64 (C, d) and `second-<scale>` int64 (d, d), over all folds, of features in units of bound · 2⁻²⁰.
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
+    - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given. Only
+      where anything was described.
     - `memory.json`: sensor, embedding, digest, date. It is written last.
 
     Raises InputError for a folder that holds something or cannot be written; StoreError.
@@ -57,6 +60,9 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
         if ledger.store is not None:
             progress("observations", 0, 1)
             _rows(target / "observations.csv", ["sequence", "material", "key", "time", "state"], _told(ledger.store))
+        if learner.descriptions:
+            header = ["material", "constituent", "present", "share"]
+            _rows(target / "descriptions.csv", header, _described(learner.descriptions))
         progress("statistics", 0, 1)
         with (target / "statistics.npz").open("wb") as file:
             np.savez(file, allow_pickle=False, **_arrays(statistics))
@@ -106,6 +112,17 @@ def _told(store: Store) -> list[list[Any]]:
         ]
         for one in heads
         if one.kind in (OBSERVE, FELT)
+    ]
+
+
+def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:
+    def present(value: float | bool | None) -> str:
+        return "unknown" if value is None else "yes" if value else "no"
+
+    return [
+        [material, name, present(value), value if isinstance(value, float) else ""]
+        for material, one in descriptions.items()
+        for name, value in one.items()
     ]
 
 

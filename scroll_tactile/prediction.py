@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Compacted", "Merged", "Prediction", "Receipt"]
+__all__ = ["Compacted", "Composition", "Constituent", "Merged", "Prediction", "Receipt"]
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,12 @@ class Merged:
     """What a merge brought.
 
     observations: that came in. shared: streams, of one material, that both memories had felt.
+    described: materials whose descriptions came in, or were replaced.
     """
 
     observations: int
     shared: int
+    described: int = 0
 
 
 @dataclass(frozen=True)
@@ -72,3 +74,43 @@ class Prediction:
     known: bool
     seconds: float
     tuned: bool = False
+
+
+@dataclass(frozen=True)
+class Constituent:
+    """What a stream says of one constituent.
+
+    name: as it was described. presence: the probability that it is there; None where no head could be learned.
+    share: its part of the mass, from 0 to 1; None where it has none, or no head could be learned.
+    evidence: the materials known to have it that the touch feels most like, with the probability of each among all
+        that were felt; likeliest first.
+    unlearned: why there is no presence, in words; empty where there is one.
+    """
+
+    name: str
+    presence: float | None
+    share: float | None
+    evidence: tuple[tuple[str, float], ...]
+    unlearned: str = ""
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What a stream feels made of.
+
+    constituents: all that were asked for, in alphabetical order. unfamiliar: the probability that the touch is of a
+        material never felt, one such touch being expected for each of a known one: what the heads weigh, who speak for
+        a new material, against the known ones that the touch feels like.
+    prediction: what it feels like among the materials felt.
+    """
+
+    constituents: tuple[Constituent, ...]
+    unfamiliar: float
+    prediction: Prediction
+
+    def __getitem__(self, name: str) -> Constituent:
+        """The constituent of a name. Raises KeyError where it was not asked for."""
+        for one in self.constituents:
+            if one.name == name:
+                return one
+        raise KeyError(name)

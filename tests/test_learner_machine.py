@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.errors import ObservationError, StreamError, UnknownMaterialError
+from scroll_tactile.errors import MismatchError, ObservationError, StreamError, UnknownMaterialError
 from scroll_tactile.ridge.pool import Pool
 from scroll_tactile.ridge.statistics import Statistics
 
@@ -24,6 +24,7 @@ PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", dur
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
 
 materials = st.sampled_from(["a", "b", "c", "ü"])
+descriptions = st.sampled_from([None, {"x": True}, {"x": 1.0}, {"x": 0.25, "y": 0.75}, {"x": False, "y": None}])
 touches = st.tuples(st.integers(0, 5), st.sampled_from([5, 9, 15, 16, 25, 40, 90]))
 histories = st.lists(st.tuples(materials, touches), max_size=6)
 
@@ -40,16 +41,18 @@ def stream(touch):
     return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
 
 
-def fed(felt):
+def fed(felt, described=()):
     learner = TactileLearner(**SETTINGS)
+    for material, one in dict(described).items():
+        learner.describe(material, one)
     for material, touch in felt:
         learner.observe(material, stream(touch))
     return learner
 
 
-def require_same(learner, felt):
+def require_same(learner, felt, described=()):
     """All that is kept of what was felt is, to the byte, what a memory keeps that felt it in another order."""
-    whole = fed(sorted(felt))
+    whole = fed(sorted(felt), described)
     whole.readout = learner.readout
     assert learner.digest() == whole.digest()
     assert learner.exemplars == whole.exemplars
@@ -60,6 +63,9 @@ def require_same(learner, felt):
     assert ours == theirs
     for touch in ((7, 25), (8, 6), (9, 60)):
         assert learner.predict(stream(touch)) == whole.predict(stream(touch))
+    assert repr(learner.descriptions) == repr(whole.descriptions)
+    if described:
+        assert repr(learner.compose(stream((7, 25)))) == repr(whole.compose(stream((7, 25))))
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,7 @@ class History(RuleBasedStateMachine):
         self.home = Path(tempfile.mkdtemp())
         self.names = (str(number) for number in itertools.count())
         self.felt: list[Felt] = []
+        self.described: dict[str, dict] = {}
         self.last = 0
         self.pools = mock.patch("scroll_tactile.memory.Pool", SmallPool)
         self.pools.start()
@@ -132,6 +139,19 @@ class History(RuleBasedStateMachine):
         with pytest.raises(ObservationError, match="already"):
             self.learner.retract(one.sequence)
 
+    def say(self, material, one):
+        self.last += repr(self.described.get(material)) != repr(one)
+        self.described.pop(material, None)
+        self.described |= {} if one is None else {material: one}
+
+    @rule(material=materials, one=descriptions)
+    def describe(self, material, one):
+        before = self.learner.digest()
+        self.learner.describe(material, one)
+        assert self.learner.digest() == before
+        self.say(material, one)
+        assert self.learner._memory.sequence == self.last
+
     @rule(material=materials)
     def forget(self, material):
         before = [one for one in self.felt if one.material == material]
@@ -141,6 +161,7 @@ class History(RuleBasedStateMachine):
             return
         assert self.learner.forget(material) == len(before)
         self.felt = [one for one in self.felt if one.material != material]
+        self.described.pop(material, None)
         self.last += 1
 
     @rule(keep=st.integers(0, 4))
@@ -154,10 +175,25 @@ class History(RuleBasedStateMachine):
                 with pytest.raises(ObservationError):
                     self.learner.retract(one.sequence)
 
-    @rule(felt=histories, taken=st.sets(st.integers(0, 5)), keep=st.none() | st.integers(0, 3), once=st.booleans())
-    def merge(self, felt, taken, keep, once):
-        """Another memory, which takes some back and may be compacted, comes in."""
+    @rule(
+        felt=histories,
+        taken=st.sets(st.integers(0, 5)),
+        keep=st.none() | st.integers(0, 3),
+        once=st.booleans(),
+        said=st.dictionaries(materials, descriptions, max_size=2),
+        late=st.booleans(),
+        choice=st.sampled_from(["same", "ours", "theirs"]),
+    )
+    def merge(self, felt, taken, keep, once, said, late, choice):
+        """Another memory, which takes some back, describes some and may be compacted, comes in."""
         with self.open(self.home / next(self.names)) as other:
+
+            def describe():
+                for name, one in said.items():
+                    other.describe(name, one)
+
+            if not late:
+                describe()
             receipts = [other.observe(name, stream(touch)) for name, touch in felt]
             for at in sorted(taken):
                 if at < len(felt):
@@ -167,13 +203,24 @@ class History(RuleBasedStateMachine):
                 other.compact(keep=keep)
             fixed = len(left) if keep == 0 else 0 if keep is None else max(0, len(left) - keep)
             based = other._ledger.memory.base > 0
+            if late:
+                describe()
             ours = {one.pair for one in self.felt}
             shared = [at for at, one in enumerate(left) if one in ours]
             if once and any(at < fixed for at in shared):
                 with pytest.raises(ObservationError, match="cannot be counted once"):
                     self.learner.merge(other, shared="once")
                 return
-            merged = self.learner.merge(other, shared="once" if once else "twice")
+            new = {name: one for name, one in said.items() if one and repr(self.described.get(name)) != repr(one)}
+            if choice == "same" and set(new) & set(self.described):
+                with pytest.raises(MismatchError, match="described differently"):
+                    self.learner.merge(other, shared="once" if once else "twice")
+                choice = "theirs"
+            merged = self.learner.merge(other, shared="once" if once else "twice", descriptions=choice)
+        new = {name: one for name, one in new.items() if choice == "theirs" or name not in self.described}
+        assert merged.described == len(new)
+        for name, one in new.items():
+            self.say(name, one)
         coming = [at for at in range(len(left)) if not (once and at in shared)]
         assert (merged.observations, merged.shared) == (len(coming), len(shared))
         self.last += based
@@ -204,7 +251,7 @@ class History(RuleBasedStateMachine):
     def reopen(self, readout):
         self.learner.close()
         self.learner = self.open(self.path, readout)
-        require_same(self.learner, [one.pair for one in self.felt])
+        require_same(self.learner, [one.pair for one in self.felt], self.described)
 
     @rule(readout=st.sampled_from(["lda", "ridge"]))
     def abandon(self, readout):
@@ -219,7 +266,7 @@ class History(RuleBasedStateMachine):
     @rule()
     def refresh(self):
         self.reader.refresh()
-        require_same(self.reader, [one.pair for one in self.felt])
+        require_same(self.reader, [one.pair for one in self.felt], self.described)
         assert not self.reader.refresh()
 
     @rule(data=st.data())
@@ -241,7 +288,7 @@ class History(RuleBasedStateMachine):
     def teardown(self):
         if hasattr(self, "learner"):
             for _ in range(2):
-                require_same(self.learner, [one.pair for one in self.felt])
+                require_same(self.learner, [one.pair for one in self.felt], self.described)
                 self.learner.close()
                 self.learner = self.open(self.path, self.learner.readout)
             self.learner.close()

@@ -1,0 +1,103 @@
+"""Heads for attributes of materials: ridge regression over the classes of a readout, from its C × C matrices alone.
+
+Let z = Wᵀ(x − c) be a readout's projection and G that of its class means. A head that knows the materials K is
+f(x) = b + Σ_K α_y z_y(x), ridge regression of the targets on the class means in the space where the scatter within
+classes is white, each material counting as one row:
+
+    [G_KK + γ I   1] [α]   [t]
+    [1ᵀ           0] [b] = [0].
+
+The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α: what Σ_y c_y t_yᵀ is to the paper's readout, with the
+scatter between materials, and not between touches, against it. A material of which a target is unknown is in no sum
+but the scatter within classes. With B the inverse of that matrix, the head that never felt material i follows from it
+(Allen 1974, PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches of materials that the head does not know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.special import expit
+
+__all__ = ["GAMMAS", "Curve", "Solved", "fit_curve", "solve"]
+
+FloatArray = npt.NDArray[np.float64]
+
+GAMMAS = (1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0, 10.0)  # as shares of the mean of G's diagonal, centred
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A factorised system of one set of known materials and one γ.
+
+    inverse: B, shape (K + 1, K + 1), the intercept last.
+    """
+
+    inverse: FloatArray
+
+    def head(self, targets: FloatArray) -> FloatArray:
+        """(α, b), shape (K + 1,), of targets of the known materials, shape (K,)."""
+        head: FloatArray = self.inverse[:, :-1] @ targets
+        return head
+
+    def without(self, head: FloatArray, place: int) -> FloatArray:
+        """The head had material `place` never been felt, shape (K + 1,), its own α 0."""
+        left: FloatArray = head - self.inverse[:, place] * (head[place] / self.inverse[place, place])
+        left[place] = 0.0
+        return left
+
+
+def solve(gram: FloatArray, gamma: float) -> Solved:
+    """Factorise the system of known materials with G_KK, shape (K, K), K ≥ 2, and γ, a share of G's diagonal."""
+    count = len(gram)
+    centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
+    # Materials that cannot be told apart at all have G = 0: then any γ says the mean.
+    size = max(float(np.trace(centred)) / count, 1e-12)
+    system = np.zeros((count + 1, count + 1))
+    system[:count, :count] = (gram + gram.T) / 2 + gamma * size * np.eye(count)
+    system[count, :count] = system[:count, count] = 1.0
+    return Solved(np.asarray(np.linalg.inv(system), dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A logistic curve: the probability at x is 1 / (1 + exp(−(slope·x + offset)))."""
+
+    slope: float
+    offset: float
+
+    def __call__(self, at: npt.ArrayLike) -> FloatArray:
+        """Probabilities, of the same shape."""
+        chances: FloatArray = expit(self.slope * np.asarray(at, dtype=np.float64) + self.offset)
+        return chances
+
+
+def fit_curve(
+    values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, rows: float = 1.0, weights: npt.ArrayLike = 1.0
+) -> Curve:
+    """The logistic curve of least log loss (Platt 1999), its slope not below 0, drawn to `prior` where touches are few.
+
+    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. weights: of each, shape (N,) or one number. rows: what the
+    prior counts as.
+    """
+    at, wanted = np.asarray(values, dtype=np.float64), np.asarray(targets, dtype=np.float64)
+    heavy = np.broadcast_to(np.asarray(weights, dtype=np.float64), at.shape)
+    if not len(at):
+        return prior
+    spread = max(abs(prior.slope), 1e-6)
+
+    def loss(point: FloatArray) -> tuple[float, FloatArray]:
+        slope, offset = point
+        logits = slope * at + offset
+        miss = heavy * (expit(logits) - wanted)
+        value = float(np.sum(heavy * (np.logaddexp(0.0, logits) - wanted * logits)))
+        pull = np.array([(slope - prior.slope) / spread, (offset - prior.offset) / spread])
+        gradient = np.array([miss @ at, miss.sum()]) + rows * pull / spread
+        return value + rows * float(pull @ pull) / 2, gradient
+
+    start = np.array([prior.slope, prior.offset])
+    fit = minimize(loss, start, jac=True, bounds=[(0.0, None), (None, None)], method="L-BFGS-B")
+    return Curve(float(fit.x[0]), float(fit.x[1]))

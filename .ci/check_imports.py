@@ -27,7 +27,7 @@ LAYERS = [
     {"export", "plain"},
     {"datasets"},
     {"plots"},
-    {"plots_continual", "plots_frontier", "plots_numerics"},
+    {"plots_continual", "plots_efficiency", "plots_frontier", "plots_numerics"},
     {"pipelines"},
     {"bench"},
     {"cli", "__main__"},

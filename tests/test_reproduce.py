@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile.cli.reproduce import SETS
+from scroll_tactile.cli.studies import SETS
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import DatasetError, InputError, WeightsError
 from scroll_tactile.pipelines.cells import Cell, pooled, split, time_left
 from scroll_tactile.pipelines.efficiency import Efficiency, curves, first_touches
-from scroll_tactile.pipelines.table1 import PAPER, Study, Table1, blocked, rows
+from scroll_tactile.pipelines.studies import Study
+from scroll_tactile.pipelines.table1 import PAPER, Table1, blocked, rows
 from scroll_tactile.sensors import Sensor
 
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
@@ -268,7 +269,7 @@ class TestCommand:
         words = ("reproduce", "table1", "--data", tmp_path)
         assert "biotac-20-blocked" in refused(*words, "--sets", "biotac-50", "--systems", "svm")
         assert "least-squares-random" in refused(*words, "--systems", "cnn")
-        assert "out of [0, 1, 2]" in refused(*words, "--systems", "svm", "--folds", "9")
+        assert "out of [0, 1, 2]" in refused(*words, "--systems", "svm", "--sets", "roboskin-20", "--folds", "9")
         assert "folder that exists" in refused(*words, "--json", tmp_path / "no" / "x.json")
 
 
@@ -276,6 +277,7 @@ def test_a_missing_data_set_is_named_with_where_to_get_it(tmp_path: Path):
     words = ("reproduce", "table1", "--data", tmp_path, "--systems", "svm")
     assert "github.com/dexrob/biotac_slide_20_50" in refused(*words)
     assert "github.com/clear-nus/octopi" in refused(*words, "--sets", "gelsight")
+    assert "--sets biotac-20" in refused(*words)
 
 
 class TestPhysiclear:

@@ -11,8 +11,8 @@ import numpy as np
 from scroll_tactile.pipelines.cells import Cell, Figures, Split
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.studies import Study
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, SYSTEMS
-from scroll_tactile.pipelines.table1 import Study
 from scroll_tactile.training import Progress
 
 __all__ = ["STREAMS", "Efficiency", "curves", "first_touches"]

@@ -18,7 +18,7 @@ from scroll_tactile.pipelines.systems.protocol import Watch, require_touches, si
 from scroll_tactile.streams import Stream
 from scroll_tactile.training import Progress
 
-__all__ = ["Make", "Trained"]
+__all__ = ["Make", "Trained", "require_device"]
 
 Make = Callable[[tuple[int, ...], int, int], nn.Module]
 """(shape of an input, materials, seed) → a new network, which may draw from torch's generator."""
@@ -43,7 +43,7 @@ class Trained:
         device: str = "cpu",
         augmentation: Augmentation | None = None,
     ) -> None:
-        _require_device(device)
+        require_device(device)
         self.name = name
         self.course = course or Course()
         self.epochs: list[Epoch] = []
@@ -116,7 +116,8 @@ class Trained:
         return Batches(lambda places: inputs[torch.from_numpy(places)], targets)
 
 
-def _require_device(device: str) -> None:
+def require_device(device: str) -> None:
+    """Raise InputError for a device that torch cannot use here."""
     try:
         torch.zeros(1, device=torch.device(device)).item()
     except (RuntimeError, AssertionError, TypeError) as error:

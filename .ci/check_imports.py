@@ -28,7 +28,7 @@ LAYERS = [
     {"export", "plain"},
     {"datasets"},
     {"plots"},
-    {"plots_activation", "plots_continual", "plots_frontier", "plots_numerics"},
+    {"plots_activation", "plots_continual", "plots_efficiency", "plots_frontier", "plots_numerics", "plots_robustness"},
     {"pipelines"},
     {"bench"},
     {"cli", "__main__"},

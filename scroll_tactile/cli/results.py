@@ -6,6 +6,7 @@ import platform
 from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
 
 __all__ = ["Dataset", "origin", "parse_folds", "read", "require_folders"]
+
+
+_OPTIONAL = {"scikit-learn": "sklearn", "snntorch": "snntorch"}  # what made some results; distribution → module
 
 
 class Dataset(StrEnum):
@@ -45,13 +49,14 @@ def require_folders(*files: Path | None) -> None:
             raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
 
 
-def origin(command: str, recordings: Recordings) -> dict[str, Any]:
-    """What made a result: the command, when, with which versions, on what machine, from which sensor."""
+def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]:
+    """What made a result: the command, when, with which versions, on what machine, and from which sensor, of one."""
     versions = {name: version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy")}
-    return {
+    versions |= {name: version(name) for name, module in _OPTIONAL.items() if find_spec(module)}
+    made = {
         "command": command,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions | {"python": platform.python_version()},
         "machine": f"{platform.machine()} {platform.system()}",
-        "sensor": recordings.sensor.model_dump(mode="json"),
     }
+    return made if recordings is None else made | {"sensor": recordings.sensor.model_dump(mode="json")}

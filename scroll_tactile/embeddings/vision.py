@@ -227,10 +227,14 @@ class TunableVision(nn.Module):
 
 
 def to_planes(images: torch.Tensor) -> torch.Tensor:
-    """Tactile images (B, C, T) in [-1, 1] as colour planes (B, 3, C, T), scaled as in the networks' training."""
+    """Tactile images (B, C, T) in [-1, 1] as colour planes (B, 3, C, T), scaled as in the networks' training.
+
+    Images that have three planes already, (B, 3, H, W), are scaled only.
+    """
     mean = torch.tensor(MEAN, dtype=images.dtype, device=images.device)[:, None, None]
     deviation = torch.tensor(DEVIATION, dtype=images.dtype, device=images.device)[:, None, None]
-    return ((images[:, None] + 1) / 2 - mean) / deviation
+    planes = images if images.ndim == 4 else images[:, None]
+    return ((planes + 1) / 2 - mean) / deviation
 
 
 def pool_windows(maps: Sequence[torch.Tensor], columns: int, windows: Sequence[tuple[int, int]]) -> torch.Tensor:

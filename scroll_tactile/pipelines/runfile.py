@@ -83,7 +83,10 @@ class RunFile:
                 os.fsync(file.fileno())
             draft.replace(self.path)
         except OSError as error:
-            raise InputError(f"{self.path} cannot be written: {error.strerror}. Take another folder") from error
+            raise InputError(
+                f"{self.path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
+                "another folder, and start again"
+            ) from error
 
 
 def _draft(path: Path) -> Path:

@@ -1,0 +1,163 @@
+"""`scroll-tactile reproduce`: the paper's tables and figures, from one's own copy of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import typer
+from rich.table import Table
+
+from scroll_tactile import plots
+from scroll_tactile.cli.results import require_folders
+from scroll_tactile.cli.studies import (
+    QUICK_EPOCHS,
+    QUICK_SETS,
+    SETS,
+    Data,
+    Device,
+    Epochs,
+    Folds,
+    Json,
+    Plot,
+    Quick,
+    Run,
+    Seed,
+    Sets,
+    Systems,
+    Weights,
+    Where,
+    choose_folds,
+    choose_systems,
+    close,
+    read_sets,
+    say_conditions,
+)
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
+from scroll_tactile.pipelines.efficiency import Efficiency, curves
+from scroll_tactile.pipelines.studies import Study
+from scroll_tactile.pipelines.systems.catalogue import SYSTEMS
+from scroll_tactile.pipelines.table1 import PAPER, Table1, rows
+from scroll_tactile.plots_efficiency import draw_efficiency
+
+__all__ = ["reproduce"]
+
+reproduce = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    help="Measure what the paper measured, and ours beside it, on one's own copy of the data.",
+)
+
+CURVES = ("resnet", "resnet-pretrained", "kernels-lda", "vision-lda", "kernels+vision-lda")
+EPOCH_COLUMNS = (1, 2, 5, 10, 20)  # of the table of efficiency
+
+
+@reproduce.command()
+def table1(
+    data: Data,
+    weights: Weights = None,
+    sets: Sets = None,
+    systems: Systems = None,
+    folds: Folds = None,
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Table I: every system on every data set, with the paper's figure beside ours and the difference.
+
+    100 epochs, five folds: hours on a GPU, days without. --systems and --folds take parts of it, --run adds them up.
+    """
+    require_folders(json)
+    keys = choose_systems(systems, tuple(SYSTEMS), weights)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        read = read_sets(sets, tuple(SETS), data, seed, quick)
+        study = Table1(read, keys, weights, epochs or (QUICK_EPOCHS if quick else 100), device.value, seed, quick, run)
+        results = list(study.run(choose_folds(folds, read, quick), progress))
+    found = rows(results)
+    for recordings in read:
+        _show_table(recordings.name, found, study)
+    if any(one.sensor.camera for one in read):
+        say(
+            "GelSight frames are those of PhysiCLeAR, split by video: the paper's GelSight-45 is not public, and its "
+            "figures stand beside nothing of ours: "
+            + "; ".join(f"{SYSTEMS[k]} {percent(p['GelSight-45'])}" for k, p in PAPER.items() if "GelSight-45" in p)
+        )
+    close(study, results, json, {"rows": found}, sets, folds)
+
+
+@reproduce.command()
+def efficiency(
+    data: Data,
+    weights: Weights = None,
+    sets: Sets = None,
+    systems: Systems = None,
+    folds: Folds = None,
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Learning efficiency: the test after each of 20 epochs of the ResNets; ours after 1 to 40 touches of a material.
+
+    Of the paper's figure there are curves only, no numbers; its final accuracies are those of table1.
+    """
+    require_folders(json, plot)
+    keys = choose_systems(systems, CURVES, weights)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        read = read_sets(sets, QUICK_SETS, data, seed, quick)
+        few = epochs or (QUICK_EPOCHS if quick else 20)
+        study = Efficiency(read, keys, weights, few, device.value, seed, quick, run)
+        results = list(study.run(choose_folds(folds, read, quick), progress))
+    found = curves(results)
+    for recordings in read:
+        mine = [curve for curve in found if curve["dataset"] == recordings.name]
+        _show_curves(f"{recordings.name}: after so many epochs", [one for one in mine if one["by"] == "epochs"])
+        title = f"{recordings.name}: one pass, after so many touches of each material"
+        _show_curves(title, [one for one in mine if one["by"] == "streams"])
+    close(study, results, json, {"curves": found}, sets, folds)
+    if plot is not None and not plots.available():
+        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+    elif plot is not None:
+        draw_efficiency(plot, found)
+        say(f"plot: {plot}")
+
+
+def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: Study) -> None:
+    table = Table("system", "paper", "here", "difference", "folds", "seconds", title=dataset)
+    for row in found:
+        figures = row["sets"].get(dataset)
+        if figures is None:
+            continue
+        paper, apart = figures["paper"], figures["difference"]
+        vote = f" (vote of a recording {percent(figures['vote'])})" if "vote" in figures else ""
+        table.add_row(
+            row["system"],
+            "" if paper is None else percent(paper),
+            percent(figures["mean"]) + (f" ± {100 * figures['sd']:.1f}" if figures["folds"] > 1 else "") + vote,
+            "" if apart is None else f"{100 * apart:+.1f}",
+            str(figures["folds"]),
+            f"{figures['seconds']:.0f}",
+        )
+    console().print(table)
+    say_conditions(study)
+
+
+def _show_curves(title: str, found: Sequence[Mapping[str, Any]]) -> None:
+    if not found:
+        return
+    places = sorted({int(point[0]) for curve in found for point in curve["points"]})
+    if found[0]["by"] == "epochs":
+        places = sorted({at for at in places if at in EPOCH_COLUMNS} | {places[-1]})
+    table = Table("system", *map(str, places), "folds", title=title)
+    for curve in found:
+        shares = {int(at): percent(mean) for at, mean, _ in curve["points"]}
+        table.add_row(curve["system"], *(shares.get(at, "") for at in places), str(curve["folds"]))
+    console().print(table)

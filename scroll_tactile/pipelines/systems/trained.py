@@ -1,0 +1,124 @@
+"""A network that is trained over epochs, as a system of the comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from scroll_tactile.augment import Augmentation
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.systems.descent import Batches, Course, Epoch, descend, logits_of, seeded
+from scroll_tactile.pipelines.systems.inputs import Image, one_width, picture, usual_columns
+from scroll_tactile.pipelines.systems.protocol import Watch, require_touches, silent, unwatched
+from scroll_tactile.streams import Stream
+from scroll_tactile.training import Progress
+
+__all__ = ["Make", "Trained", "require_device"]
+
+Make = Callable[[tuple[int, ...], int, int], nn.Module]
+"""(shape of an input, materials, seed) → a new network, which may draw from torch's generator."""
+
+
+class Trained:
+    """A network trained as `descend` does, on images of one width; it is asked about images of any.
+
+    make: a new network for each fit. read: from an image to what the network reads, both (…, T). course: of the
+    training. device: torch's name of one. augmentation: of every touch in every epoch, drawn anew; none as in the
+    paper's table.
+
+    epochs: what each epoch of the last fit came to. Raises InputError for a device that is not there.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        make: Make,
+        read: Callable[[Image], Image] = lambda image: image,
+        course: Course | None = None,
+        device: str = "cpu",
+        augmentation: Augmentation | None = None,
+    ) -> None:
+        require_device(device)
+        self.name = name
+        self.course = course or Course()
+        self.epochs: list[Epoch] = []
+        self._make, self._read = make, read
+        self._device = device
+        self._augmentation = augmentation
+        self._names: list[str] = []
+        self._net: nn.Module | None = None
+
+    def fit(
+        self,
+        streams: Sequence[Stream],
+        materials: Sequence[str],
+        validation: Sequence[Labelled],
+        seed: int,
+        progress: Progress = silent,
+        watch: Watch = unwatched,
+    ) -> None:
+        """See `System.fit`. The validation lowers the rate and chooses the epoch, and is not learned.
+
+        Raises TrainingError where the loss is not finite or the device has no memory left.
+        """
+        self._names = require_touches(streams, materials, validation)
+        images = [picture(stream) for stream in streams]
+        columns = usual_columns(images)
+        random = np.random.default_rng([seed, 0])
+        taught = self._batches(images, materials, columns, random if self._augmentation is not None else None)
+        held = None
+        if validation:
+            held = self._batches([picture(one) for _, one in validation], [name for name, _ in validation], columns)
+        with seeded(seed, self._device):
+            shape = self._read(one_width(images[0], columns)).shape
+            self._net = self._make(shape, len(self._names), seed).to(self._device)
+            self.epochs = descend(self._net, taught, held, self.course, random, progress, watch)
+
+    def predict(self, streams: Sequence[Stream]) -> list[str]:
+        """See `System.predict`."""
+        if self._net is None:
+            raise InputError(f"{self.name} has learned nothing yet: call fit first")
+        said = [""] * len(streams)
+        sizes: dict[tuple[int, ...], list[int]] = {}
+        images = [picture(stream) for stream in streams]
+        for at, image in enumerate(images):
+            sizes.setdefault(image.shape, []).append(at)
+        for members in sizes.values():
+            inputs = torch.from_numpy(np.stack([self._read(images[at]) for at in members])).to(self._device)
+            for at, place in zip(members, logits_of(self._net, inputs).argmax(dim=1).tolist(), strict=True):
+                said[at] = self._names[place]
+        return said
+
+    def _batches(
+        self,
+        images: Sequence[Image],
+        materials: Sequence[str],
+        columns: int,
+        random: np.random.Generator | None = None,
+    ) -> Batches:
+        """Images of one width on the device; augmented at each look where there is a generator to draw from."""
+        targets = torch.tensor([self._names.index(name) for name in materials], device=self._device)
+        if random is not None and self._augmentation is not None:
+            augmentation = self._augmentation
+
+            def drawn(places: npt.NDArray[np.intp]) -> torch.Tensor:
+                changed = [augmentation.augment(images[at], random, columns=columns) for at in places]
+                return torch.from_numpy(np.stack([self._read(image) for image in changed])).to(self._device)
+
+            return Batches(drawn, targets)
+        inputs = torch.from_numpy(np.stack([self._read(one_width(image, columns)) for image in images]))
+        inputs = inputs.to(self._device)
+        return Batches(lambda places: inputs[torch.from_numpy(places)], targets)
+
+
+def require_device(device: str) -> None:
+    """Raise InputError for a device that torch cannot use here."""
+    try:
+        torch.zeros(1, device=torch.device(device)).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise InputError(f"expected a device that torch can use here, such as cpu; came {device!r}: {error}") from error

@@ -14,6 +14,7 @@ from commands import refused, run
 from scroll_tactile.cli.studies import SETS
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import DatasetError, InputError, WeightsError
 from scroll_tactile.pipelines.cells import Cell, pooled, split, time_left
 from scroll_tactile.pipelines.efficiency import Efficiency, curves, first_touches
@@ -264,6 +265,28 @@ class TestCommand:
         assert result.exit_code == 0, result.output
         assert plot.stat().st_size > 10_000
         assert len(json.loads(file.read_text())["curves"]) == 4
+
+    def test_activation_compares_and_draws_and_goes_on_where_it_was(self, tmp_path: Path):
+        pytest.importorskip("matplotlib")
+        safetensors = pytest.importorskip("safetensors.torch")
+        weights, folder, plot = tmp_path / "w.safetensors", tmp_path / "run", tmp_path / "a.png"
+        safetensors.save_file(ResNet.random(4).state_dict(), weights)
+        words = ("reproduce", "activation", "--data", tmp_path, "--quick", "--epochs", 1, "--run", folder)
+        assert "expected --weights" in refused(*words)
+        files = [tmp_path / "one.json", tmp_path / "two.json"]
+        for file, drawn in zip(files, (["--plot", plot], []), strict=True):
+            result = run(*words, "--weights", weights, "--json", file, *drawn)
+            assert result.exit_code == 0, result.output
+        once, again = (json.loads(file.read_text()) for file in files)
+        assert once["likeness"] == again["likeness"] and once["cells"] == again["cells"]
+        pairs = {(pair["one"], pair["two"]): pair for pair in once["likeness"]}
+        assert len(pairs) == 6
+        tuned = ("fine-tuned on BioTac-20", "fine-tuned on RoboSkin-20")
+        assert pairs["pre-trained", tuned[0]]["filters"] > 0.9 > pairs["pre-trained", "random weights"]["filters"]
+        assert 0 < pairs[tuned]["moved"] <= 1 and pairs[tuned]["blocks"] > 0.5
+        assert plot.read_bytes().startswith(b"\x89PNG")
+        (folder / "activation BioTac-20.npz").unlink()
+        assert "first layers cannot be read" in refused(*words, "--weights", weights)
 
     def test_what_is_not_there_is_named(self, tmp_path: Path):
         words = ("reproduce", "table1", "--data", tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,10 +35,13 @@ from scroll_tactile.cli.studies import (
     say_conditions,
 )
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.activation_study import ActivationStudy
 from scroll_tactile.pipelines.efficiency import Efficiency, curves
 from scroll_tactile.pipelines.studies import Study
 from scroll_tactile.pipelines.systems.catalogue import SYSTEMS
 from scroll_tactile.pipelines.table1 import PAPER, Table1, rows
+from scroll_tactile.plots_activation import draw_activation
 from scroll_tactile.plots_efficiency import draw_efficiency
 
 __all__ = ["reproduce"]
@@ -127,6 +131,48 @@ def efficiency(
         say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
     elif plot is not None:
         draw_efficiency(plot, found)
+        say(f"plot: {plot}")
+
+
+@reproduce.command()
+def activation(
+    data: Data,
+    weights: Weights = None,
+    sets: Sets = None,
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Feature activation: what excites the first block, pre-trained and fine-tuned on each sensor; and how alike it is.
+
+    The paper shows the images only. Here each two networks are compared: by the cosine of their stem's filters, by
+    whether two sensors moved them the same way, and by what their first blocks make of the same touches (CKA).
+    """
+    require_folders(json, plot)
+    if weights is None:
+        raise InputError("expected --weights: without a trained ResNet there is nothing to be fine-tuned")
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        read = read_sets(sets, QUICK_SETS, data, seed, quick)
+        few = epochs or (QUICK_EPOCHS if quick else 20)
+        study = ActivationStudy(read, ("resnet-pretrained",), weights, few, device.value, seed, quick, run)
+        results = list(study.run({one.name: [0] for one in read}, progress))
+        networks = study.networks()
+        likeness = study.likeness(networks)
+        images = study.looks(networks, progress) if plot is not None else {}
+    table = Table("of", "and", "filters", "moved the same way", "first blocks (CKA)")
+    for pair in likeness:
+        figures = ("" if math.isnan(pair[name]) else f"{pair[name]:.3f}" for name in ("filters", "moved", "blocks"))
+        table.add_row(pair["one"], pair["two"], *figures)
+    console().print(table)
+    say_conditions(study)
+    close(study, results, json, {"likeness": likeness}, sets, "0")
+    if plot is not None:
+        draw_activation(plot, images)
         say(f"plot: {plot}")
 
 

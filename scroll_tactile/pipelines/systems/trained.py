@@ -79,10 +79,16 @@ class Trained:
             self._net = self._make(shape, len(self._names), seed).to(self._device)
             self.epochs = descend(self._net, taught, held, self.course, random, progress, watch)
 
-    def predict(self, streams: Sequence[Stream]) -> list[str]:
-        """See `System.predict`."""
+    @property
+    def network(self) -> nn.Module:
+        """The network that was trained last, on its device. Raises InputError before any was."""
         if self._net is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
+        return self._net
+
+    def predict(self, streams: Sequence[Stream]) -> list[str]:
+        """See `System.predict`."""
+        network = self.network
         said = [""] * len(streams)
         sizes: dict[tuple[int, ...], list[int]] = {}
         images = [picture(stream) for stream in streams]
@@ -90,7 +96,7 @@ class Trained:
             sizes.setdefault(image.shape, []).append(at)
         for members in sizes.values():
             inputs = torch.from_numpy(np.stack([self._read(images[at]) for at in members])).to(self._device)
-            for at, place in zip(members, logits_of(self._net, inputs).argmax(dim=1).tolist(), strict=True):
+            for at, place in zip(members, logits_of(network, inputs).argmax(dim=1).tolist(), strict=True):
                 said[at] = self._names[place]
         return said
 

@@ -17,6 +17,7 @@ from scroll_tactile.memory import Memory
 from scroll_tactile.model import Model
 from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.tracking import Tracked
+from scroll_tactile.windows import CHANNELS
 
 __all__ = ["Added", "Following", "SolverName"]
 
@@ -48,7 +49,8 @@ class Following:
         """
         statistics = memory.statistics
         self._felt += len(added)
-        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in statistics.scales):
+        judging = [scale for scale in statistics.scales if scale != CHANNELS]
+        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in judging):
             return False
         selections = dict(self.model.selections)
         for scale, selection in selections.items():

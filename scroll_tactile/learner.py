@@ -426,6 +426,12 @@ class TactileLearner:
         Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
         enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
         """
+        if self._reading.beginning or self._reading.noisy or self._reading.filled:
+            raise InputError(
+                f"f* is made of windows alone, and {self.embedding!r} reads beginnings, noise and silent channels by "
+                "statistics that training would not know: it would be asked about less than f. Fine-tune a memory of "
+                "the embedding inside it"
+            )
         with self._ledger.lock:
             self._ledger.require_writing()
             model, ranked, memory = self.model(), self._ranked(), self._memory

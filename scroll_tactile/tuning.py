@@ -135,7 +135,6 @@ class TouchFeatures:
         return {
             width: [read[width][place] for place in places]
             for width, places in self.reading.scored(columns, columns).items()
-            if width in read
         }
 
     def frozen(self, image: npt.NDArray[np.float32]) -> dict[int, FloatArray]:

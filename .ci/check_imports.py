@@ -19,7 +19,7 @@ LAYERS = [
     {"augment"},
     {"copies"},
     {"embeddings", "ridge", "requests"},
-    {"exemplars", "tuned", "packing", "descriptions"},
+    {"exemplars", "tuned", "packing", "descriptions", "filling"},
     {"memory", "tuning"},
     {"model", "identity", "history"},
     {"training", "following", "composing"},

@@ -60,50 +60,59 @@ def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -
 class Augmented:
     """Which copies a touch is observed with.
 
-    copies: how many, 1 or more, the same for every touch, so that each counts alike. speed: the most that a copy is
-    slower, or faster, as a factor of 1 or more. dead: the largest share of channels that read the low end of the
-    range. noise: the largest amplitude of uniform noise, as a share of the range. offset, gain: the most that a
-    channel's zero (as a share of the range) and its gain drift by until the end of the touch.
+    copies: how many that differ in all but noise, the same for every touch, so that each counts alike. speed: the most
+    that a copy is slower, or faster, as a factor of 1 or more. dead: the largest share of channels that read the low
+    end of the range. offset, gain: the most that a channel's zero (as a share of the range) and its gain drift by
+    until the end of the touch. noisy: how many copies more that differ in noise alone. noise: its largest amplitude,
+    uniform and as a share of the range; the least is a tenth of that.
 
-    A copy is no longer than the touch: what is slower is cut off there, as it is where it is asked about.
+    The speeds are spread evenly over the copies, two of them faster for each that is slower: there is less of a fast
+    touch to be known by. A copy is no longer than the touch: what is slower is cut off there, as it is where it is
+    asked about.
 
     Raises InputError for strengths that cannot be.
     """
 
     copies: int = 4
     speed: float = 2.0
-    dead: float = 0.3
-    noise: float = 0.0
+    dead: float = 0.0
     offset: float = 0.0
     gain: float = 0.0
+    noisy: int = 0
+    noise: float = 1.0
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.copies, int) and not isinstance(self.copies, bool) and self.copies >= 1
-        strengths = (self.speed - 1, self.dead, self.noise, self.offset, self.gain)
-        if not whole or not all(math.isfinite(one) and one >= 0 for one in strengths) or self.dead >= 1:
+        counts = (self.copies, self.noisy)
+        whole = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in counts)
+        strengths = (self.speed - 1, self.dead, self.offset, self.gain, self.noise)
+        possible = all(math.isfinite(one) and one >= 0 for one in strengths) and self.dead < 1
+        if not whole or not possible or not sum(counts):
             raise InputError(
-                f"expected 1 copy or more, a speed of 1 or more, dead in [0, 1), and noise, offset and gain of 0 or "
-                f"more; came {self}"
+                f"expected 1 copy or more in all, a speed of 1 or more, dead in [0, 1), and offset, gain and noise of "
+                f"0 or more; came {self}"
             )
 
     def to_json(self) -> dict[str, Any]:
         """All of it in JSON's types, as a memory keeps it."""
         return asdict(self)
 
-    def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> list[Image]:
-        """The copies of a touch, each float32 of shape (C, T') in [-1, 1], T' ≤ T; the same for the same key.
+    def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> tuple[list[Image], list[Image]]:
+        """The copies of a touch and its noisy copies, each float32 of shape (C, T') in [-1, 1], T' ≤ T.
 
-        image: the tactile image of the touch, shape (C, T). key: its content hash, see `Stream.key`.
+        The same for the same key. image: the tactile image of the touch, shape (C, T). key: its content hash, see
+        `Stream.key`.
         """
         rng = np.random.default_rng([1, int.from_bytes(key, "little")])
-        return [self._copy(image, rng) for _ in range(self.copies)]
+        copies = [self._copy(image, (at + rng.random()) / self.copies, rng) for at in range(self.copies)]
+        amplitudes = self.noise * (0.1 + 0.9 * rng.random(self.noisy))
+        return copies, [hiss(image, float(amplitude), rng) for amplitude in amplitudes]
 
-    def _copy(self, image: Image, rng: np.random.Generator) -> Image:
-        slower, much, dead, noise, offset, gain = rng.random(6)
+    def _copy(self, image: Image, pace: float, rng: np.random.Generator) -> Image:
+        dead, offset, gain = rng.random(3)
+        much = (3 * pace - 1) / 2 if pace > 1 / 3 else 3 * pace
         factor = 1 + much * (self.speed - 1)
         columns = image.shape[1]
-        copy = resize(image, max(factor if slower < 0.5 else 1 / factor, FEWEST / columns))
+        copy = resize(image, max(1 / factor if pace > 1 / 3 else factor, FEWEST / columns))
         copy = crop(copy, 0, min(columns, copy.shape[1]))
         copy = wander(copy, offset * self.offset, gain * self.gain, rng)
-        copy = silence(copy, dead * self.dead, rng)
-        return np.ascontiguousarray(hiss(copy, noise * self.noise, rng))
+        return silence(copy, dead * self.dead, rng)

@@ -20,6 +20,7 @@ from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.selection import Selection
 from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.ridge.tracking import Tracked
+from scroll_tactile.windows import CHANNELS
 
 __all__ = ["Added", "Following", "SolverName"]
 
@@ -51,7 +52,8 @@ class Following:
         """
         statistics = memory.statistics
         self._felt += len(added)
-        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in statistics.scales):
+        judging = [scale for scale in statistics.scales if scale != CHANNELS]
+        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in judging):
             return False
         with one_thread():
             self.model = replace(self.model, selections=self._followed(statistics, added))

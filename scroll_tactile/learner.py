@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,10 @@ import numpy.typing as npt
 from scroll_tactile.composing import Composer
 from scroll_tactile.copies import Augmented
 from scroll_tactile.descriptions import Description, checked, require_constituents
-from scroll_tactile.embeddings import Embedding, Kernels, embed_windows
+from scroll_tactile.embeddings import Embedding, Kernels, Robust, embed_windows
 from scroll_tactile.errors import DescriptionError, EmbeddingError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
+from scroll_tactile.filling import Filling, sampled_readings
 from scroll_tactile.finetune import fine_tune
 from scroll_tactile.following import Following, SolverName
 from scroll_tactile.history import Choice
@@ -26,7 +27,7 @@ from scroll_tactile.identity import capacity_of, identity_of, kept_augmentation,
 from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
 from scroll_tactile.memory import Memory
-from scroll_tactile.model import Model
+from scroll_tactile.model import Judgement, Model
 from scroll_tactile.packing import Codes
 from scroll_tactile.prediction import Compacted, Composition, Constituent, Merged, Prediction, Receipt
 from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
@@ -36,7 +37,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
-from scroll_tactile.windows import Reading
+from scroll_tactile.windows import BEGINNING, CHANNELS, NOISY, Reading
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -103,6 +104,7 @@ class TactileLearner:
         self._model: tuple[int, Model] | None = None
         self._following: tuple[int, Following] | None = None
         self._composer: tuple[Model, int, Composer] | None = None
+        self._filled: tuple[int, Filling | None] | None = None
 
     @classmethod
     def open(
@@ -187,15 +189,19 @@ class TactileLearner:
         return self._ledger.observe(material, felt, image.shape[1], self._codes(image, felt))
 
     def _codes(self, image: npt.NDArray[np.float32], felt: Stream) -> Codes:
-        """The codes of a touch's windows by scale, behind them those of its copies.
+        """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
 
         The touch's own come first: the pool finds them by their place. Copies are no longer than the touch, and so
         have no scale that it has not.
         """
-        copies = [] if self.augmentation is None else self.augmentation.copies_of(image, felt.key)
-        own, *others = [self._features(one) for one in (image, *copies)]
-        read = {width: [rows, *(one[width] for one in others if width in one)] for width, rows in own.items()}
-        return {width: to_codes(np.concatenate(rows), self.embedding.bound) for width, rows in read.items()}
+        copies, noisy = self.augmentation.copies_of(image, felt.key) if self.augmentation is not None else ([], [])
+        own, *others = [self._features(one) for one in (image, *copies, *noisy * (not self._reading.noisy))]
+        read = {scale: [rows, *(one[scale] for one in others if scale in one)] for scale, rows in own.items()}
+        if self._reading.noisy and noisy:
+            read[NOISY] = [self._noisy_features(one)[None] for one in noisy]
+        if self._reading.filled:
+            read[CHANNELS] = [sampled_readings(image, self.embedding.dimension)]
+        return {scale: to_codes(np.concatenate(rows), self.embedding.bound) for scale, rows in sorted(read.items())}
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.
@@ -316,6 +322,10 @@ class TactileLearner:
         felt = self._as_far_as_learned(felt, longest)
         image = tactile_image(felt)
         columns = image.shape[1]
+        if model.noisy is not None and cast(Robust, self.embedding).is_noisy(image):
+            judgement = model.judge_noisy(candidates, in_units(self._noisy_features(image), self.embedding.bound))
+            return self._prediction(candidates, judgement, felt)
+        image = self._mended(image)
         means = self._means(image, model.needed(candidates, columns))
         logits = None
         if (
@@ -352,7 +362,7 @@ class TactileLearner:
             nothing = tuple(Constituent(name, None, None, (), "nothing was felt yet") for name in wanted)
             return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
         felt = self._as_far_as_learned(felt, longest)
-        image = tactile_image(felt)
+        image = self._mended(tactile_image(felt))
         columns = image.shape[1]
         means = self._means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
         prediction = self._told(model, model.names, means, felt, columns, None)
@@ -364,6 +374,11 @@ class TactileLearner:
         if self._composer is None or self._composer[0] is not model or self._composer[1] != described:
             self._composer = model, described, Composer.of(model, self._memory.pool, self._memory.descriptions)
         return self._composer[2]
+
+    def _mended(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """The image with silent channels filled from the others, where the embedding asks for that."""
+        filling = self._filling() if self._reading.filled else None
+        return image if filling is None else filling.fill(image)
 
     def _means(self, image: npt.NDArray[np.float32], widths: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale."""
@@ -384,12 +399,17 @@ class TactileLearner:
         logits: Mapping[str, float] | None,
     ) -> Prediction:
         judgement = model.judge(candidates, means, columns, logits)
+        return self._prediction(candidates, judgement, felt, tuned=logits is not None)
+
+    def _prediction(
+        self, candidates: Sequence[str], judgement: Judgement, felt: Stream, *, tuned: bool = False
+    ) -> Prediction:
         ranking = sorted(
             zip(candidates, judgement.probability.tolist(), strict=True),
             key=lambda entry: (-entry[1], entry[0]),
         )
         known = bool(judgement.novelty <= judgement.calibration.threshold(self.false_alarms))
-        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds, tuned=logits is not None)
+        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds, tuned=tuned)
 
     def _as_far_as_learned(self, felt: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned, of so many columns.
@@ -401,12 +421,13 @@ class TactileLearner:
         return felt.first(longest // frame / self.sensor.rate)
 
     def _features(
-        self, image: npt.NDArray[np.float32], widths: Sequence[int] | None = None
+        self, image: npt.NDArray[np.float32], scales: Sequence[int] | None = None
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of a tactile image's windows, (windows, d) by scale: all, or those of some widths."""
+        """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
         windows = self._reading.extent(image.shape[1])
-        if widths is not None:
-            windows = {width: windows[width] for width in widths}
+        narrowest = self._reading.widths[0]
+        if scales is not None:
+            windows = {width: windows[width] for width in windows if width in scales}
         read = embed_windows(self.embedding, image, windows)
         for width, features in read.items():
             expected = (len(windows[width]), self.embedding.dimension)
@@ -414,7 +435,13 @@ class TactileLearner:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
                 )
+        if self._reading.beginning and narrowest in read:
+            read = {BEGINNING: read[narrowest][:1], **read}
         return read
+
+    def _noisy_features(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        embedding = cast(Robust, self.embedding)  # which `Reading.of` found to have it
+        return embedding.embed_noisy(image)
 
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""
@@ -423,6 +450,14 @@ class TactileLearner:
             if self._model is None or self._model[0] != version:
                 self._model = version, Model.of(memory, self.readout)
             return self._model[1]
+
+    def _filling(self) -> Filling | None:
+        """As the silent channels of a touch are filled in by the memory as it is now."""
+        with self._ledger.lock:
+            memory, version = self._memory, self._ledger.version
+            if self._filled is None or self._filled[0] != version:
+                self._filled = version, Filling.of(memory.statistics, self.sensor.channels, self.embedding.bound)
+            return self._filled[1]
 
     def _present(self) -> Model:
         """The model that predictions are made with: `model`, or one that follows it where `refit` allows."""
@@ -481,6 +516,12 @@ class TactileLearner:
         Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
         enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
         """
+        if self._reading.beginning or self._reading.noisy or self._reading.filled:
+            raise InputError(
+                f"f* is made of windows alone, and {self.embedding!r} reads beginnings, noise and silent channels by "
+                "statistics that training would not know: it would be asked about less than f. Fine-tune a memory of "
+                "the embedding inside it"
+            )
         with self._ledger.lock:
             self._ledger.require_writing()
             model, ranked, memory = self.model(), self._ranked(), self._memory

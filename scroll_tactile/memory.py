@@ -19,7 +19,7 @@ from scroll_tactile.packing import Codes, unpack_codes, unspanned
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.statistics import Statistics, fold_of
 from scroll_tactile.tuned import Tuned
-from scroll_tactile.windows import Reading
+from scroll_tactile.windows import NOISY, Reading
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
@@ -75,7 +75,7 @@ class Memory:
     def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
         self.reading = reading
         self.capacity = capacity or Capacity()
-        self.statistics = Statistics(dimension, reading.widths)
+        self.statistics = Statistics(dimension, reading.scales)
         self.pool = Pool()
         self.exemplars = self.capacity.pool()
         self.tuned: Tuned | None = None
@@ -237,6 +237,9 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> Touch:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
+        if NOISY in codes:  # the first noisy copy, at a stage behind all that a touch can reach
+            unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            stages += [*unreached, {NOISY: [0]}]
         return Touch.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
@@ -332,8 +335,8 @@ class Memory:
         return memory
 
     def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
-        names, widths = attributes["materials"], self.reading.widths
-        self.statistics = Statistics.from_arrays(self.statistics.dimension, widths, arrays, names)
+        names, scales = attributes["materials"], self.reading.scales
+        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         self.pool = Pool.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarPool.from_arrays(

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory import Memory, give_back_scratch
-from scroll_tactile.ridge.calibration import Calibration, calibrate
+from scroll_tactile.ridge.calibration import Calibration, calibrate, calibrate_stage
 from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.ridge.selection import Selection, select
-from scroll_tactile.windows import Reading
+from scroll_tactile.windows import CHANNELS, NOISY, Reading
 
 __all__ = ["Judgement", "Model"]
 
@@ -31,7 +31,10 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Model:
-    """names: the materials. selections: scale → its readout. stages: for each, the scales that judge there."""
+    """names: the materials. selections: scale → its readout. stages: for each, the scales that judge there.
+
+    noisy: of touches felt through noise; None where none were learned.
+    """
 
     kind: ReadoutName
     names: list[str]
@@ -39,6 +42,7 @@ class Model:
     stages: list[list[int]]
     selections: dict[int, Selection]
     calibrations: list[Calibration]
+    noisy: Calibration | None = None
 
     @classmethod
     def of(cls, memory: Memory, kind: ReadoutName) -> Model:
@@ -47,11 +51,14 @@ class Model:
         scales = statistics.scales
         stages = [memory.reading.judging(length) for length in memory.reading.milestones()]
         with one_thread():
-            chosen = {scale: select(statistics, scale, kind) for scale in scales}
+            chosen = {scale: select(statistics, scale, kind) for scale in scales if scale != CHANNELS}
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
+            noisy = None
+            if NOISY in selections:
+                noisy = calibrate_stage(len(stages), memory.pool, [selections[NOISY]], kind)
         give_back_scratch()
-        return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations)
+        return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations, noisy)
 
     @property
     def scales(self) -> tuple[int, ...]:
@@ -101,6 +108,17 @@ class Model:
         calibration = self.calibrations[stage]
         distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
+
+    def judge_noisy(self, candidates: Sequence[str], features: FloatArray) -> Judgement:
+        """Weigh the candidates for a touch felt through noise; features: in the codes' unit, (d,)."""
+        assert self.noisy is not None
+        selection = self.selections[NOISY]
+        z = selection.readout.project(features)
+        places = [selection.places[name] for name in candidates]
+        logits = self.noisy.weights[0] * selection.readout.scores(z, self.kind)[places]
+        chances = np.exp(logits - logits.max())
+        novelty = self.noisy.novelty(np.array([self._distance(NOISY, z, candidates)]))
+        return Judgement(chances / chances.sum(), float(novelty), self.noisy)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""

@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from scroll_tactile.sensors import Sensor
 
 __all__ = [
+    "BEGINNING",
+    "CHANNELS",
     "ENOUGH",
     "MOST_WINDOWS",
+    "NOISY",
     "Extent",
     "Reading",
     "extent",
@@ -35,6 +38,11 @@ ENOUGH = 0.65  # of a window: a touch half the usual one is read with the kernel
 FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
 FRAMES = 80  # columns of a camera's frame in its tactile image
+
+# Scales that are no widths, and smaller than any width:
+NOISY = 0  # the whole of a touch felt through noise
+BEGINNING = 1  # the first of the narrowest windows, by itself
+CHANNELS = 2  # readings themselves, by which silent channels are filled in; it judges nothing
 
 Extent = dict[int, list[int]]  # width of windows → their first columns
 
@@ -128,19 +136,35 @@ def stages(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> li
 class Reading:
     """How the touches of a sensor are read by an embedding: which windows, and which scales judge.
 
-    widths: the scales, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
-    judged: "all" scales that fit a touch, or the "widest" of them alone.
+    widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
+    judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
+    is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
     """
 
     widths: tuple[int, ...]
     partial: bool = True
     judged: Literal["all", "widest"] = "all"
+    beginning: bool = False
+    noisy: bool = False
+    filled: bool = False
 
     @classmethod
-    def of(cls, sensor: Sensor, embedding: object) -> Reading:
-        """As the embedding asks for by its attributes `partial_windows` and `judged_scales`, where it has them."""
+    def of(cls, sensor: Sensor, embedding: Any) -> Reading:
+        """As the embedding asks for by its attributes, where it has them.
+
+        These are `partial_windows`, `judged_scales`, `reads_beginnings`, `fills_channels`, and whether there is an
+        `embed_noisy`.
+        """
         partial = bool(getattr(embedding, "partial_windows", True))
-        return cls(scales(sensor), partial, getattr(embedding, "judged_scales", "all"))
+        beginning = bool(getattr(embedding, "reads_beginnings", False))
+        noisy = hasattr(embedding, "embed_noisy")
+        filled = bool(getattr(embedding, "fills_channels", False)) and sensor.channels <= embedding.dimension
+        return cls(scales(sensor), partial, getattr(embedding, "judged_scales", "all"), beginning, noisy, filled)
+
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """All that has statistics of its own, ascending: the widths, and before them NOISY, BEGINNING, CHANNELS."""
+        return (NOISY,) * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled + self.widths
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""
@@ -149,16 +173,18 @@ class Reading:
     def judging(self, length: int) -> list[int]:
         """The scales that judge when so many columns have been felt."""
         fit = fitting(length, self.widths, partial=self.partial)
-        return fit[-1:] if self.judged == "widest" else fit
+        chosen = fit[-1:] if self.judged == "widest" else fit
+        return [BEGINNING, *chosen] if self.beginning and chosen[0] == self.widths[0] else chosen
 
     def scored(self, columns: int, length: int) -> dict[int, list[int]]:
-        """Of a touch of so many columns: width → places of the windows that judge after the first `length`."""
+        """Of a touch of so many columns: scale → places of the windows that judge after the first `length`."""
         places = scored(self.extent(columns), length, partial=self.partial)
-        return {width: places[width] for width in self.judging(length)}
+        return {scale: places.get(scale, [0]) for scale in self.judging(length)}
 
     def places(self, columns: int) -> dict[int, list[int]]:
-        """Of a touch of so many columns: width → places of the windows whose codes are averaged, at every scale."""
-        return scored(self.extent(columns), columns, partial=self.partial)
+        """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
+        places = scored(self.extent(columns), columns, partial=self.partial)
+        return {BEGINNING: [0], **places} if self.beginning else places
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""

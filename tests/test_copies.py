@@ -12,10 +12,16 @@ from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.images import tactile_image
 from scroll_tactile.streams import validate
 
-THREE = Augmented(copies=3, noise=0.5, offset=0.05, gain=0.2)
+THREE = Augmented(copies=3, dead=0.3, offset=0.05, gain=0.2)
+NOISY = Augmented(copies=2, noisy=3, noise=0.5)
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4, "augmentation": THREE}
 FELT = [(name, (seed, readings)) for seed, readings in enumerate((60, 25, 90)) for name in "ab"]
 RAMP = np.linspace(-1, 1, 60, dtype=np.float32).reshape(3, 20)
+
+
+def both(augmentation, image, key):
+    copies, noisy = augmentation.copies_of(image, key)
+    return [*copies, *noisy]
 
 
 def contents(learner):
@@ -40,10 +46,10 @@ class TestCopies:
     def test_they_are_a_function_of_the_touch(self):
         one, other = (validate(stream((seed, 60)), PAD) for seed in (0, 1))
         image = tactile_image(one)
-        first, again = (THREE.copies_of(image, one.key) for _ in range(2))
+        first, again = (both(THREE, image, one.key) for _ in range(2))
         assert [copy.tobytes() for copy in first] == [copy.tobytes() for copy in again]
         assert len({copy.tobytes() for copy in first}) == 3
-        assert first[0].tobytes() != THREE.copies_of(image, other.key)[0].tobytes()
+        assert first[0].tobytes() != both(THREE, image, other.key)[0].tobytes()
 
     def test_they_neither_touch_the_image_nor_a_global_generator(self):
         image, before = RAMP.copy(), np.random.get_state()[1].tobytes()  # noqa: NPY002
@@ -54,9 +60,9 @@ class TestCopies:
     @pytest.mark.parametrize("columns", [1, 2, 5, 400])
     def test_they_are_sound_images_no_longer_than_the_touch(self, columns):
         image = np.linspace(-1, 1, 2 * columns, dtype=np.float32).reshape(2, columns)
-        strong = Augmented(copies=4, speed=4, dead=0.9, noise=1, offset=1, gain=1)
+        strong = Augmented(copies=4, speed=4, dead=0.9, offset=1, gain=1, noisy=2)
         for seed in range(20):
-            for copy in strong.copies_of(image, bytes([seed])):
+            for copy in both(strong, image, bytes([seed])):
                 assert copy.dtype == np.float32
                 assert copy.flags.c_contiguous
                 assert len(copy) == 2
@@ -64,8 +70,8 @@ class TestCopies:
                 assert np.abs(copy).max() <= 1
 
     def test_without_any_strength_a_copy_is_the_touch(self):
-        plain = Augmented(copies=2, speed=1, dead=0)
-        assert [copy.tobytes() for copy in plain.copies_of(RAMP, b"key")] == [RAMP.tobytes()] * 2
+        plain = Augmented(copies=2, speed=1, noisy=1, noise=0)
+        assert [copy.tobytes() for copy in both(plain, RAMP, b"key")] == [RAMP.tobytes()] * 3
 
     def test_noise_fills_its_amplitude_and_the_range_ends_it(self):
         noise = hiss(np.zeros((4, 2000), np.float32), 0.25, np.random.default_rng(0))
@@ -86,7 +92,16 @@ class TestCopies:
         assert 0.05 < np.abs(wandered[:, -1] - RAMP[:, -1]).max() <= 2 * 0.1 + 2 * 0.3
 
     @pytest.mark.parametrize(
-        "wrong", [{"copies": 0}, {"copies": True}, {"speed": 0.5}, {"dead": 1.0}, {"noise": -1}, {"gain": np.nan}]
+        "wrong",
+        [
+            {"copies": 0},
+            {"copies": True},
+            {"noisy": -1},
+            {"speed": 0.5},
+            {"dead": 1.0},
+            {"noise": -1},
+            {"gain": np.nan},
+        ],
     )
     def test_strengths_that_cannot_be_are_refused(self, wrong):
         with pytest.raises(InputError, match="came Augmented"):

@@ -10,6 +10,7 @@ from scroll_tactile.cli.demo import demo
 from scroll_tactile.cli.memory import inspect, observe, predict
 from scroll_tactile.cli.replay import replay
 from scroll_tactile.cli.reproduce import reproduce
+from scroll_tactile.cli.robustness import robustness
 from scroll_tactile.cli.schedules import schedules
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
@@ -24,7 +25,7 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, predict, inspect, replay, continual, schedules):
+for command in (demo, observe, predict, inspect, replay, continual, robustness, schedules):
     app.command()(command)
 app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")

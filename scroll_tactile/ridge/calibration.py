@@ -19,7 +19,7 @@ from scroll_tactile.ridge.readouts import Readout, ReadoutName
 from scroll_tactile.ridge.selection import Selection
 from scroll_tactile.ridge.statistics import fold_of
 
-__all__ = ["Calibration", "calibrate"]
+__all__ = ["Calibration", "calibrate", "calibrate_stage"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -67,13 +67,14 @@ def calibrate(
 ) -> list[Calibration]:
     """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
     return [
-        _calibrate_stage(stage, pool, [selections[scale] for scale in scales], kind)
+        calibrate_stage(stage, pool, [selections[scale] for scale in scales], kind)
         for stage, scales in enumerate(stages)
         if all(scale in selections for scale in scales)
     ]
 
 
-def _calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName) -> Calibration:
+def calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName) -> Calibration:
+    """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
     scores, targets, distances = _held_out(stage, pool, selections, kind)
     prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
     weights = _fit_weights(scores, targets, prior)

@@ -7,6 +7,7 @@ import typer
 from scroll_tactile.cli.bench import bench
 from scroll_tactile.cli.continual import continual
 from scroll_tactile.cli.demo import demo
+from scroll_tactile.cli.fabric import fabric
 from scroll_tactile.cli.memory import inspect, observe, predict
 from scroll_tactile.cli.replay import replay
 from scroll_tactile.cli.schedules import schedules
@@ -27,3 +28,4 @@ for command in (demo, observe, predict, inspect, replay, continual, schedules):
     app.command()(command)
 app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")
+app.add_typer(fabric, name="fabric")

@@ -30,9 +30,10 @@ from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["FIGURES", "Letters", "SlideTransfer", "directions", "summary"]
 
-FIGURES = ("score", "exact", "accuracy", "always", "calibration_error")
-"""Of each fold: mean score per constituent, exact matches, materials told, the score of always saying what is more
-common, and expected calibration error of the presences."""
+FIGURES = ("score", "exact", "accuracy", "untold", "always", "calibration_error")
+"""Of each fold: mean score per constituent, exact matches, materials told, the score where it is not said beforehand
+whether the touches are of letters never touched, that of always saying what is more common, and expected calibration
+error of the presences."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -75,19 +76,22 @@ class Letters:
         ]
         groups = letter_folds(self.groups, self.seed)
         parts += [("never touched", " ".join(group), at, np.isin(names, group)) for at, group in enumerate(groups)]
-        embeddings: dict[str, Embedding] = {
-            "known": Cached(Maps(layout=GRID, parts=4, cosines=self.cosines)),
-            "never touched": Cached(Maps(layout=GRID, parts=4, views=["corner"])),
+        # With the embedding: whether the touches asked about are of letters never touched, which whoever asks knows.
+        settings: dict[str, tuple[Embedding, float]] = {
+            "known": (Cached(Maps(layout=GRID, parts=4, cosines=self.cosines)), 0.0),
+            "never touched": (Cached(Maps(layout=GRID, parts=4, views=["corner"])), 1.0),
         }
         for kind, title, at, tested in parts:
             name = f"{kind} {at}"
             if name not in notes.notes and tested.any():
                 result = {"part": kind, "number": at, "tested on": title}
-                notes.note(name, result | self._part(embeddings[kind], tested, f"{kind}, {title}", progress))
+                notes.note(name, result | self._part(*settings[kind], tested, f"{kind}, {title}", progress))
             if name in notes.notes:
                 yield notes.notes[name]
 
-    def _part(self, embedding: Embedding, tested: Mask, what: str, progress: Progress) -> dict[str, Any]:
+    def _part(
+        self, embedding: Embedding, unfamiliar: float, tested: Mask, what: str, progress: Progress
+    ) -> dict[str, Any]:
         begun = time.perf_counter()
         recordings = self.recordings
         learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=0)
@@ -98,17 +102,20 @@ class Letters:
         for letter in learner.materials:
             learner.describe(letter, dots_of(letter))
         exam = np.flatnonzero(tested).tolist()
-        said = []
+        said, untold = [], []
         for done, at in enumerate(exam):
-            said.append(learner.compose(recordings.streams[at]))
+            said.append(learner.compose(recordings.streams[at], unfamiliar=unfamiliar))
+            untold.append(learner.compose(recordings.streams[at]))
             progress(what, total - len(exam) + done + 1, total)
         truth = [recordings.materials[at] for at in exam]
-        figures = score_compositions(DOTS, [dots_of(letter) for letter in truth], said)
+        dots = [dots_of(letter) for letter in truth]
+        figures = score_compositions(DOTS, dots, said)
         return {
             "learned": int((~tested).sum()),
             "accuracy": accuracy(truth, [one.prediction.material for one in said]),
-            "unfamiliar": float(np.mean([one.unfamiliar for one in said])),
+            "unfamiliar": float(np.mean([one.unfamiliar for one in untold])),
             **figures,
+            "untold": score_compositions(DOTS, dots, untold)["score"],
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
         }

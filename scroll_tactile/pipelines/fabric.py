@@ -79,7 +79,7 @@ class Letters:
         # With the embedding: whether the touches asked about are of letters never touched, which whoever asks knows.
         settings: dict[str, tuple[Embedding, float]] = {
             "known": (Cached(Maps(layout=GRID, parts=4, cosines=self.cosines)), 0.0),
-            "never touched": (Cached(Maps(layout=GRID, parts=4, views=["corner"])), 1.0),
+            "never touched": (Cached(Maps(layout=GRID, parts=1, views=["corner"])), 1.0),
         }
         for kind, title, at, tested in parts:
             name = f"{kind} {at}"

@@ -10,8 +10,10 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from scipy.ndimage import gaussian_filter, shift
 
+from scroll_tactile.embeddings.kernels import one_torch_thread
 from scroll_tactile.embeddings.protocol import canary
 from scroll_tactile.errors import InputError
 
@@ -99,10 +101,10 @@ class Maps:
         return digest.hexdigest()
 
     @cached_property
-    def _waves(self) -> tuple[FloatArray, FloatArray]:
+    def _waves(self) -> tuple[torch.Tensor, FloatArray]:
         rng = np.random.default_rng([self.seed, *self.layout, self.parts, self.cosines])
         weights = rng.standard_normal((self.cosines, self._plain)) / self.reach
-        return weights, rng.uniform(0, 2 * np.pi, self.cosines)
+        return torch.from_numpy(weights), rng.uniform(0, 2 * np.pi, self.cosines)
 
     def embed(self, image: npt.NDArray[np.float32]) -> FloatArray:
         """Features in [-1, 1], shape (d,), of a tactile image of shape (C, T) in [-1, 1], C as in the layout."""
@@ -113,8 +115,8 @@ class Maps:
         if not self.cosines:
             return plain
         weights, phases = self._waves
-        # Summed by numpy itself, in one order whatever the threads.
-        turned = (weights * plain).sum(axis=1) + phases
+        with one_torch_thread():  # in one order, whatever the threads
+            turned = torch.mv(weights, torch.from_numpy(plain)).numpy() + phases
         rounded: FloatArray = np.rint(np.cos(turned) * STEPS) / STEPS
         return rounded
 

@@ -7,7 +7,7 @@ learner.predict(stream).material         # "felt"; or known=False: never felt th
 
 from scroll_tactile import errors, sensors
 from scroll_tactile.copies import Augmented
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, ModuleEmbedding, Vision, check_embedding
+from scroll_tactile.embeddings import Embedding, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision, check_embedding
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction import Composition, Constituent, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -20,9 +20,11 @@ __all__ = [
     "Embedding",
     "Joined",
     "Kernels",
+    "Maps",
     "ModuleEmbedding",
     "Prediction",
     "Receipt",
+    "Robust",
     "Sensor",
     "Stream",
     "TactileLearner",

@@ -337,17 +337,24 @@ class TactileLearner:
             logits = reader.logits(image)
         return self._told(model, candidates, means, felt, columns, logits)
 
-    def compose(self, stream: Readings, *, constituents: Sequence[str] | None = None) -> Composition:
+    def compose(
+        self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
+    ) -> Composition:
         """Say what a stream feels made of, of all that was described; the memory stays as it is.
 
-        stream: as for `observe`. constituents: those that are asked for; all where it is None.
+        stream: as for `observe`. constituents: those that are asked for; all where it is None. unfamiliar: how probable
+        it is beforehand that the touch is of a material never felt: 1 where that is known, 0 where it cannot be.
 
         A touch of a material that was felt is told by what it feels like and what that is made of, one of a material
-        never felt by heads over all that were (see `scroll_tactile.composing`). A constituent that all or none of the
+        never felt by heads over all that were (see `scroll_tactile.composing`); the two are weighed by the touch's
+        novelty. A constituent that all or none of the
         materials have that were felt and of which it is known is named, in `Constituent.unlearned`, and not guessed.
 
-        Raises StreamError, and DescriptionError where nothing was described, or for a constituent that nothing names.
+        Raises StreamError, DescriptionError where nothing was described, or for a constituent that nothing names, and
+        InputError for an unfamiliar that is no probability.
         """
+        if not 0 <= unfamiliar <= 1:
+            raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
         felt = validate(stream, self.sensor)
         with self._ledger.lock:
             described, longest = self._memory.descriptions, self._memory.statistics.longest
@@ -366,8 +373,8 @@ class TactileLearner:
         columns = image.shape[1]
         means = self._means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
         prediction = self._told(model, model.names, means, felt, columns, None)
-        made_of, unfamiliar = composer.compose(wanted, dict(prediction.ranking), means, columns)
-        return Composition(made_of, unfamiliar, prediction)
+        made_of, new = composer.compose(wanted, dict(prediction.ranking), means, columns, unfamiliar)
+        return Composition(made_of, new, prediction)
 
     def _fitted_composer(self, model: Model) -> Composer:
         described = self._ledger.described

@@ -99,8 +99,8 @@ class Composition:
     """What a stream feels made of.
 
     constituents: all that were asked for, in alphabetical order. unfamiliar: the probability that the touch is of a
-        material never felt, one such touch being expected for each of a known one: what the heads weigh, who speak for
-        a new material, against the known ones that the touch feels like.
+        material never felt: what the heads weigh, which speak for a new material, against the known ones that it
+        feels like.
     prediction: what it feels like among the materials felt.
     """
 

@@ -267,4 +267,7 @@ class TestHeads:
         true = rng.uniform(size=4000) < 1 / (1 + np.exp(-(3 * at - 1)))
         curve = fit_curve(at, true, prior)
         assert (curve.slope, curve.offset) == pytest.approx((3, -1), abs=0.3)
-        assert fit_curve(at, ~true, prior).slope == 0  # never the wrong way round
+        assert fit_curve(at, ~true, prior).slope == pytest.approx(0, abs=1e-6)  # never the wrong way round
+        steady = fit_curve(at, true, prior, turning=False)
+        assert steady(0.5) == pytest.approx(0.5)
+        assert steady.slope < prior.slope

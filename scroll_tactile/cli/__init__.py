@@ -7,6 +7,7 @@ import typer
 from scroll_tactile.cli.bench import bench
 from scroll_tactile.cli.continual import continual
 from scroll_tactile.cli.demo import demo
+from scroll_tactile.cli.fabric import fabric
 from scroll_tactile.cli.memory import inspect, observe, predict
 from scroll_tactile.cli.replay import replay
 from scroll_tactile.cli.reproduce import reproduce
@@ -30,3 +31,4 @@ for command in (demo, observe, predict, inspect, replay, continual, robustness, 
 app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")
 app.add_typer(reproduce, name="reproduce")
+app.add_typer(fabric, name="fabric")

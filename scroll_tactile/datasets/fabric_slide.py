@@ -25,7 +25,7 @@ from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
 
-__all__ = ["BALANCED", "CPM_FINGER", "FABRICS", "Slides", "load", "protocol_of"]
+__all__ = ["BALANCED", "CPM_FINGER", "CPM_RATIOS", "FABRICS", "Slides", "load", "protocol_of", "ratios"]
 
 SOURCE = "github.com/wngfra/FabricSlide"
 FABRICS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Linen", "WovenFabric")
@@ -43,6 +43,18 @@ CPM_FINGER = Sensor(
 )
 """The 16 capacitive channels of the finger."""
 
+CPM_RATIOS = Sensor(
+    name="cpm-finger-ratios",
+    channels=16,
+    rate=36.0,  # of a slide of 4 s; of others it is the distance between two readings that is the same
+    low=-1.5,
+    high=1.5,
+    unit="ln",
+    duration=5.3,  # so that the widest window, three quarters of it, is a slide
+)
+"""The finger's channels as natural logarithms of their ratios to the mean of all, over distance."""
+
+_PLACES = 144  # readings of a slide over distance: those of a fast one
 _FOLDS = 5
 _FIRST = 3  # columns before the channels
 _NAME = re.compile(r"(?P<fabric>[A-Za-z]+)_F(?P<force>\d+)_V(?P<speed>-?\d+)mmps_(?P<repetition>\d+)")
@@ -96,6 +108,24 @@ def load(root: str | Path, fabrics: Collection[str] = BALANCED, seed: int = 0) -
     recordings = Recordings("FabricSlide", CPM_FINGER, streams, names, within, fold, ordered=False)
     force, speed = (np.array([protocol[at] for protocol, _ in chosen], dtype=np.int64) for at in (1, 2))
     return Slides(recordings, force, speed)
+
+
+def ratios(slide: Stream) -> Stream:
+    """A slide without its speed and force: (144, 16) logarithms of ratios, at places evenly spread over the distance.
+
+    Pressing harder raises all channels together, which the logarithm of each one's ratio to their geometric mean
+    leaves out; going faster makes the same distance shorter, and each place is the mean of the readings there.
+
+    slide: of `CPM_FINGER`, at least 2 readings. Raises InputError for another sensor's stream.
+    """
+    slide = validate(slide, CPM_FINGER)
+    logs = np.log(np.maximum(slide.readings.astype(np.float64), 1.0))
+    logs -= logs.mean(axis=1, keepdims=True)
+    # The integral of the readings, taken between the places' edges: exact for slow slides and for fast ones.
+    total = np.concatenate([np.zeros((1, logs.shape[1])), np.cumsum(logs, axis=0)])
+    edges = np.linspace(0, len(logs), _PLACES + 1)
+    at = np.stack([np.interp(edges, np.arange(len(total)), column) for column in total.T], axis=1)
+    return validate(np.diff(at, axis=0) * (_PLACES / len(logs)), CPM_RATIOS)
 
 
 def _read(path: Path) -> Stream:

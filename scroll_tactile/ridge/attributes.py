@@ -76,28 +76,27 @@ class Curve:
 
 
 def fit_curve(
-    values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, rows: float = 1.0, weights: npt.ArrayLike = 1.0
+    values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, rows: float = 1.0, turning: bool = True
 ) -> Curve:
     """The logistic curve of least log loss (Platt 1999), its slope not below 0, drawn to `prior` where touches are few.
 
-    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. weights: of each, shape (N,) or one number. rows: what the
-    prior counts as.
+    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: what the prior counts as. turning: whether the value
+    at which it passes a half may be another than the prior's.
     """
     at, wanted = np.asarray(values, dtype=np.float64), np.asarray(targets, dtype=np.float64)
-    heavy = np.broadcast_to(np.asarray(weights, dtype=np.float64), at.shape)
     if not len(at):
         return prior
-    spread = max(abs(prior.slope), 1e-6)
+    half = -prior.offset / prior.slope
+    from_half = at - half
 
     def loss(point: FloatArray) -> tuple[float, FloatArray]:
-        slope, offset = point
-        logits = slope * at + offset
-        miss = heavy * (expit(logits) - wanted)
-        value = float(np.sum(heavy * (np.logaddexp(0.0, logits) - wanted * logits)))
-        pull = np.array([(slope - prior.slope) / spread, (offset - prior.offset) / spread])
-        gradient = np.array([miss @ at, miss.sum()]) + rows * pull / spread
-        return value + rows * float(pull @ pull) / 2, gradient
+        logits = point[0] * from_half + point[1]
+        miss = expit(logits) - wanted
+        pull = (point - start) / prior.slope
+        value = float(np.sum(np.logaddexp(0.0, logits) - wanted * logits)) + rows * float(pull @ pull) / 2
+        return value, np.array([miss @ from_half, miss.sum()]) + rows * pull / prior.slope
 
-    start = np.array([prior.slope, prior.offset])
-    fit = minimize(loss, start, jac=True, bounds=[(0.0, None), (None, None)], method="L-BFGS-B")
-    return Curve(float(fit.x[0]), float(fit.x[1]))
+    start = np.array([prior.slope, 0.0])
+    bounds = [(0.0, None), (None, None) if turning else (0.0, 0.0)]
+    slope, above = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x.tolist()
+    return Curve(slope, above - slope * half)

@@ -42,6 +42,7 @@ OPERATIONS: dict[str, Operation] = {
     "batch": ("batch", tuple(("observe", "c", (at, 90)) for at in range(5))),
     "retract": ("retract", 2),
     "forget": ("forget", "ü"),
+    "describe": ("describe", "a", (("silk", 1.0),)),
     "merge": ("merge", "plain", "twice"),
     "merge of one compacted": ("merge", "compacted", "twice"),
     "fine_tune": ("fine_tune",),

@@ -64,6 +64,7 @@ HISTORY: tuple[tuple[str, Operation, int], ...] = (
     ("batch", ("batch", (OBSERVE, ("observe", "a", (2, 40)), ("retract", 3), ("forget", "ü"))), NEVER),
     ("retract", ("retract", 2), NEVER),
     ("forget", ("forget", "c"), NEVER),
+    ("describe", ("describe", "b", (("silk", 0.25), ("wool", 0.75))), NEVER),
     ("merge", ("merge", "taken", "twice"), NEVER),
     ("merge of one compacted", ("merge", "compacted", "twice"), NEVER),
     ("fine-tune", ("fine_tune",), NEVER),

@@ -84,7 +84,7 @@ class Killing:
     def once(self) -> None:
         """One child, one kill, one look at what is left."""
         target = self.rng.choice(TARGETS)
-        kinds = self.rng.choices(KINDS[:5], k=self.rng.randrange(4))
+        kinds = self.rng.choices(KINDS[:6], k=self.rng.randrange(4))
         operations = history(self.rng, self.state, self.others, [*kinds, *([target] if target in KINDS else [])])
         if target in ("close", "idle"):
             operations.append((target,))

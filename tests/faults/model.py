@@ -1,9 +1,9 @@
 """What a memory must hold: a list of touches that cannot go wrong, and the operations that change it.
 
 An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
-("forget", material), ("merge", name, shared), ("compact", keep), ("fine_tune",). `after` says what it makes of a
-`State` and what the call returns, `perform` does it to a learner, and `expected` is what can be seen of a learner
-in that state: made anew, in memory, from the touches in another order.
+("forget", material), ("describe", material, constituents or None), ("merge", name, shared), ("compact", keep),
+("fine_tune",). `after` says what it makes of a `State` and what the call returns, `perform` does it to a learner, and
+`expected` is what can be seen of a learner in that state: made anew, in memory, from the touches in another order.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ MATERIALS = ("a", "b", "c", "ü")
 LENGTHS = (9, 16, 25, 40, 60, 90, 90)  # the widest scale needs 37, a fine-tune some of two materials
 
 Touch = tuple[int, int]
+Constituents = tuple[tuple[str, float | bool | None], ...]
 Operation = tuple[Any, ...]
 
 
@@ -98,13 +99,17 @@ Pairs = tuple[tuple[str, Touch], ...]
 
 @dataclass(frozen=True)
 class State:
-    """All that a memory holds. last: its rows. base: the last that was compacted. tuned: what f* was made from."""
+    """All that a memory holds. last: its rows. base: the last that was compacted. tuned: what f* was made from.
+
+    said: materials with what they are made of, in alphabetical order.
+    """
 
     felt: tuple[Felt, ...] = ()
     last: int = 0
     base: int = 0
     tuned: Pairs | None = None
     tuned_upto: int = 0
+    said: tuple[tuple[str, Constituents], ...] = ()
 
     @property
     def pairs(self) -> Pairs:
@@ -121,6 +126,13 @@ class State:
         """The state after an observation."""
         one = Felt(self.last + 1, material, touch, fixed)
         return replace(self, felt=(*self.felt, one), last=self.last + 1)
+
+    def with_said(self, material: str, constituents: Constituents | None) -> State:
+        """The state in which this is said of a material; None: nothing is."""
+        said = dict(self.said)
+        said.pop(material, None)
+        said |= {} if constituents is None else {material: constituents}
+        return replace(self, said=tuple(sorted(said.items())))
 
     @property
     def loose(self) -> list[Felt]:
@@ -168,7 +180,12 @@ def _forget(state: State, _: Any, material: str) -> tuple[State, Any]:
         return state, "UnknownMaterialError"
     if any(one.fixed for one in found):
         return state, "ObservationError"
-    return state.without({one.sequence for one in found}), len(found)
+    return state.without({one.sequence for one in found}).with_said(material, None), len(found)
+
+
+def _describe(state: State, _: Any, material: str, constituents: Constituents | None) -> tuple[State, Any]:
+    changed = repr(dict(state.said).get(material)) != repr(constituents)
+    return replace(state.with_said(material, constituents), last=state.last + changed), None
 
 
 def _merge(state: State, others: dict[str, Other], name: str, shared: str) -> tuple[State, Any]:
@@ -204,6 +221,7 @@ _AFTER = {
     "batch": _batch,
     "retract": _retract,
     "forget": _forget,
+    "describe": _describe,
     "merge": _merge,
     "compact": _compact,
     "fine_tune": _fine_tune,
@@ -238,6 +256,7 @@ _CALLS = {
     "batch": _do_batch,
     "retract": lambda learner, _, sequence: learner.retract(sequence),
     "forget": lambda learner, _, material: learner.forget(material),
+    "describe": lambda learner, _, material, said: learner.describe(material, said and dict(said)),
     "merge": _do_merge,
     "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,
     "fine_tune": lambda learner, _: learner.fine_tune(epochs=1).digest,
@@ -250,6 +269,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
     return {
         "materials": learner.materials,
         "digest": learner.digest(),
+        "descriptions": learner.descriptions,
         "exemplars": {name: [key.hex() for key in keys] for name, keys in learner.exemplars.items()},
         "tuned": learner.tuned_digest(),
         "pool": _pool(learner),
@@ -269,7 +289,9 @@ def expected(state: State) -> dict[str, Any]:
     """What must be seen of a learner in this state."""
     counted = dict(sorted(Counter(one.material for one in state.felt).items()))
     tuned = None if state.tuned is None else tuned_digest(state.tuned)
-    return _felt(state.pairs) | {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base}
+    said = {material: dict(constituents) for material, constituents in state.said}
+    told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
+    return _felt(state.pairs) | told
 
 
 def _taught(pairs: Pairs) -> TactileLearner:

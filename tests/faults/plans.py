@@ -7,10 +7,12 @@ from pathlib import Path
 
 from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened, stream
 
-KINDS = ("observe", "batch", "retract", "forget", "merge", "compact", "fine_tune")
+KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune")
 
 # Few touches, so that the same stream is felt again, by this memory and by those merged into it.
 SEEDS = 6
+
+SAID = (None, (("silk", 1.0),), (("silk", 0.25), ("wool", 0.75)), (("soft", True), ("wool", None)))
 
 
 def touch(rng: random.Random) -> Touch:
@@ -42,6 +44,8 @@ def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) 
         return kind, rng.choice(MATERIALS), touch(rng)
     if kind == "batch":
         return kind, _together(rng, state, others)
+    if kind == "describe":
+        return kind, rng.choice(MATERIALS), rng.choice(SAID)
     if kind in ("retract", "forget"):
         return kind, _to_take_back(rng, state, kind)
     if kind == "merge":
@@ -62,7 +66,7 @@ def _to_take_back(rng: random.Random, state: State, kind: str) -> int | str:
 def _together(rng: random.Random, state: State, others: dict[str, Other]) -> tuple[Operation, ...]:
     operations: list[Operation] = []
     for _ in range(rng.randrange(1, 7)):
-        kind = rng.choice(("observe", "observe", "observe", "retract", "forget"))
+        kind = rng.choice(("observe", "observe", "observe", "retract", "forget", "describe"))
         operations.append(draw(rng, state, others, kind))
         state, _ = after(state, operations[-1], others)
     return tuple(operations)

@@ -33,7 +33,7 @@ from faults.plans import draw
 from faults.zygote import Zygote
 from store import LockedError
 
-KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "compact", "fine_tune")
+KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "describe", "compact", "fine_tune")
 SNAPSHOT_EVERY = 6
 PACE = 0.1  # seconds, at most, between two operations of the writer
 HELD = re.compile(r"by process (\d+) on (\S+) since (\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\S*)")

@@ -1,0 +1,114 @@
+"""`scroll-tactile fabric letters` and `scroll-tactile fabric slide`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from scroll_tactile.cli.results import origin, parse_folds, require_folders
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.datasets import fabric_slide, letter_spike
+from scroll_tactile.datasets.letter_spike import DOTS
+from scroll_tactile.pipelines.fabric import FIGURES, Letters, SlideTransfer, summary
+
+__all__ = ["fabric"]
+
+fabric = typer.Typer(
+    cls=Commands, no_args_is_help=True, help="What a touch is made of, on real data: letters of dots, slid fabrics."
+)
+
+RunFolder = Annotated[
+    Path | None, typer.Option(help="Note finished parts in this folder; an interrupted run goes on from it.")
+]
+JsonFile = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
+
+_LABELS = {
+    "score": "mean score per dot",
+    "exact": "all six dots right",
+    "accuracy": "letter right",
+    "untold": "… not told whether letters are new",
+    "always": "score of always saying what is more common",
+    "calibration_error": "expected calibration error of the dots",
+}
+
+
+@fabric.command()
+def letters(
+    data: Annotated[Path, typer.Option(help="Folder of letter-spike, or the one it lies in.")],
+    folds: Annotated[str, typer.Option(help='Which folds of known letters: "all", or numbers such as 0,1.')] = "all",
+    groups: Annotated[int, typer.Option(min=2, max=27, help="The letters are left out in so many groups.")] = 9,
+    seed: Annotated[int, typer.Option(min=0, help="Deals presses into folds and letters into groups.")] = 0,
+    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 2000,
+    json: JsonFile = None,
+    run: RunFolder = None,
+) -> None:
+    """Tell Braille letters by their dots: letters that were touched, and letters never touched before."""
+    require_folders(json)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        recordings = letter_spike.load(data, seed)
+        task = Letters(recordings, groups, seed, cosines, run)
+        results = list(task.run(parse_folds(folds, recordings), progress))
+    _show_letters(results)
+    if json is not None:
+        words = ["fabric", "letters", "--data", data, "--folds", folds, "--groups", groups, "--seed", seed]
+        command = shlex.join(["scroll-tactile", *map(str, words), "--cosines", str(cosines)])
+        write_json(json, origin(command, recordings) | task.plan | {"means": summary(results), "parts": results})
+        say(f"figures: {json}")
+
+
+@fabric.command()
+def slide(
+    data: Annotated[Path, typer.Option(help="Folder of FabricSlide, or the one it lies in.")],
+    parts: Annotated[int, typer.Option(min=1, help="Of a slide, whose mean ratios are the features.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Deals slides into folds.")] = 0,
+    json: JsonFile = None,
+    run: RunFolder = None,
+) -> None:
+    """Learn four fabrics at one speed or force, and be asked about them at another."""
+    require_folders(json)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        slides = fabric_slide.load(data, seed=seed)
+        task = SlideTransfer(slides, parts, run)
+        results = list(task.run(progress))
+    table = Table("part", "learned", "tested", "right", "called unknown", title="FabricSlide, four balanced fabrics")
+    for one in results:
+        shown = (percent(one["accuracy"]), percent(one["unknown"]))
+        table.add_row(one["part"], str(one["learned"]), str(one["tested"]), *shown)
+    console().print(table)
+    if json is not None:
+        words = ["scroll-tactile", "fabric", "slide", "--data", str(data), "--parts", str(parts), "--seed", str(seed)]
+        write_json(json, origin(shlex.join(words), slides.recordings) | task.plan | {"parts": results})
+        say(f"figures: {json}")
+
+
+def _show_letters(results: Sequence[Mapping[str, Any]]) -> None:
+    means = summary(results)
+    table = Table("figure", *means, title="letter-spike, mean over touches (sd over folds or groups of letters)")
+    for name in FIGURES:
+        cells = [means[kind].get(name) for kind in means]
+        told = [percent(cell["mean"]) + f" ({percent(cell['sd'])})" if cell else "" for cell in cells]
+        table.add_row(_LABELS[name], *told)
+    console().print(table)
+    dots = Table("dot", "there", *(f"{kind}: {what}" for kind in means for what in ("correct", "precision", "recall")))
+    for dot in DOTS:
+        row = [dot, percent(_mean(results, dot, "there"))]
+        for kind in means:
+            those = [one for one in results if one["part"] == kind]
+            row += [percent(_mean(those, dot, what)) for what in ("correct", "precision", "recall")]
+        dots.add_row(*row)
+    console().print(dots)
+
+
+def _mean(results: Sequence[Mapping[str, Any]], dot: str, what: str) -> float:
+    """Over touches; parts where a precision or a recall has no meaning are left out."""
+    told = [(one["constituents"][dot][what], one["tested"]) for one in results]
+    told = [one for one in told if one[0] is not None]
+    total = sum(tested for _, tested in told)
+    return sum(value * tested for value, tested in told) / total if total else 0.0

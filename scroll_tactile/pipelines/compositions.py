@@ -1,0 +1,101 @@
+"""How well compositions are told: the paper's score, and what is behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.metrics import calibration_error
+from scroll_tactile.prediction import Composition
+
+__all__ = ["score", "score_compositions"]
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def score(
+    names: Sequence[str],
+    truth: npt.ArrayLike,
+    presence: npt.ArrayLike,
+    shares: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+) -> dict[str, Any]:
+    """Figures of N compositions of K constituents.
+
+    names: K. truth: whether each is there, shape (N, K). presence: the probability that was said, shape (N, K); said
+    to be there is what has more than a half, and NaN, said of a constituent without a head, counts as "not there".
+    shares: true and said ones, each of shape (N, K), NaN where there is none.
+
+    "score": the paper's, the mean over the constituents of correct presence (of six, each false positive or negative
+    costs a sixth). "exact": the share of compositions without any. "always": the score of saying of each constituent
+    always what is true more often. "calibration_error": expected, of all presences said, 15 bins. "share_error": mean
+    absolute. "constituents": of each, how often it is there, correct, precision and recall (None without any said, or
+    any there), and how often nothing was said.
+
+    Raises InputError where the shapes differ, or there are none.
+    """
+    there, chances = np.asarray(truth, dtype=bool), np.asarray(presence, dtype=np.float64)
+    if there.shape != chances.shape or there.ndim != 2 or there.shape[1] != len(names) or not there.size:
+        raise InputError(
+            f"expected truth and presence of shape (N, {len(names)}), N ≥ 1; came {there.shape} and {chances.shape}"
+        )
+    said = chances > 0.5  # False for NaN
+    right, told = said == there, np.isfinite(chances)
+    often = there.mean(axis=0)
+    figures: dict[str, Any] = {
+        "tested": len(there),
+        "score": float(right.mean()),
+        "exact": float(right.all(axis=1).mean()),
+        "always": float(np.maximum(often, 1 - often).mean()),
+        "calibration_error": None,
+        "share_error": None,
+        "constituents": {
+            name: _of_one(there[:, at], said[:, at]) | {"unsaid": int((~told[:, at]).sum())}
+            for at, name in enumerate(names)
+        },
+    }
+    if told.any():
+        sure = np.maximum(chances[told], 1 - chances[told])
+        figures["calibration_error"] = calibration_error(sure, right[told])
+    if shares is not None:
+        gaps = np.abs(np.asarray(shares[0], dtype=np.float64) - np.asarray(shares[1], dtype=np.float64))
+        if np.isfinite(gaps).any():
+            figures["share_error"] = float(np.nanmean(gaps))
+    return figures
+
+
+def _of_one(there: BoolArray, said: BoolArray) -> dict[str, float | None]:
+    hits = int((there & said).sum())
+    return {
+        "there": float(there.mean()),
+        "correct": float((there == said).mean()),
+        "precision": hits / int(said.sum()) if said.any() else None,
+        "recall": hits / int(there.sum()) if there.any() else None,
+    }
+
+
+def score_compositions(
+    names: Sequence[str], truth: Sequence[Mapping[str, float | bool]], said: Sequence[Composition]
+) -> dict[str, Any]:
+    """Figures, as `score` gives them, of what a learner said; truth: presence or share of each constituent, N times.
+
+    A constituent that the truth does not name is not there. Raises InputError where the lengths differ.
+    """
+    if len(truth) != len(said):
+        raise InputError(f"expected as many truths as compositions; came {len(truth)} and {len(said)}")
+
+    def told(composition: Composition, name: str, what: str) -> float:
+        value = getattr(composition[name], what)
+        return float("nan") if value is None else float(value)
+
+    presence = [[told(one, name, "presence") for name in names] for one in said]
+    guessed = [[told(one, name, "share") for name in names] for one in said]
+    masses = [any(isinstance(value, float) for value in one.values()) for one in truth]
+    shares = [
+        [float(one.get(name, 0.0)) if mass else float("nan") for name in names]
+        for one, mass in zip(truth, masses, strict=True)
+    ]
+    return score(names, [[bool(one.get(name, 0)) for name in names] for one in truth], presence, (shares, guessed))

@@ -316,6 +316,21 @@ class TestNetworks:
         gradient = next(net.parameters()).grad
         assert gradient is not None and gradient.abs().sum() > 0
 
+    def test_a_trained_network_starts_training_as_what_it_was(self):
+        net = ResNetClassifier(ResNet.random(0), 4, trained=True).eval()
+        with torch.no_grad():  # statistics folded away, as in some files
+            for norm in net.net.modules():
+                if isinstance(norm, nn.BatchNorm2d):
+                    norm.weight.fill_(3.0)
+                    norm.bias.fill_(0.1)
+        images = torch.rand(16, 12, 40, generator=torch.Generator().manual_seed(0)) * 2 - 1
+        with torch.no_grad():
+            before = net(images)
+            net.prepare([images[:10], images[10:]])
+            assert torch.allclose(net(images), before, rtol=1e-3, atol=1e-3 * float(before.abs().max()))
+            trained = net.train()(images)  # the batch has the statistics that the network now has
+        assert torch.allclose(trained, before, rtol=1e-2, atol=1e-2 * float(before.abs().max()))
+
     def test_a_colour_frame_is_read(self):
         net = ResNetClassifier(ResNet.random(0), 4).eval()
         assert net(torch.rand(2, 3, 24, 32)).shape == (2, 4)

@@ -107,7 +107,7 @@ class Catalogue:
 
     def _pretrained(self, shape: tuple[int, ...], count: int, seed: int) -> nn.Module:
         assert self.weights is not None
-        return ResNetClassifier(load_network(self.weights), count)
+        return ResNetClassifier(load_network(self.weights), count, trained=True)
 
     @cached_property
     def _pretrained_squares(self) -> LeastSquares:

@@ -17,7 +17,7 @@ from scroll_tactile.embeddings.runtimes import full_float32
 from scroll_tactile.errors import InputError, TrainingError
 from scroll_tactile.training import Progress
 
-__all__ = ["Batches", "Course", "Epoch", "descend", "logits_of", "seeded"]
+__all__ = ["AT_ONCE", "Batches", "Course", "Epoch", "descend", "logits_of", "seeded"]
 
 Fetch = Callable[[npt.NDArray[np.intp]], torch.Tensor]
 AT_ONCE = 64  # images in a batch that nothing is learned from

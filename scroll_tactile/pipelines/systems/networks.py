@@ -5,6 +5,7 @@ Each reads a batch of images of one size and gives logits (B, C) of C materials.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -104,16 +105,68 @@ def _leaky() -> Any:
 class ResNetClassifier(nn.Module):
     """A residual network, all of it to be trained, the average of its last maps, and a linear layer.
 
-    net: taken over. Images of any size, (B, C, T) or colour (B, 3, H, W), in [-1, 1].
+    net: taken over. Images of any size, (B, C, T) or colour (B, 3, H, W), in [-1, 1]. trained: whether its weights are
+    worth keeping; see `prepare`.
     """
 
-    def __init__(self, net: ResNet, materials: int) -> None:
+    def __init__(self, net: ResNet, materials: int, *, trained: bool = False) -> None:
         super().__init__()
         self.net = net
+        self.trained = trained
         self.head = nn.Linear(net.widths[-1], materials)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Logits (B, materials)."""
-        last = self.net(to_planes(images))[-1]
+        last: torch.Tensor = self.net(to_planes(images))[-1]
         logits: torch.Tensor = self.head(functional.adaptive_avg_pool2d(last, 1).flatten(1))
         return logits
+
+    def prepare(self, batches: Iterable[torch.Tensor]) -> None:
+        """Be told of all images that will be learned from; of a trained network the statistics become theirs.
+
+        Batch normalisation trains with the batch's mean μ and deviation σ, and the published ones, μ₀ and σ₀, are of
+        photographs, or of nothing where the file has them folded into the slopes: training would begin with another
+        network, with maps up to thirty times as large. So slopes and offsets are changed with them,
+
+            γ' = γ σ / σ₀,   β' = β + γ (μ − μ₀) / σ₀,
+
+        and the network gives what it gave before.
+        """
+        if not self.trained:
+            return
+        norms = [module for module in self.net.modules() if isinstance(module, nn.BatchNorm2d)]
+        sums = {norm: torch.zeros(2, norm.num_features, dtype=torch.float64) for norm in norms}
+        counts = dict.fromkeys(norms, 0)
+
+        def add(norm: nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
+            assert isinstance(norm, nn.BatchNorm2d)
+            values = inputs[0].double()
+            both = torch.stack([values.sum(dim=(0, 2, 3)), values.square().sum(dim=(0, 2, 3))])
+            sums[norm] += both.cpu()
+            counts[norm] += values.numel() // values.shape[1]
+
+        hooks = [norm.register_forward_pre_hook(add) for norm in norms]
+        try:
+            self.net.eval()
+            with torch.no_grad():
+                for images in batches:
+                    self.net(to_planes(images))
+        finally:
+            for hook in hooks:
+                hook.remove()
+        for norm in norms:
+            mean, square = sums[norm] / counts[norm]
+            _adopt(norm, mean, (square - mean.square()).clamp(min=0))
+
+
+def _adopt(norm: nn.BatchNorm2d, mean: torch.Tensor, variance: torch.Tensor) -> None:
+    """Give a layer other statistics, and slopes and offsets with which it does the same."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    with torch.no_grad():
+        slope = norm.weight.double().cpu() / torch.sqrt(norm.running_var.double().cpu() + norm.eps)
+        offset = norm.bias.double().cpu() + slope * (mean - norm.running_mean.double().cpu())
+        norm.weight.copy_(slope * torch.sqrt(variance + norm.eps))
+        norm.bias.copy_(offset)
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)

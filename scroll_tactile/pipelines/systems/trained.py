@@ -12,8 +12,9 @@ from torch import nn
 from scroll_tactile.augment import Augmentation
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.passes import Labelled
-from scroll_tactile.pipelines.systems.descent import Batches, Course, Epoch, descend, logits_of, seeded
+from scroll_tactile.pipelines.systems.descent import AT_ONCE, Batches, Course, Epoch, descend, logits_of, seeded
 from scroll_tactile.pipelines.systems.inputs import Image, one_width, picture, usual_columns
+from scroll_tactile.pipelines.systems.networks import ResNetClassifier
 from scroll_tactile.pipelines.systems.protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile.streams import Stream
 from scroll_tactile.training import Progress
@@ -77,6 +78,9 @@ class Trained:
         with seeded(seed, self._device):
             shape = self._read(one_width(images[0], columns)).shape
             self._net = self._make(shape, len(self._names), seed).to(self._device)
+            if isinstance(self._net, ResNetClassifier):
+                places = np.array_split(np.arange(len(images)), -(-len(images) // AT_ONCE))
+                self._net.prepare(taught.fetch(some) for some in places)
             self.epochs = descend(self._net, taught, held, self.course, random, progress, watch)
 
     @property

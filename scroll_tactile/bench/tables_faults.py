@@ -43,7 +43,7 @@ def faults(read: Callable[[str], Result]) -> str:
         ),
         (
             "a full disk, a disk that can only be read, one that fails in the middle",
-            f"{_thousands(sum(read('faults-disk')['operations'].values()))} calls",
+            f"{_thousands(read('faults-disk')['operations'])} operations",
             _failures(read("faults-disk")),
             "typed errors; it goes on when there is room",
         ),

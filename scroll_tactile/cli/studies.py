@@ -49,7 +49,7 @@ SETS: dict[str, Callable[[Path, int], Recordings]] = {
     "gelsight": physiclear.load,
 }
 QUICK_SETS = ("biotac-20", "roboskin-20")
-QUICK_EPOCHS = 8
+QUICK_EPOCHS = 6
 
 Data = Annotated[Path, typer.Option(help="Folder with biotac_slide_20_50/ in it, and physiclear/ for gelsight.")]
 Weights = Annotated[
@@ -63,7 +63,7 @@ Epochs = Annotated[int | None, typer.Option(min=1, help="Of the networks' traini
 Where = Annotated[Device, typer.Option(help="Where networks are trained.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of all that is drawn.")]
 Quick = Annotated[
-    bool, typer.Option("--quick", help="One fold, every second touch, small images, 8 epochs: minutes, for a look.")
+    bool, typer.Option("--quick", help="One fold, every second touch, small images, 6 epochs: minutes, for a look.")
 ]
 Run = Annotated[
     Path | None,

@@ -218,6 +218,20 @@ def _vision(read: Read) -> str:
     return _table([*head, "error of features", "RoboSkin, fold 0"], rows)
 
 
+def _tableone(read: Read) -> str:
+    rows = []
+    for row in read("table1")["rows"]:
+        cells = []
+        for name in ("BioTac-20", "BioTac-20 blocked", "RoboSkin-20"):
+            one = row["sets"][name]
+            paper = "" if one["paper"] is None else f"{100 * one['paper']:.1f}"
+            here = f"{100 * one['mean']:.1f} ± {100 * one['sd']:.1f}"
+            cells += [here] if "blocked" in name else [paper, here]
+        rows.append([row["system"], *cells])
+    head = ["percent", "BioTac-20, paper", "here", "here, blocked folds", "RoboSkin-20, paper", "here"]
+    return _table(head, rows)
+
+
 SECTIONS: dict[str, Callable[[Read], str]] = {
     "results": _results,
     "speed": _speed,
@@ -227,6 +241,7 @@ SECTIONS: dict[str, Callable[[Read], str]] = {
     "continual": _continual,
     "buffers": _buffers,
     "vision": _vision,
+    "tableone": _tableone,
     "faults": faults,
 }
 """Name → what makes the section from the results that it reads by name."""

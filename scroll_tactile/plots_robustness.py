@@ -70,6 +70,9 @@ def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
         panel.set(xlabel=LABELS[study], ylabel="accuracy, %", ylim=(0, 102))
         if study in LOGARITHMIC:
             panel.set_xscale("log")
+            ticks = sorted({strength for points in lines.values() for strength, _, _ in points})
+            panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            panel.minorticks_off()
         if study == "sitting":
             panel.set_xticks([])
         panel.grid(alpha=0.3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 __all__ = ["Compacted", "Composition", "Constituent", "Merged", "Prediction", "Receipt"]
 
@@ -35,7 +35,7 @@ class Merged:
 
     observations: int
     shared: int
-    described: int = 0
+    described: int = field(default=0, repr=False)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ _LABELS = {
     "score": "mean score per dot",
     "exact": "all six dots right",
     "accuracy": "letter right",
+    "likeliest": "… of the likeliest letter's dots",
     "untold": "… not told whether letters are new",
     "always": "score of always saying what is more common",
     "calibration_error": "expected calibration error of the dots",

@@ -23,16 +23,17 @@ from scroll_tactile.embeddings import Embedding, Maps
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.cached import Cached
-from scroll_tactile.pipelines.compositions import score_compositions
+from scroll_tactile.pipelines.compositions import score, score_compositions
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.replay import Progress
 from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["FIGURES", "Letters", "SlideTransfer", "directions", "summary"]
 
-FIGURES = ("score", "exact", "accuracy", "untold", "always", "calibration_error")
-"""Of each fold: mean score per constituent, exact matches, materials told, the score where it is not said beforehand
-whether the touches are of letters never touched, that of always saying what is more common, and expected calibration
+FIGURES = ("score", "exact", "accuracy", "likeliest", "untold", "always", "calibration_error")
+"""Of each fold: mean score per constituent, exact matches, materials told; the score of saying the dots of the
+likeliest letter (all right wherever the letter is), that where it is not said beforehand whether the touches are of
+letters never touched, and that of always saying what is more common among the letters learned; and expected calibration
 error of the presences."""
 
 Mask = npt.NDArray[np.bool_]
@@ -110,11 +111,16 @@ class Letters:
         truth = [recordings.materials[at] for at in exam]
         dots = [dots_of(letter) for letter in truth]
         figures = score_compositions(DOTS, dots, said)
+        there = [[one[dot] for dot in DOTS] for one in dots]
+        likeliest = [dots_of(one.prediction.material or "space") for one in said]
+        often = np.mean([list(dots_of(recordings.materials[at]).values()) for at in np.flatnonzero(~tested)], axis=0)
         return {
             "learned": int((~tested).sum()),
             "accuracy": accuracy(truth, [one.prediction.material for one in said]),
             "unfamiliar": float(np.mean([one.unfamiliar for one in untold])),
             **figures,
+            "likeliest": score(DOTS, there, [[one[dot] for dot in DOTS] for one in likeliest])["score"],
+            "always": score(DOTS, there, np.tile(often, (len(exam), 1)))["score"],
             "untold": score_compositions(DOTS, dots, untold)["score"],
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,

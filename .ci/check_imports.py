@@ -20,7 +20,7 @@ LAYERS = [
     {"copies"},
     {"embeddings", "ridge", "requests"},
     {"exemplars", "tuned", "packing", "descriptions", "filling"},
-    {"memory", "tuning"},
+    {"memory", "tuning", "perception"},
     {"model", "identity", "history"},
     {"training", "following", "composing"},
     {"finetune", "ledger"},

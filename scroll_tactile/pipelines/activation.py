@@ -155,7 +155,7 @@ def _cosines(one: FloatArray, two: FloatArray) -> FloatArray:
     sizes = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
     with np.errstate(invalid="ignore"):
         cosines: FloatArray = (one * two).sum(axis=1) / sizes
-    return cosines
+    return np.clip(cosines, -1.0, 1.0)  # rounding may pass 1 by a unit in the last place
 
 
 def _maps(net: ResNet, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:

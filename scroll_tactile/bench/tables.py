@@ -232,6 +232,38 @@ def _tableone(read: Read) -> str:
     return _table(head, rows)
 
 
+def _robustness(read: Read) -> str:
+    results = [read(f"robustness-{name}") for name in SETS]
+    rows = []
+    for words, study, strength in (
+        ("clean", "speed", 1.0),
+        ("the first 0.3 s", "length", 0.3),
+        ("half the speed", "speed", 0.5),
+        ("twice the speed", "speed", 2.0),
+        ("a fifth of the channels dead", "dead", 0.2),
+        ("uniform noise of ± half the range", "noise", 0.5),
+        ("zero and gain drifting by 5 %", "drift", 0.05),
+    ):
+        cells = []
+        for result in results:
+            mine = {
+                one["augmented"]: one for one in result["means"] if (one["study"], one["strength"]) == (study, strength)
+            }
+            cells += [f"{100 * mine[augmented]['mean']:.1f}" for augmented in (False, True)]
+        rows.append([words, *cells])
+    head = [f"{name}, {words}" for name in BOTH[1:] for words in ("default", "`Robust`")]
+    return _table(["percent", *head], rows)
+
+
+def _slide(read: Read) -> str:
+    rows = [
+        [one["part"], str(one["learned"]), str(one["tested"]), f"{100 * one['accuracy']:.1f}"]
+        for one in read("fabric-slide")["parts"]
+        if "→" in one["part"]
+    ]
+    return _table(["four fabrics, learned → asked", "touches learned", "asked", "right, %"], rows)
+
+
 SECTIONS: dict[str, Callable[[Read], str]] = {
     "results": _results,
     "speed": _speed,
@@ -242,6 +274,8 @@ SECTIONS: dict[str, Callable[[Read], str]] = {
     "buffers": _buffers,
     "vision": _vision,
     "tableone": _tableone,
+    "robustness": _robustness,
+    "slide": _slide,
     "faults": faults,
 }
 """Name → what makes the section from the results that it reads by name."""

@@ -85,7 +85,7 @@ def slide(
     console().print(table)
     if json is not None:
         words = ["scroll-tactile", "fabric", "slide", "--data", str(data), "--parts", str(parts), "--seed", str(seed)]
-        write_json(json, origin(shlex.join(words), slides.recordings) | task.plan | {"parts": results})
+        write_json(json, origin(shlex.join(words), slides.recordings) | task.plan | {"seed": seed, "parts": results})
         say(f"figures: {json}")
 
 

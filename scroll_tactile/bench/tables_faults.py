@@ -86,7 +86,7 @@ def _space(record: Result) -> str:
     count, opened = _thousands(large["observations"]), large["seconds to open"]
     kilobytes = {name: size / 1e3 for name, size in kept.items()}
     return (
-        f"{count} observations, compacted, open in {min(opened):.1f} to {max(opened):.1f} s. On disk a touch of BioTac "
+        f"{count} observations, compacted, open in {max(opened):.1f} s at most. On disk a touch of BioTac "
         f"is {kilobytes['an observation, with readings']:.0f} KB with its readings,\n"
         f"{kilobytes['an observation, without readings']:.0f} without (`exemplars=0`), "
         f"{kilobytes['an observation, compacted (what is known of it)']:.1f} compacted; a material "

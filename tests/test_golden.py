@@ -42,6 +42,7 @@ def content(learner):
         "digest": learner.digest(),
         "exemplars": {name: [key.hex() for key in keys] for name, keys in learner.exemplars.items()},
         "tuned": learner.tuned_digest(),
+        "descriptions": learner.descriptions,
         "answers": [[answer.material, round(answer.probability, 6)] for answer in answers],
     }
 
@@ -68,12 +69,15 @@ def write(folder):
     with learner.batch():
         receipts = [learner.observe(names[seed % 3], stream(seed, 60)) for seed in range(6, 18)]
     learner.retract(receipts[4])
+    learner.describe("felt", {"wool": 0.75, "viscose": 0.25})
+    learner.describe("cork", {"soft": False, "natural": True})
     learner.observe("short", stream(1, 8))
     learner.forget("short")
     learner.compact(keep=6)
     learner.merge(folder / "other", shared="once")
     learner.fine_tune(epochs=1)
     learner.observe("cork", stream(20, 40))
+    learner.describe("cork", {"soft": False, "natural": None})
     learner.retract(learner.observe("felt", stream(21, 60)))
     shutil.rmtree(folder / "other")
     shutil.copytree(folder / "memory", folder / "store", ignore=shutil.ignore_patterns("*-shm", "lock", "holder.json"))
@@ -111,7 +115,7 @@ def test_every_kind_of_row_and_generation_is_in_it(golden):
     path, _ = golden
     assert (path / "journal.sqlite-wal").stat().st_size > 0
     with Store.open(path, mode="read") as store:
-        assert {head.kind for head in store.heads()} == {"observe", "retract", "merge", "felt"}
+        assert {head.kind for head in store.heads()} == {"observe", "retract", "merge", "felt", "describe"}
         assert 0 < store.compacted < store.last
         assert store.latest().upto < store.last
         assert "tuned" in store.latest().attributes
@@ -122,7 +126,7 @@ def test_it_is_what_this_release_writes(tmp_path):
     current = DATA / version("scroll-tactile")
     write(tmp_path / "again")
     again, expected = (json.loads((one / "expected.json").read_text()) for one in (tmp_path / "again", current))
-    for exact in ("digest", "materials", "exemplars"):  # an f* is not the same on every machine
+    for exact in ("digest", "materials", "exemplars", "descriptions"):  # an f* is not the same on every machine
         assert again[exact] == expected[exact]
     shutil.copytree(current / "store", tmp_path / "golden")  # a look with SQLite empties its log
     shapes = []

@@ -67,6 +67,25 @@ class TestMemory:
         assert digest_of(text) == found["digest"]
         assert "4 of 2 materials" in text
 
+    def test_what_it_is_made_of_is_told_and_asked(self, memory: Path, files: Path) -> None:
+        assert "nothing was described yet" in run("compose", memory, files / "silk.csv").output
+        told = run("describe", memory, "silk", "silk=1.0")
+        assert told.exit_code == 0, told.output
+        assert "silk: made of silk; felt 2 times" in told.stdout
+        run("describe", memory, "wool", "wool=0.75", "dye=0.25")
+        run("describe", memory, "tweed", "wool=1", "soft=unknown")
+        answer = json.loads(run("compose", memory, files / "silk.csv", "--json").stdout)
+        found = {one["constituent"]: one for one in answer["constituents"]}
+        assert answer["material"] == "silk" and list(found) == ["dye", "silk", "soft", "wool"]
+        assert found["silk"]["presence"] > 0.5 > found["wool"]["presence"]
+        assert found["soft"]["presence"] is None and found["soft"]["unlearned"]
+        text = run("compose", memory, files / "silk.csv").stdout
+        assert "constituent" in text and "a material never felt" in text
+        for wrong, said in (("wool", "came 'wool'"), ("wool=much", "NAME=SHARE"), ("wool=0.7", "sum to one")):
+            refused = run("describe", memory, "silk", wrong)
+            assert refused.exit_code != 0 and said in refused.output
+        assert "taken back; felt 2 times" in run("describe", memory, "silk").stdout
+
     def test_an_empty_memory_answers_unknown(self, tmp_path: Path, files: Path) -> None:
         from scroll_tactile import TactileLearner
 

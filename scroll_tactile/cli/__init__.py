@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from scroll_tactile.cli.bench import bench
+from scroll_tactile.cli.composition import compose, describe
 from scroll_tactile.cli.continual import continual
 from scroll_tactile.cli.demo import demo
 from scroll_tactile.cli.fabric import fabric
@@ -26,7 +27,7 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, predict, inspect, replay, continual, robustness, schedules):
+for command in (demo, observe, predict, inspect, describe, compose, replay, continual, robustness, schedules):
     app.command()(command)
 app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")

@@ -105,7 +105,7 @@ def cka(one: FloatArray, two: FloatArray) -> float:
 class Similarity:
     """Of two networks: how alike their filters and their first blocks are.
 
-    filters: mean over the stem's filters of the cosine between the two networks' own.
+    filters: mean over the stem's filters of the cosine between the two networks' own, but for filters of zeros.
     moved: cosine between the two ways in which the stem's filters moved from a common start; NaN without one, or where
     one of the two is the start.
     blocks: `cka` of the first blocks' maps of some images, position by position.
@@ -140,7 +140,9 @@ def compare(
         if start is not None and start not in (one, two):
             ways = [(filters[name] - filters[start]).reshape(1, -1) for name in (one, two)]
             moved = float(_cosines(*ways)[0])
-        alike = float(_cosines(filters[one], filters[two]).mean())
+        cosines = _cosines(filters[one], filters[two])
+        pointing = cosines[np.isfinite(cosines)]
+        alike = float(pointing.mean()) if len(pointing) else float("nan")
         found.append(Similarity(one, two, alike, moved, cka(maps[one], maps[two])))
     return found
 

@@ -92,7 +92,7 @@ class Store:
                 self._lock = lock_to_write(folder, identity)
                 undo.callback(self._lock.release)
             require_whole_log(folder)
-            self._journal = Journal(folder / JOURNAL_FILE, write=mode == "write")
+            self._journal = self._opened(folder / JOURNAL_FILE)
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
             self._snapshots = Snapshots(folder / GENERATIONS, self._journal)
@@ -100,6 +100,15 @@ class Store:
                 self._snapshots.remove_unfinished()
             self._warn_of_damaged_generations()
             undo.pop_all()
+
+    def _opened(self, journal: Path) -> Journal:
+        try:
+            return Journal(journal, write=self.mode == "write")
+        except StoreError:
+            # A repair may just be putting another journal in the place of the one that was there a moment ago.
+            if self.mode == "write" or not holds_store(journal.parent):
+                raise
+            return Journal(journal, write=False)
 
     def _warn_of_damaged_generations(self) -> None:
         # It may be the base's: nothing else would tell of that until a generation behind it is damaged, too.

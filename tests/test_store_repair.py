@@ -15,6 +15,7 @@ import store.files
 import store.rebuild
 import store.repair
 import store.schema
+import store.store
 from store import (
     CompactedError,
     DamageError,
@@ -27,6 +28,7 @@ from store import (
     check_store,
     repair_store,
 )
+from store.journal import Journal
 
 LAST = 20
 IDENTITY = {"for": ["repairs", 1]}
@@ -636,6 +638,30 @@ def test_a_disk_that_does_not_keep_what_is_written_is_told_of(path, monkeypatch)
         repair_store(path)
     assert not (path / "journal.sqlite.repaired").exists()
     assert repair_store(path).kept == 17
+
+
+@pytest.mark.parametrize("there_again", [True, False])
+def test_a_reader_that_comes_while_the_journal_is_replaced_reads_or_is_told(path, monkeypatch, there_again):
+    journal, opening = path / "journal.sqlite", []
+
+    def replaced(*arguments, **options):
+        opening.append(1)
+        if len(opening) == 1:
+            aside = journal.rename(path / "journal.sqlite.damaged")
+            try:
+                Journal(*arguments, **options)
+            finally:
+                if there_again:
+                    aside.rename(journal)
+        return Journal(*arguments, **options)
+
+    monkeypatch.setattr(store.store, "Journal", replaced)
+    if there_again:
+        with Store.open(path, mode="read") as reader:
+            assert reader.last > 0
+    else:
+        with pytest.raises(DamageError, match=r"has journal\.sqlite\.damaged .*but no journal\.sqlite"):
+            Store.open(path, mode="read")
 
 
 def test_readers_meanwhile_get_right_answers_or_are_told(path):

@@ -140,7 +140,7 @@ class TestExport:
         with np.load(out / "statistics.npz") as arrays:
             assert arrays["materials"].tolist() == ["a", "b/ü", "c"]
             for scale in whole._memory.statistics.scales:
-                rows = [whole._features(whole_image(touch))[scale] for _, touch in left]
+                rows = [whole._perception.features(whole_image(touch))[scale] for _, touch in left]
                 codes = np.concatenate([np.rint(np.asarray(one, float) * 2**20) for one in rows]).astype(np.int64)
                 assert np.array_equal(arrays[f"second-{scale}"], codes.T @ codes)
                 assert np.array_equal(arrays[f"sums-{scale}"].sum(axis=0), codes.sum(axis=0))

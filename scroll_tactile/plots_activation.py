@@ -37,7 +37,7 @@ def draw_activation(path: Path, images: Mapping[str, npt.NDArray[np.floating]]) 
         panel.set_title(name)
         panel.set_axis_off()
     try:
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=72)
     except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
         raise InputError(f"the plot cannot be written to {path}: {error}") from error
 

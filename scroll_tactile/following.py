@@ -19,13 +19,13 @@ from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.recursive import Recursive
 from scroll_tactile.ridge.selection import Selection
 from scroll_tactile.ridge.statistics import Statistics
-from scroll_tactile.ridge.tracking import Tracked
+from scroll_tactile.ridge.tracking import Follower, Tracked
 from scroll_tactile.windows import CHANNELS
 
 __all__ = ["Added", "Following", "SolverName"]
 
 SolverName = Literal["exact", "recursive"]
-FOLLOWERS: dict[SolverName, type[Tracked | Recursive]] = {"exact": Tracked, "recursive": Recursive}
+FOLLOWERS: dict[SolverName, type[Follower]] = {"exact": Tracked, "recursive": Recursive}
 
 Added = tuple[str, dict[int, npt.NDArray[np.int32]]]
 """A material, and the codes of a touch of it by scale."""
@@ -43,7 +43,7 @@ class Following:
         self._follower = FOLLOWERS[solver]
         self._felt = sum(memory.statistics.materials.values())
         self._most = (1 + refit) * self._felt
-        self._tracked: dict[int, Tracked | Recursive] = {}
+        self._tracked: dict[int, Follower] = {}
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in the touches that were added since; False where the model has to be fitted again.

@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 
 from scroll_tactile.descriptions import Description
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory
+from scroll_tactile.memory import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory, hear
 from scroll_tactile.packing import unspanned
 from scroll_tactile.prediction import Receipt
 from store import Head, Record, Store
@@ -164,10 +164,7 @@ def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) ->
     base = theirs.base()
     said = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
     for head in theirs.heads(0 if base is None else base.upto):
-        if head.kind == DESCRIBE and head.attributes["constituents"] is not None:
-            said[head.label] = cast(Description, dict(cast(dict[str, Any], head.attributes["constituents"])))
-        elif head.kind in (DESCRIBE, RETRACT):
-            said.pop(head.label, None)
+        hear(said, head)
     new = {name: one for name, one in sorted(said.items()) if repr(memory.descriptions.get(name)) != repr(one)}
     differing = [name for name in new if name in memory.descriptions]
     if differing and choice == "same":

@@ -32,6 +32,7 @@ __all__ = [
     "Capacity",
     "Memory",
     "give_back_scratch",
+    "hear",
 ]
 
 logger = logging.getLogger(__name__)
@@ -116,13 +117,11 @@ class Memory:
         After the last row `refill` has to be called. Raises MismatchError for a row of a kind that this version
         does not know.
         """
+        hear(self.descriptions, record)
         if record.kind == OBSERVE:
             codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
             self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
-        elif record.kind == DESCRIBE:
-            self.describe(record.label, record.attributes["constituents"])
         elif record.kind == RETRACT:
-            self.descriptions.pop(record.label, None)  # of a material forgotten; single observations are of no label
             for sequence in unspanned(record.attributes["sequences"]):
                 if sequence > self.base:
                     self.withdraw(store.record(sequence))
@@ -136,7 +135,7 @@ class Memory:
                     )
         elif record.kind == MERGE:
             self._join(record.arrays, cast(dict[str, Any], record.attributes))
-        elif record.kind != FELT:
+        elif record.kind not in (FELT, DESCRIBE):
             raise MismatchError(
                 f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
                 f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
@@ -145,10 +144,7 @@ class Memory:
 
     def describe(self, material: str, constituents: Any) -> None:
         """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
-        if constituents is None:
-            self.descriptions.pop(material, None)
-        else:
-            self.descriptions[material] = dict(constituents)
+        _say(self.descriptions, material, constituents)
 
     def withdraw(self, record: Record) -> None:
         """Take an observation out of the sums; `refill` then mends the pools."""
@@ -328,7 +324,7 @@ class Memory:
             if record.sequence > upto:
                 break
             if record.kind == RETRACT:
-                memory.descriptions.pop(record.label, None)
+                hear(memory.descriptions, record)
             elif record.sequence not in self.withdrawn:
                 memory.replay(record, store)
         memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
@@ -346,6 +342,19 @@ class Memory:
         self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
         if "tuned" in attributes:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+
+
+def hear(descriptions: dict[str, Description], row: Head | Record) -> None:
+    """Take in what a journal row says that materials are made of; one that is forgotten takes its description along."""
+    if row.kind in (DESCRIBE, RETRACT):  # of which a retraction has no constituents, and a label where all is forgotten
+        _say(descriptions, row.label, row.attributes.get("constituents"))
+
+
+def _say(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
+    if constituents is None:
+        descriptions.pop(material, None)
+    else:
+        descriptions[material] = dict(constituents)
 
 
 def _columns(record: Record) -> int:

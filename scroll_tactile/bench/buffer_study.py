@@ -19,6 +19,7 @@ from scroll_tactile.exemplars import Exemplar
 from scroll_tactile.finetune import fine_tune
 from scroll_tactile.images import tactile_image
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.passes import hold_out
 from scroll_tactile.tuning import TunedReader
 
 __all__ = ["run_buffers"]
@@ -39,14 +40,11 @@ def run_buffers(
     Returns circumstances and a list of records: capacity, way, gap, ratio to full herding's, overlap of two schedules,
     accuracy of f* by itself and of f, on the first fold.
     """
-    held = (recordings.fold == 0).tolist()
-    touches = list(zip(recordings.materials, recordings.streams, strict=True))
-    exam = [touch for touch, out in zip(touches, held, strict=True) if out]
-    learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=len(touches))
+    lessons, exam = hold_out(recordings, recordings.fold == 0)
+    learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=len(recordings))
     note("learning")
-    for touch, out in zip(touches, held, strict=True):
-        if not out:
-            learner.observe(*touch)
+    for touch in lessons:
+        learner.observe(*touch)
     assert learner._memory.exemplars is not None
     kept = list(learner._memory.exemplars)
     codes, keys = np.stack([one.code for one in kept]), [one.key for one in kept]

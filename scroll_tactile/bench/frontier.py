@@ -32,7 +32,7 @@ from scroll_tactile.bench.peers import (
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.passes import Labelled, hold_out
 from scroll_tactile.pipelines.peers import touch_features
 from scroll_tactile.ridge.readouts import ReadoutName
 
@@ -82,7 +82,7 @@ def run_frontier(
 
 
 def _one_fold(recordings: Recordings, fold: int, width: int) -> list[tuple[tuple[str, str], float, Record]]:
-    learned, asked = _split(recordings, fold)
+    learned, asked = hold_out(recordings, recordings.fold == fold)
     found = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         path, embedding = Path(folder, "memory"), Kernels(dimension=width)
@@ -118,13 +118,6 @@ def _milliseconds(seconds: Sequence[float]) -> float:
     return 1e3 * float(np.median(seconds))
 
 
-def _split(recordings: Recordings, fold: int) -> tuple[list[Labelled], list[Labelled]]:
-    touches = list(zip(recordings.materials, recordings.streams, strict=True))
-    held = recordings.fold == fold
-    learned = [touch for touch, out in zip(touches, held, strict=True) if not out]
-    return learned, [touch for touch, out in zip(touches, held, strict=True) if out]
-
-
 def _timed(call: Callable[[], object]) -> float:
     begun = time.process_time()
     call()
@@ -137,7 +130,7 @@ def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lamb
     In a random order, which gradient steps need. `predict_ms` is of a prediction that follows others, `fresh_ms` of
     one that follows an observation.
     """
-    learned, asked = _split(recordings, fold)
+    learned, asked = hold_out(recordings, recordings.fold == fold)
     embedding = Kernels(dimension=PEERS_WIDTH)
     note(f"{recordings.name}: {PEERS_WIDTH} features of {len(learned) + len(asked)} touches")
     names = sorted(set(recordings.materials))

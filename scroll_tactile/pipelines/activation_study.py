@@ -61,8 +61,8 @@ class ActivationStudy(Study):
         network = system.network
         assert isinstance(network, ResNetClassifier)
         self._keep(cell.dataset, {name: tensor.cpu().numpy() for name, tensor in network.net.state_dict().items()})
-        said = system.predict([stream for _, stream in part.exam])
-        right = sum(name == one for (name, _), one in zip(part.exam, said, strict=True))
+        said = system.predict(part.asked)
+        right = sum(one == other for one, other in zip(part.truth, said, strict=True))
         return {"right": right, "tested": len(said)}
 
     def _keep(self, dataset: str, tensors: Mapping[str, npt.NDArray[Any]]) -> None:

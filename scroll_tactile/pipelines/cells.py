@@ -49,6 +49,16 @@ class Split:
     exam: list[Labelled]
     touch: list[int]
 
+    @property
+    def asked(self) -> list[Stream]:
+        """The streams of the test."""
+        return [stream for _, stream in self.exam]
+
+    @property
+    def truth(self) -> list[str]:
+        """The materials of the test."""
+        return [name for name, _ in self.exam]
+
 
 def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share: float = 0.1) -> Split:
     """Split a data set for one fold: what is not tested is learned, but for a tenth of each material's recordings.

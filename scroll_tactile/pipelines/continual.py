@@ -20,7 +20,7 @@ from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.cached import Cached
-from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.passes import Labelled, hold_out
 from scroll_tactile.pipelines.peers import NearestMean, Peer, RanPAC, StreamingLDA, touch_features
 from scroll_tactile.pipelines.peers_replay import GDumb, Replaying
 from scroll_tactile.pipelines.replay import Progress
@@ -113,10 +113,7 @@ class _Fold:
         self.notes = notes
         self.progress = progress
         recordings = task.recordings
-        touches: list[Labelled] = list(zip(recordings.materials, recordings.streams, strict=True))
-        held = (recordings.fold == number).tolist()
-        taught = [touch for touch, out in zip(touches, held, strict=True) if not out]
-        self.exam = [touch for touch, out in zip(touches, held, strict=True) if out]
+        taught, self.exam = hold_out(recordings, recordings.fold == number)
         self.lessons = [taught[at] for at in arrange(task.schedule, [name for name, _ in taught], task.seed)]
         self.total = len(self.lessons)
         self.ends = part_ends(task.schedule, [name for name, _ in self.lessons])

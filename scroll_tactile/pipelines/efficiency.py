@@ -34,8 +34,7 @@ class Efficiency(Study):
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         touches, system = self._split(cell), self._system(cell)
-        exam = [stream for _, stream in touches.exam]
-        truth = [name for name, _ in touches.exam]
+        exam, truth = touches.asked, touches.truth
         points: list[list[float]] = []
 
         def test(at: int) -> None:

@@ -6,13 +6,17 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.prediction import Prediction
 from scroll_tactile.streams import Stream
 
-__all__ = ["Answers", "Labelled", "ask", "missing", "observe_all"]
+__all__ = ["Answers", "Labelled", "ask", "hold_out", "missing", "observe_all"]
 
 Labelled = tuple[str, Stream]
 """A material and how it felt."""
@@ -46,6 +50,13 @@ class Answers:
             (truth, said) for truth, said in zip(self.truth, self.said, strict=True) if said and said != truth
         )
         return [(*pair, count) for pair, count in sorted(pairs.items(), key=lambda entry: (-entry[1], entry[0]))]
+
+
+def hold_out(recordings: Recordings, tested: npt.NDArray[np.bool_]) -> tuple[list[Labelled], list[Labelled]]:
+    """The touches that are learned, and those that are held out to be asked about: of N, bool of shape (N,)."""
+    touches = list(zip(recordings.materials, recordings.streams, tested.tolist(), strict=True))
+    learned = [(name, stream) for name, stream, out in touches if not out]
+    return learned, [(name, stream) for name, stream, out in touches if out]
 
 
 def ask(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: float | None = None) -> Answers:

@@ -21,7 +21,7 @@ from scroll_tactile.embeddings import Embedding, Robust
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
-from scroll_tactile.pipelines.passes import Labelled, observe_all
+from scroll_tactile.pipelines.passes import Labelled, hold_out, observe_all
 from scroll_tactile.pipelines.perturbations import STUDIES
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
@@ -182,10 +182,7 @@ class Robustness:
 
     def _split(self, fold: int, sitting: bool) -> tuple[list[Labelled], list[Labelled]]:
         places: npt.NDArray[np.int64] = self.recordings.blocked() if sitting else self.recordings.fold
-        touches = list(zip(self.recordings.materials, self.recordings.streams, strict=True))
-        held = (places == fold).tolist()
-        lessons = [touch for touch, out in zip(touches, held, strict=True) if not out]
-        return lessons, [touch for touch, out in zip(touches, held, strict=True) if out]
+        return hold_out(self.recordings, places == fold)
 
 
 def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

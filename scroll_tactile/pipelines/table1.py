@@ -35,8 +35,7 @@ class Table1(Study):
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         touches, system = self._split(cell), self._system(cell)
-        exam = [stream for _, stream in touches.exam]
-        truth = [name for name, _ in touches.exam]
+        exam, truth = touches.asked, touches.truth
         curve: list[float] = []
         system.fit(
             touches.streams,

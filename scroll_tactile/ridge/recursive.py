@@ -21,21 +21,15 @@ from scroll_tactile.ridge.moments import one_thread, within_scatter
 from scroll_tactile.ridge.readouts import Readout, centred_means, require_definite
 from scroll_tactile.ridge.solvers import Covariance
 from scroll_tactile.ridge.statistics import Statistics
-from scroll_tactile.ridge.tracking import penalties_from
+from scroll_tactile.ridge.tracking import Follower
 
 __all__ = ["Recursive"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
-class Recursive:
-    """The readout of one scale as rows come, with the penalties of the readout that it starts from; as `Tracked`."""
-
-    def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
-        self._scale = scale
-        self._penalty = start.penalty
-        self._penalties = penalties_from(start)
-        self.anchor(statistics)
+class Recursive(Follower):
+    """A follower by the paper's recursion."""
 
     def anchor(self, statistics: Statistics) -> None:
         """Start again from a dense solve of the exact statistics.

@@ -20,7 +20,7 @@ from scroll_tactile.ridge.moments import one_thread, within_scatter
 from scroll_tactile.ridge.readouts import Readout, centred_means
 from scroll_tactile.ridge.statistics import Statistics
 
-__all__ = ["Tracked", "penalties_from"]
+__all__ = ["Follower", "Tracked"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,25 +31,42 @@ LEAST_RANK = 32
 FEW = 4  # columns that are solved for one by one
 
 
-def penalties_from(start: Readout) -> FloatArray:
-    """The penalties with which to go on from a readout, in codes², shape (d,)."""
-    # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.
-    varied = start.weights.any(axis=1)
-    return np.where(varied, start.penalties, start.penalties[varied].mean() if varied.any() else 1.0)
-
-
-class Tracked:
+class Follower:
     """The readout of one scale as rows come, with the penalties of the readout that it starts from.
 
-    Equal, but for rounding, to a fresh solve of (S_w + P) W = M on the statistics with all rows added. Its products are
-    small: whoever calls it with BLAS on one thread (`one_thread`) is answered soonest.
+    A subclass has `anchor`, `add` and `readout`.
     """
 
     def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
         self._scale = scale
         self._penalty = start.penalty
-        self._penalties = penalties_from(start)
+        # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.
+        varied = start.weights.any(axis=1)
+        self._penalties = np.where(varied, start.penalties, start.penalties[varied].mean() if varied.any() else 1.0)
         self.anchor(statistics)
+
+    def anchor(self, statistics: Statistics) -> None:
+        """Start again from the exact statistics.
+
+        Raises numpy.linalg.LinAlgError where the system is not positive definite to working precision.
+        """
+        raise NotImplementedError
+
+    def add(self, rows: npt.NDArray[np.integer], place: int) -> bool:
+        """Follow rows of codes, shape (k, d), of the class at a place; False, and nothing done, where it cannot."""
+        raise NotImplementedError
+
+    def readout(self) -> Readout:
+        """The readout of all rows so far."""
+        raise NotImplementedError
+
+
+class Tracked(Follower):
+    """A follower by Woodbury's identity.
+
+    Equal, but for rounding, to a fresh solve of (S_w + P) W = M on the statistics with all rows added. Its products are
+    small: whoever calls it with BLAS on one thread (`one_thread`) is answered soonest.
+    """
 
     def anchor(self, statistics: Statistics) -> None:
         """Start again from the exact statistics.

@@ -18,7 +18,7 @@ from scroll_tactile.errors import InputError, TrainingError
 from scroll_tactile.images import tactile_image
 from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.systems import SYSTEMS, Catalogue
-from scroll_tactile.pipelines.systems.descent import Batches, Course, descend, seeded
+from scroll_tactile.pipelines.systems.descent import Batches, Course, Precision, descend, logits_of, seeded
 from scroll_tactile.pipelines.systems.inputs import average_columns, one_width, picture
 from scroll_tactile.pipelines.systems.least_squares import PENALTIES, LeastSquares
 from scroll_tactile.pipelines.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
@@ -290,7 +290,34 @@ class TestTraining:
         with pytest.raises(TrainingError, match="nan in epoch 1"):
             descend(nn.Linear(2, 2), taught, None, Course(epochs=2), np.random.default_rng(0), silent, unwatched)
 
-    @pytest.mark.parametrize("wrong", [{"epochs": 0}, {"batch": 1}, {"rate": 0.0}, {"factor": 1.0}, {"momentum": 1.0}])
+    def test_bfloat16_rounds_products_and_keeps_weights_and_answers_float32(self):
+        images = torch.randn(16, 3, generator=torch.Generator().manual_seed(0))
+        taught = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())
+        seen: set[torch.dtype] = set()
+
+        def train(precision: Precision) -> tuple[float, nn.Module]:
+            with seeded(0, "cpu"):
+                net = nn.Linear(3, 2)
+                net.register_forward_hook(lambda module, inputs, output: seen.add(output.dtype))
+                course = Course(epochs=3, precision=precision)
+                epochs = descend(net, taught, None, course, np.random.default_rng(0), silent, unwatched)
+            return epochs[-1].loss, net
+
+        full, half = train("float32"), train("bfloat16")
+        assert seen == {torch.float32, torch.bfloat16}
+        assert full[0] != half[0]
+        assert full[0] == pytest.approx(half[0], rel=0.02)
+        assert {one.dtype for one in half[1].parameters()} == {torch.float32}
+        assert logits_of(half[1], images).dtype == torch.float32
+
+    def test_the_precision_is_the_residual_networks_alone(self, weights: str):
+        catalogue = Catalogue(weights, Course(epochs=1, precision="bfloat16"))
+        precision = {key: catalogue.make(key).course.precision for key in ("resnet", "resnet-pretrained", "conv-lstm")}  # type: ignore[attr-defined]
+        assert precision == {"resnet": "bfloat16", "resnet-pretrained": "bfloat16", "conv-lstm": "float32"}
+
+    @pytest.mark.parametrize(
+        "wrong", [{"epochs": 0}, {"batch": 1}, {"rate": 0.0}, {"factor": 1.0}, {"momentum": 1.0}, {"precision": "half"}]
+    )
     def test_settings_that_cannot_be_are_refused(self, wrong: dict[str, Any]):
         with pytest.raises(InputError, match="came"):
             Course(**wrong)

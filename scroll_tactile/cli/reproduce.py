@@ -19,8 +19,10 @@ from scroll_tactile.cli.studies import (
     Device,
     Epochs,
     Folds,
+    InPrecision,
     Json,
     Plot,
+    PrecisionChoice,
     Quick,
     Run,
     Seed,
@@ -65,6 +67,7 @@ def table1(
     folds: Folds = None,
     epochs: Epochs = None,
     device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
     seed: Seed = 0,
     quick: Quick = False,
     run: Run = None,
@@ -79,7 +82,17 @@ def table1(
     with progress_bar() as progress:
         progress("reading", 0, 1)
         read = read_sets(sets, tuple(SETS), data, seed, quick)
-        study = Table1(read, keys, weights, epochs or (QUICK_EPOCHS if quick else 100), device.value, seed, quick, run)
+        study = Table1(
+            read,
+            keys,
+            weights,
+            epochs or (QUICK_EPOCHS if quick else 100),
+            device.value,
+            seed,
+            quick,
+            run,
+            precision.value,
+        )
         results = list(study.run(choose_folds(folds, read, quick), progress))
     found = rows(results)
     for recordings in read:
@@ -102,6 +115,7 @@ def efficiency(
     folds: Folds = None,
     epochs: Epochs = None,
     device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
     seed: Seed = 0,
     quick: Quick = False,
     run: Run = None,
@@ -118,7 +132,7 @@ def efficiency(
         progress("reading", 0, 1)
         read = read_sets(sets, QUICK_SETS, data, seed, quick)
         few = epochs or (QUICK_EPOCHS if quick else 20)
-        study = Efficiency(read, keys, weights, few, device.value, seed, quick, run)
+        study = Efficiency(read, keys, weights, few, device.value, seed, quick, run, precision.value)
         results = list(study.run(choose_folds(folds, read, quick), progress))
     found = curves(results)
     for recordings in read:
@@ -141,6 +155,7 @@ def activation(
     sets: Sets = None,
     epochs: Epochs = None,
     device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
     seed: Seed = 0,
     quick: Quick = False,
     run: Run = None,
@@ -159,7 +174,9 @@ def activation(
         progress("reading", 0, 1)
         read = read_sets(sets, QUICK_SETS, data, seed, quick)
         few = epochs or (QUICK_EPOCHS if quick else 20)
-        study = ActivationStudy(read, ("resnet-pretrained",), weights, few, device.value, seed, quick, run)
+        study = ActivationStudy(
+            read, ("resnet-pretrained",), weights, few, device.value, seed, quick, run, precision.value
+        )
         results = list(study.run({one.name: [0] for one in read}, progress))
         networks = study.networks()
         likeness = study.likeness(networks)

@@ -15,7 +15,7 @@ from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.pipelines.cells import Cell, Figures, Split, require_data, run_cells, split
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.systems.catalogue import NEED_WEIGHTS, SYSTEMS, Catalogue
-from scroll_tactile.pipelines.systems.descent import Course
+from scroll_tactile.pipelines.systems.descent import Course, Precision
 from scroll_tactile.pipelines.systems.protocol import System
 from scroll_tactile.pipelines.systems.trained import require_device
 from scroll_tactile.training import Progress
@@ -35,6 +35,7 @@ class Study:
 
     sets: of different names. systems: keys of SYSTEMS. weights: of a trained ResNet, for those in NEED_WEIGHTS.
     epochs: of the networks. device: of all networks but ours. seed: of all that is drawn.
+    precision: of the residual networks' training, see `Course`.
     quick: learn every second recording, and let residual networks read about 50 columns an image: for a look.
     folder: where finished cells are noted, so that a run that was killed goes on; or None.
 
@@ -50,6 +51,7 @@ class Study:
     seed: int = 0
     quick: bool = False
     folder: Path | None = None
+    precision: Precision = "float32"
 
     name = "study"
 
@@ -62,7 +64,7 @@ class Study:
             raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
         if len({one.name for one in self.sets}) < len(self.sets) or not self.sets:
             raise InputError(f"expected data sets of different names; came {[one.name for one in self.sets]}")
-        Course(epochs=self.epochs)
+        Course(epochs=self.epochs, precision=self.precision)
         require_device(self.device)
         if self.seed < 0:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
@@ -70,7 +72,7 @@ class Study:
     @property
     def plan(self) -> dict[str, Any]:
         """All that each figure depends on, beside the data; sets, systems and folds can be added to a run later."""
-        options = {name: getattr(self, name) for name in ("epochs", "device", "seed", "quick")}
+        options = {name: getattr(self, name) for name in ("epochs", "device", "seed", "quick", "precision")}
         return {"run": self.name, **options, "weights": None if self.weights is None else weights_digest(self.weights)}
 
     def cells(self, folds: Mapping[str, Sequence[int]]) -> list[Cell]:
@@ -119,7 +121,9 @@ class Study:
     def _catalogue(self, recordings: Recordings) -> Catalogue:
         columns = recordings.sensor.shape[1] if recordings.sensor.camera else recordings.sensor.readings
         every = max(1, round(columns / QUICK_COLUMNS)) if self.quick else 1
-        return Catalogue(self.weights, Course(epochs=self.epochs), self.device, every, self.seed)
+        return Catalogue(
+            self.weights, Course(epochs=self.epochs, precision=self.precision), self.device, every, self.seed
+        )
 
 
 def weights_digest(weights: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from torch import nn
@@ -63,7 +63,8 @@ class Catalogue:
     """What the systems are made with; embeddings are made once and remember the touches that they have read.
 
     weights: of a trained ResNet: a file or a published name; None: the systems in NEED_WEIGHTS cannot be made.
-    course: of the networks' training. device: of all networks but ours. every: columns that the residual networks'
+    course: of the networks' training, in whose precision the residual ones alone are trained: the others are small.
+    device: of all networks but ours. every: columns that the residual networks'
     images are averaged over (1: as recorded). seed: of the control's random weights.
     """
 
@@ -90,13 +91,16 @@ class Catalogue:
             ),
             "least-squares": lambda: self._pretrained_squares,
             "least-squares-random": lambda: self._random_squares,
-            "resnet": lambda: self._trained(key, self._new, self._thinned),
-            "resnet-pretrained": lambda: self._trained(key, self._pretrained, self._thinned),
+            "resnet": lambda: self._residual(key, self._new),
+            "resnet-pretrained": lambda: self._residual(key, self._pretrained),
         }
         return makers[key]()
 
     def _trained(self, key: str, make: Make, read: Callable[[Image], Image] = lambda image: image) -> Trained:
-        return Trained(SYSTEMS[key], make, read, self.course, self.device)
+        return Trained(SYSTEMS[key], make, read, replace(self.course, precision="float32"), self.device)
+
+    def _residual(self, key: str, make: Make) -> Trained:
+        return Trained(SYSTEMS[key], make, self._thinned, self.course, self.device)
 
     def _thinned(self, image: Image) -> Image:
         return average_columns(image, self.every)

@@ -111,7 +111,8 @@ class ResNetClassifier(nn.Module):
 
     def __init__(self, net: ResNet, materials: int, *, trained: bool = False) -> None:
         super().__init__()
-        self.net = net
+        # The order of the planes is the same arithmetic and an eighth to a third of the time less.
+        self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.trained = trained
         self.head = nn.Linear(net.widths[-1], materials)
 

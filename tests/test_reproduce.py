@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -287,6 +288,49 @@ class TestCommand:
         assert plot.read_bytes().startswith(b"\x89PNG")
         (folder / "activation BioTac-20.npz").unlink()
         assert "first layers cannot be read" in refused(*words, "--weights", weights)
+
+    def test_noise_is_asked_of_the_papers_systems_and_ours(self, tmp_path: Path):
+        pytest.importorskip("matplotlib")
+        file = tmp_path / "noise.json"
+        words = ("reproduce", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")
+        result = run(*words, "--systems", "svm,conv-lstm", "--json", file, "--plot", tmp_path / "noise.png")
+        assert result.exit_code == 0, result.output
+        assert "73.0 %" in result.output and "80.0 %" in result.output
+        kept = json.loads(file.read_text())
+        assert kept["command"].startswith("scroll-tactile reproduce noise --data DATA --systems svm,conv-lstm")
+        means = {(one["dataset"], one["strength"], one["system"], one["augmented"]): one for one in kept["means"]}
+        assert len(means) == 16
+        assert means["RoboSkin-20", 0.0, "svm", False]["mean"] > 0.5  # of three materials
+        assert kept["sets"]["RoboSkin-20"]["settings"]["conv-lstm"]["epochs"] == 1
+        assert (tmp_path / "noise-biotac-20.png").is_file() and (tmp_path / "noise-roboskin-20.png").is_file()
+        # Another system can join the run; the same with other settings cannot.
+        assert run(*words, "--systems", "svm,svm-spikes").exit_code == 0
+        again = refused(*words[:6], 2, *words[7:], "--systems", "conv-lstm")
+        assert "other settings of conv-lstm" in again and "'epochs': 2" in again
+
+    def test_what_the_robustness_commands_cannot_do_is_refused(self, tmp_path: Path):
+        words = ("reproduce", "speed", "--data", tmp_path)
+        assert "ours, svm, svm-spikes, conv-lstm, snn, resnet" in refused(*words, "--systems", "least-squares")
+        assert "give --weights" in refused(*words, "--systems", "resnet-pretrained")
+        assert "out of [0, 1, 2]" in refused(*words, "--systems", "svm", "--sets", "roboskin-20", "--folds", "9")
+
+    def test_all_writes_every_part_and_reads_finished_cells_back(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        pytest.importorskip("matplotlib")
+        # The package's names are the commands; their modules lie behind them.
+        module = sys.modules["scroll_tactile.cli.reproduce"]
+        monkeypatch.setattr(module, "SYSTEMS", {"svm-spikes": "SVM on spikes"})
+        monkeypatch.setattr(module, "CURVES", ("kernels-lda",))
+        monkeypatch.setattr("scroll_tactile.cli.perturbed.CHOICES", ("svm-spikes",))
+        monkeypatch.setattr("scroll_tactile.cli.perturbed.BASELINES", ("svm-spikes",))
+        words = ("reproduce", "all", "--data", tmp_path, "--out", tmp_path, "--quick", "--run", tmp_path / "run")
+        for _ in range(2):
+            result = run(*words)
+            assert result.exit_code == 0, result.output
+        made = {file.name for file in tmp_path.iterdir() if file.is_file()}
+        pictures = {f"robustness-{name}.png" for name in ("biotac-20", "roboskin-20")}
+        assert made == {"table1.json", "efficiency.json", "efficiency.png", "robustness.json", *pictures}
+        studies = {one["study"] for one in json.loads((tmp_path / "robustness.json").read_text())["means"]}
+        assert studies == {"length", "speed", "noise"}
 
     def test_what_is_not_there_is_named(self, tmp_path: Path):
         words = ("reproduce", "table1", "--data", tmp_path)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
 from scroll_tactile import plots
 from scroll_tactile.cli.results import require_folders
+from scroll_tactile.cli.robustness import IN_THE_PAPER, study_command
 from scroll_tactile.cli.studies import (
     QUICK_EPOCHS,
     QUICK_SETS,
@@ -191,6 +193,42 @@ def activation(
     if plot is not None:
         draw_activation(plot, images)
         say(f"plot: {plot}")
+
+
+for name in IN_THE_PAPER:
+    reproduce.command(name)(study_command(name))
+
+
+@reproduce.command(name="all")
+def everything(
+    data: Data,
+    out: Annotated[Path, typer.Option(help="An existing folder: every part's figures and pictures go there.")],
+    weights: Weights = None,
+    folds: Folds = None,
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+) -> None:
+    """All of it, one after the other: table1, efficiency, length, speed and noise, and with weights activation.
+
+    Length, speed and noise are asked of the same systems, so that each is taught once; their figures are one file.
+    """
+    require_folders(out / "table1.json")
+    shared: dict[str, Any] = {"data": data, "weights": weights, "epochs": epochs, "device": device, "seed": seed}
+    shared |= {"precision": precision, "quick": quick}
+
+    def files(part: str, *, picture: bool = True) -> dict[str, Any]:
+        kept: dict[str, Any] = {"run": None if run is None else run / part, "json": out / f"{part}.json"}
+        return kept | ({"plot": out / f"{part}.png"} if picture else {})
+
+    table1(**shared, folds=folds, **files("table1", picture=False))
+    efficiency(**shared, folds=folds, **files("efficiency"))
+    study_command("all")(**shared, folds=folds, **files("robustness"))
+    if weights is not None:
+        activation(**shared, **files("activation"))
 
 
 def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: Study) -> None:

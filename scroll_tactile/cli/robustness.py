@@ -1,25 +1,45 @@
-"""`scroll-tactile robustness`."""
+"""`scroll-tactile robustness`, and the paper's part of it: `reproduce length`, `speed` and `noise`."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable
 from enum import StrEnum
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from scroll_tactile import plots
-from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
-from scroll_tactile.datasets import Recordings
+from scroll_tactile.cli.perturbed import CHOICES, OURS, Asked, choose, measure, tell
+from scroll_tactile.cli.results import Dataset, read, require_folders
+from scroll_tactile.cli.studies import (
+    QUICK_EPOCHS,
+    QUICK_SETS,
+    Data,
+    Device,
+    Epochs,
+    Folds,
+    InPrecision,
+    Json,
+    Plot,
+    PrecisionChoice,
+    Quick,
+    Run,
+    Seed,
+    Sets,
+    Weights,
+    Where,
+    read_sets,
+)
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.pipelines.replay import subset
-from scroll_tactile.pipelines.robustness import NAMES, SITTING, Robustness, ours, summary
-from scroll_tactile.plots_robustness import draw_robustness
 
-__all__ = ["robustness"]
+__all__ = ["IN_THE_PAPER", "robustness", "study_command"]
+
+IN_THE_PAPER = {
+    "length": "Accuracy against the length of the touch, from 0.1 s on; the paper says that 0.3 s suffices.",
+    "speed": "Accuracy against speed, a quarter to four times that learned from.",
+    "noise": "Accuracy against uniform noise, up to the whole range.",
+}
+"""Study → what its command says of itself."""
 
 
 class StudyChoice(StrEnum):
@@ -34,74 +54,97 @@ class StudyChoice(StrEnum):
     ALL = "all"
 
 
+Systems = Annotated[
+    str | None, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; without and with augmentation.")
+]
+
+
 def robustness(
     study: Annotated[StudyChoice, typer.Argument(help="What is done to the test touches.", show_default=False)],
     dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
-    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
-    folds: Annotated[str, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')] = "all",
+    data: Data,
+    systems: Systems = OURS,
+    weights: Weights = None,
+    folds: Folds = "all",
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
     quick: Annotated[bool, typer.Option("--quick", help="The first of these folds, and few strengths.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Draws what is done to touches, and BioTac's folds.")] = 0,
-    run: Annotated[
-        Path | None, typer.Option(help="Keep finished figures in this folder; an interrupted run goes on from them.")
-    ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw accuracy against strength into this PNG.")] = None,
+    seed: Seed = 0,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
     materials: Annotated[int, typer.Option(hidden=True, min=2)] = 20,
 ) -> None:
     """Learn from clean touches, and ask about shorter, faster, noisier ones; with augmented observation and without.
 
-    One learner, with one setting, answers all studies of a fold.
+    Each system learns a fold once, with one setting, for all studies; only another sitting has lessons of its own.
     """
     require_folders(json, plot)
+    asked = Asked(
+        ["scroll-tactile", "robustness", study.value, dataset.value],
+        choose(systems, weights),
+        weights,
+        epochs or (QUICK_EPOCHS if quick else 100),
+        device.value,
+        precision.value,
+        folds or "all",
+        seed,
+        quick,
+        run,
+        json,
+        plot,
+    )
     with progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = read(dataset, data, seed)
         if materials < 20:
             recordings = subset(recordings, materials)
-        make, settings = ours(recordings.sensor)
-        task = Robustness(
-            recordings,
-            {"ours": make},
-            {"ours": settings},
-            _studies(study, recordings),
-            seed=seed,
-            quick=quick,
-            folder=run,
+        found = measure(asked, [recordings], [study.value], progress)
+    tell(asked, found)
+
+
+def study_command(study: str) -> Callable[..., None]:
+    """The command of `reproduce` for a study of IN_THE_PAPER, on both sensors, ours beside the paper's systems.
+
+    "all" is the three of them: each system learns a fold once for all.
+    """
+
+    def command(
+        data: Data,
+        weights: Weights = None,
+        sets: Sets = None,
+        systems: Systems = None,
+        folds: Folds = None,
+        epochs: Epochs = None,
+        device: Where = Device.CPU,
+        precision: InPrecision = PrecisionChoice.FLOAT32,
+        seed: Seed = 0,
+        quick: Quick = False,
+        run: Run = None,
+        json: Json = None,
+        plot: Plot = None,
+    ) -> None:
+        require_folders(json, plot)
+        asked = Asked(
+            ["scroll-tactile", "reproduce", study, *(["--sets", sets] if sets is not None else [])],
+            choose(systems, weights),
+            weights,
+            epochs or (QUICK_EPOCHS if quick else 100),
+            device.value,
+            precision.value,
+            folds or "all",
+            seed,
+            quick,
+            run,
+            json,
+            plot,
         )
-        chosen = parse_folds(folds, recordings)[: 1 if quick else None]
-        records = [record for fold in task.run(chosen, progress) for record in fold]
-    rows = summary(records)
-    _show(recordings, rows, len(chosen))
-    if json is not None:
-        words = ["scroll-tactile", "robustness", study.value, dataset.value, "--data", str(data), "--folds", folds]
-        words += ["--seed", str(seed)] + ["--quick"] * quick
-        write_json(json, {**origin(shlex.join(words), recordings), **task.plan, "means": rows, "records": records})
-        say(f"figures: {json}")
-    if plot is not None and plots.available():
-        draw_robustness(plot, rows, title=f"{recordings.name}, learned from clean touches")
-        say(f"plot: {plot}")
-    elif plot is not None:
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+        studies = list(IN_THE_PAPER) if study == StudyChoice.ALL else [study]
+        with progress_bar() as progress:
+            progress("reading", 0, 1)
+            found = measure(asked, read_sets(sets, QUICK_SETS, data, seed, quick), studies, progress)
+        tell(asked, found)
 
-
-def _studies(study: StudyChoice, recordings: Recordings) -> list[str]:
-    if study is not StudyChoice.ALL:
-        return [study.value]
-    if not recordings.ordered:
-        say(f"[yellow]not measured:[/] {SITTING}: {recordings.name} is published without its order of recording")
-    return [name for name in NAMES if name != SITTING or recordings.ordered]
-
-
-def _show(recordings: Recordings, rows: Sequence[Mapping[str, Any]], folds: int) -> None:
-    systems = list(dict.fromkeys((row["system"], row["augmented"]) for row in rows))
-    count = "1 fold" if folds == 1 else f"{folds} folds"
-    heads = [f"{system}, augmented" if augmented else system for system, augmented in systems]
-    table = Table("study", "strength", *heads, title=f"{recordings.name}, learned from clean touches, {count}")
-    cells = {(row["study"], row["strength"], row["system"], row["augmented"]): row for row in rows}
-    for study in dict.fromkeys(row["study"] for row in rows):
-        for strength in dict.fromkeys(row["strength"] for row in rows if row["study"] == study):
-            said = [cells[study, strength, *system] for system in systems]
-            shown = [percent(row["mean"]) + (f" ± {100 * row['sd']:.1f}" if row["folds"] > 1 else "") for row in said]
-            table.add_row(study, "" if study == SITTING else f"{strength:g}", *shown)
-        table.add_section()
-    console().print(table)
+    command.__doc__ = f"{IN_THE_PAPER.get(study, '')} Each system with augmentation and without."
+    return command

@@ -94,7 +94,8 @@ def choose_systems(asked: str | None, usual: Sequence[str], weights: str | None)
     if weights is not None:
         return tuple(usual)
     out = [key for key in usual if key in NEED_WEIGHTS]
-    say(f"[yellow]Left out without --weights:[/] {', '.join(out)}")
+    if out:
+        say(f"[yellow]Left out without --weights:[/] {', '.join(out)}")
     return tuple(key for key in usual if key not in out)
 
 

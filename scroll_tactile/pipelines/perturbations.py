@@ -20,7 +20,7 @@ from scroll_tactile.images import tactile_image
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream, fewest_readings, validate
 
-__all__ = ["STUDIES", "Study", "dead", "drift", "length", "noise", "speed"]
+__all__ = ["STUDIES", "Study", "changed", "dead", "drift", "length", "noise", "speed"]
 
 _KINDS = {"noise": 0, "dead": 1, "drift": 2}
 
@@ -45,7 +45,7 @@ def speed(stream: Stream, factor: float, seed: int = 0) -> Stream:
     if factor == 1:
         return stream
     least = fewest_readings(stream.sensor) / len(stream)
-    return _perturbed(stream, lambda image: resize(image, max(1 / factor, min(1.0, least))))
+    return changed(stream, lambda image: resize(image, max(1 / factor, min(1.0, least))))
 
 
 def noise(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
@@ -121,12 +121,16 @@ def _drawn(
         return stream
     # With 2 in front, where copies that are learned from have 1: never the same draw.
     rng = np.random.default_rng([2, seed, _KINDS[kind], int.from_bytes(stream.key, "little")])
-    return _perturbed(stream, lambda image: change(image, rng))
+    return changed(stream, lambda image: change(image, rng))
 
 
-def _perturbed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
+def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
+    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
+
+    Raises InputError for a camera's stream.
+    """
     sensor = stream.sensor
     if sensor.camera:
         raise InputError(f"perturbations are of channels along time, and camera {sensor.name!r} takes whole frames")
-    changed = change(tactile_image(stream)).T.astype(np.float64)
-    return validate(sensor.low + (changed + 1) / 2 * (sensor.high - sensor.low), sensor)
+    image = change(tactile_image(stream)).T.astype(np.float64)
+    return validate(sensor.low + (image + 1) / 2 * (sensor.high - sensor.low), sensor)

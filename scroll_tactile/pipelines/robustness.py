@@ -7,8 +7,10 @@ cell is written down when it is finished, and an interrupted run goes on with th
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,11 +29,15 @@ from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.streams import Stream
 
-__all__ = ["NAMES", "SITTING", "Learned", "Make", "Robustness", "System", "ours", "summary", "worst"]
+__all__ = ["NAMES", "PAPER", "SITTING", "Learned", "Make", "Robustness", "System", "ours", "summary", "worst"]
 
 SITTING = "sitting"
 NAMES = (*STUDIES, SITTING)
 """The names of the studies."""
+
+PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
+"""(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
+with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
 
 AUGMENTED = Augmented(copies=6, speed=2.1, noisy=20, noise=0.7)
 """The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
@@ -47,8 +53,8 @@ class System(Protocol):
         ...
 
 
-Make = Callable[[Sequence[Labelled], bool], System]
-"""Makes a system that has learned these touches, with its augmentation (True) or without."""
+Make = Callable[[Sequence[Labelled], bool, Progress], System]
+"""Makes a system that has learned these touches, with its augmentation (True) or without; told how far it is."""
 
 
 class Learned:
@@ -71,12 +77,13 @@ def ours(
     """
     robust = Robust() if embedding is None else embedding
 
-    def make(lessons: Sequence[Labelled], augmented: bool) -> System:
+    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
         if augmented:
             learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
         else:
             learner = TactileLearner(sensor=sensor, exemplars=0)
-        observe_all(learner, lessons)
+        done = count()
+        observe_all(learner, lessons, lambda: progress("learning", next(done) + 1, len(lessons)))
         return Learned(learner)
 
     return make, {"embedding": repr(robust), "augmentation": augmentation.to_json()}
@@ -87,7 +94,7 @@ class Robustness:
     """What to study.
 
     recordings: the touches. systems: by name, what makes and teaches each. settings: by name, all that a system's
-    answers depend on beside its name, in JSON's types, so that a run of others is not gone on with.
+    answers depend on beside its name, in JSON's types, so that what other settings gave is not gone on with.
     studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
     quick: fewer strengths. folder: where finished cells are kept, or None.
 
@@ -115,10 +122,9 @@ class Robustness:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """All that the figures depend on, in JSON's types; which studies and folds are asked for is not of it."""
+        """What all figures depend on, in JSON's types; studies, folds and systems can be added to a run later."""
         size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        settings = {"settings": dict(self.settings), "seed": self.seed}
-        return {"run": "robustness", "dataset": self.recordings.name, **size, **settings}
+        return {"run": "robustness", "dataset": self.recordings.name, **size, "seed": self.seed}
 
     def run(
         self, folds: Sequence[int], progress: Progress = lambda what, done, of: None
@@ -127,12 +133,15 @@ class Robustness:
 
         A record holds study, strength, system, augmented, fold, accuracy (a share) and tested (touches).
 
-        Raises InputError for a fold that is not there or a folder of another run.
+        Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
+        under other settings.
         """
         there = sorted(set(self.recordings.fold.tolist()))
         if not folds or set(folds) - set(there):
             raise InputError(f"expected folds out of {there}; came {list(folds)}")
         notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
+        for name in self.systems:
+            self._require_settings(notes, name)
         for fold in folds:
             cells = self.cells(fold)
             yield [
@@ -151,6 +160,15 @@ class Robustness:
             for strength in ((0.0,) if study == SITTING else STUDIES[study].of(sensor, quick=self.quick))
         ]
 
+    def _require_settings(self, notes: RunFile, name: str) -> None:
+        given = json.loads(json.dumps(self.settings.get(name)))
+        kept = notes.notes.setdefault(f"settings of {name}", given)
+        if kept != given:
+            raise InputError(
+                f"the run in {notes.path} was begun with other settings of {name}: {kept} there, {given} here. Ask for "
+                "the same, or take another folder"
+            )
+
     def _taught(
         self,
         name: str,
@@ -162,13 +180,18 @@ class Robustness:
         systems: dict[bool, System] = {}  # by whether it has learned for "sitting"
         what = f"{name}{', augmented' if augmented else ''}"
         for done, (study, strength, fold) in enumerate(cells):
-            progress(f"fold {fold}: {what}: {study} {strength:g}", done, len(cells))
+            where = f"fold {fold}: {what}: {study} {strength:g}"
+            progress(where, done, len(cells))
             key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
             if key not in notes.notes:
                 sitting = study == SITTING
                 lessons, exam = self._split(fold, sitting)
                 if sitting not in systems:
-                    systems[sitting] = self.systems[name](lessons, augmented)
+
+                    def told(step: str, at: int, of: int, where: str = where) -> None:
+                        progress(f"{where}: {step}", at, of)
+
+                    systems[sitting] = self.systems[name](lessons, augmented, told)
                 asked = exam if sitting else self._perturbed(exam, study, strength)
                 said = systems[sitting].predict([stream for _, stream in asked])
                 share = accuracy([material for material, _ in asked], list(said))

@@ -9,6 +9,7 @@ from functools import cached_property
 
 from torch import nn
 
+from scroll_tactile.augment import Augmentation
 from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
@@ -65,7 +66,8 @@ class Catalogue:
     weights: of a trained ResNet: a file or a published name; None: the systems in NEED_WEIGHTS cannot be made.
     course: of the networks' training, in whose precision the residual ones alone are trained: the others are small.
     device: of all networks but ours. every: columns that the residual networks'
-    images are averaged over (1: as recorded). seed: of the control's random weights.
+    images are averaged over (1: as recorded). seed: of the control's random weights. augmentation: of every touch that
+    a network is trained on, in every epoch; the paper's table has none.
     """
 
     weights: str | os.PathLike[str] | None = None
@@ -73,6 +75,7 @@ class Catalogue:
     device: str = "cpu"
     every: int = 1
     seed: int = 0
+    augmentation: Augmentation | None = None
 
     def make(self, key: str) -> System:
         """A new system. Raises InputError for a name that is not there, or weights that are needed and not given."""
@@ -97,10 +100,11 @@ class Catalogue:
         return makers[key]()
 
     def _trained(self, key: str, make: Make, read: Callable[[Image], Image] = lambda image: image) -> Trained:
-        return Trained(SYSTEMS[key], make, read, replace(self.course, precision="float32"), self.device)
+        course = replace(self.course, precision="float32")
+        return Trained(SYSTEMS[key], make, read, course, self.device, self.augmentation)
 
     def _residual(self, key: str, make: Make) -> Trained:
-        return Trained(SYSTEMS[key], make, self._thinned, self.course, self.device)
+        return Trained(SYSTEMS[key], make, self._thinned, self.course, self.device, self.augmentation)
 
     def _thinned(self, image: Image) -> Image:
         return average_columns(image, self.every)

@@ -1,0 +1,85 @@
+"""The paper's systems in the studies of robustness: taught by the same touches, with its augmentations or without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from scroll_tactile.augment import Augmentation, fit
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.passes import Labelled
+from scroll_tactile.pipelines.perturbations import changed
+from scroll_tactile.pipelines.robustness import Make, Progress
+from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
+from scroll_tactile.pipelines.systems.inputs import Image
+from scroll_tactile.pipelines.systems.protocol import System
+from scroll_tactile.streams import Stream, fewest_readings
+
+__all__ = ["BASELINES", "COPIES", "STRONG", "baseline"]
+
+BASELINES = tuple(key for key in SYSTEMS if key not in OURS and not key.startswith("least-squares"))
+"""Keys of the catalogue that can be asked about touches of any length and speed."""
+
+STRONG = Augmentation(flip=0.5, speed=(0.45, 2.2), keep=0.1, noise=0.6, drift=0.1)
+"""The paper's four, as strong as the studies: to about half and twice the speed, down to a tenth of the touch, and to
+noise of a standard deviation of 0.6 of half the range, as uniform noise of ± 0.52 of the range has."""
+
+COPIES = 3
+"""Of each touch, for a system that is not trained over epochs, in which it would see others every time."""
+
+HELD = 0.1  # of a material's touches go to the validation
+
+
+def baseline(
+    key: str, catalogue: Catalogue, seed: int = 0, augmentation: Augmentation = STRONG
+) -> tuple[Make, dict[str, Any]]:
+    """A system of the catalogue for the studies of robustness, and what it depends on, in JSON's types.
+
+    With its augmentation a network sees each touch changed anew in every epoch, and any other system COPIES changed
+    ones beside each. The validation, a tenth of each material's touches, is left as it was felt.
+
+    Raises InputError for a system that is not in BASELINES.
+    """
+    if key not in BASELINES:
+        raise InputError(f"expected a system out of {', '.join(BASELINES)}; came {key!r}")
+
+    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
+        learned, held = _part(lessons, seed)
+        if augmented and key not in EPOCHAL:
+            learned = [*learned, *_copies(learned, augmentation, seed)]
+        made = replace(catalogue, augmentation=augmentation if augmented else None).make(key)
+        made.fit([stream for _, stream in learned], [name for name, _ in learned], held, seed, progress)
+        return made
+
+    course = {"epochs": catalogue.course.epochs, "precision": catalogue.course.precision} if key in EPOCHAL else {}
+    drawn = asdict(augmentation) | ({} if key in EPOCHAL else {"copies": COPIES})
+    return make, {"augmentation": drawn, "columns": catalogue.every, "seed": seed, **course}
+
+
+def _part(lessons: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[Labelled]]:
+    """What is learned, and a tenth of each material's touches, at least one where there are three, to choose on."""
+    random = np.random.default_rng([seed, 3])
+    held: set[int] = set()
+    for name in sorted({name for name, _ in lessons}):
+        own = random.permutation([at for at, (one, _) in enumerate(lessons) if one == name])
+        held.update(own[: max(len(own) >= 3, round(HELD * len(own)))].tolist())
+    learned = [touch for at, touch in enumerate(lessons) if at not in held]
+    return learned, [lessons[at] for at in sorted(held)]
+
+
+def _copies(touches: Sequence[Labelled], augmentation: Augmentation, seed: int) -> list[Labelled]:
+    random = np.random.default_rng([seed, 4])
+
+    def copied(stream: Stream) -> Stream:
+        change, least = augmentation.draw(random), fewest_readings(stream.sensor)
+
+        def apply(image: Image) -> Image:
+            made = change.apply(image)
+            return made if made.shape[1] >= least else fit(made, least)
+
+        return changed(stream, apply)
+
+    return [(name, copied(stream)) for name, stream in touches for _ in range(COPIES)]

@@ -3,19 +3,26 @@
 The paper (Zandonati et al. 2023) flips tactile images along the data axis, resizes and crops them along time, and
 jitters them. Here all four act along time: the slide went the other way, faster or slower, for less long, over a
 noisier, drifting sensor. The channels keep their places: a sensor's electrodes do not move.
+
+Each takes an image (C, T) or a batch of images of one width, (…, C, T), and does the same to all of it; `changed` puts
+any of them on a stream, and `Augmentation.streams` draws all four for each of several streams.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.images import tactile_image
+from scroll_tactile.streams import Stream, fewest_readings, validate
 
-__all__ = ["Augmentation", "Change", "augment", "crop", "fit", "flip", "jitter", "resize"]
+__all__ = ["Augmentation", "Change", "augment", "changed", "crop", "fit", "flip", "jitter", "resize"]
 
 Image = npt.NDArray[np.float32]
 
@@ -23,57 +30,59 @@ KNOTS = 4  # of the drift: over a touch it turns once or twice, as warming and p
 
 
 def flip(image: Image) -> Image:
-    """The touch made the other way: time reversed, same shape (C, T). Raises InputError for another shape or type."""
+    """The touch made the other way: time reversed, same shape (…, C, T).
+
+    Raises InputError for another shape or type.
+    """
     _require_image(image)
-    return np.ascontiguousarray(image[:, ::-1])
+    return np.ascontiguousarray(image[..., ::-1])
 
 
 def resize(image: Image, factor: float) -> Image:
     """The touch made slower (factor > 1) or faster: T · factor columns, at least one, by linear interpolation.
 
     The first and the last column stay. Raises InputError for a factor that is not finite and positive, or another
-    image than float32 of shape (C, T).
+    image than float32 of shape (…, C, T).
     """
     _require_image(image)
     if not (math.isfinite(factor) and factor > 0):
         raise InputError(f"expected a finite factor above 0 to resize by; came {factor}")
-    columns = image.shape[1]
+    columns = image.shape[-1]
     at = np.linspace(0, columns - 1, max(1, round(columns * factor)))
     before = np.minimum(at.astype(np.int64), max(columns - 2, 0))
     part = (at - before).astype(np.float32)
     after = np.minimum(before + 1, columns - 1)
-    resized: Image = image[:, before] * (1 - part) + image[:, after] * part
+    resized: Image = image[..., before] * (1 - part) + image[..., after] * part
     return resized
 
 
 def crop(image: Image, start: int, columns: int) -> Image:
-    """The touch made for less long: `columns` columns from `start` on, shape (C, columns).
+    """The touch made for less long: `columns` columns from `start` on, shape (…, C, columns).
 
     Raises InputError for columns that the image has not.
     """
     _require_image(image)
-    if start < 0 or columns < 1 or start + columns > image.shape[1]:
-        raise InputError(f"expected a stretch of the image's {image.shape[1]} columns; came {columns} from {start} on")
-    return np.ascontiguousarray(image[:, start : start + columns])
+    if start < 0 or columns < 1 or start + columns > image.shape[-1]:
+        raise InputError(f"expected a stretch of the image's {image.shape[-1]} columns; came {columns} from {start} on")
+    return np.ascontiguousarray(image[..., start : start + columns])
 
 
 def jitter(image: Image, noise: npt.NDArray[np.float32], drift: npt.NDArray[np.float32]) -> Image:
     """The touch felt by a noisier, slowly drifting sensor: image + noise + drift, clipped to [-1, 1].
 
-    noise: shape (C, T). drift: shape (C, K), K values that are spread evenly over the touch with straight lines
+    noise: shape (…, C, T). drift: shape (…, C, K), K values that are spread evenly over the touch with straight lines
     between them. Both in units of the image, half the sensor's range. Raises InputError for other shapes or values
     that are not finite.
     """
     _require_image(image)
-    channels, columns = image.shape
-    if noise.shape != image.shape or drift.ndim != 2 or len(drift) != channels or not drift.shape[1]:
+    if noise.shape != image.shape or drift.shape[:-1] != image.shape[:-1] or not drift.shape[-1]:
         raise InputError(
-            f"expected noise of shape {image.shape} and drift of shape ({channels}, K), K of 1 or more; "
+            f"expected noise of shape {image.shape} and drift of shape {image.shape[:-1]} and K, K of 1 or more; "
             f"came {noise.shape} and {drift.shape}"
         )
     if not (np.isfinite(noise).all() and np.isfinite(drift).all()):
         raise InputError("expected finite noise and drift; some values are NaN or infinite")
-    slow = resize(drift.astype(np.float32), columns / drift.shape[1])
+    slow = resize(drift.astype(np.float32), image.shape[-1] / drift.shape[-1])
     jittered: Image = np.clip(image + noise.astype(np.float32) + slow, np.float32(-1), np.float32(1))
     return jittered
 
@@ -86,9 +95,9 @@ def fit(image: Image, columns: int) -> Image:
     _require_image(image)
     if columns < 1:
         raise InputError(f"expected 1 column or more to fit an image to; came {columns}")
-    length = image.shape[1]
+    length = image.shape[-1]
     at = np.arange(columns) % (2 * length)
-    return np.ascontiguousarray(image[:, np.minimum(at, 2 * length - 1 - at)])
+    return np.ascontiguousarray(image[..., np.minimum(at, 2 * length - 1 - at)])
 
 
 @dataclass(frozen=True)
@@ -120,20 +129,20 @@ class Change:
             )
 
     def apply(self, image: Image, columns: int | None = None) -> Image:
-        """The changed image, float32 of shape (C, T'), in [-1, 1]; of `columns` columns where that is given.
+        """The changed image, float32 of shape (…, C, T'), in [-1, 1]; of `columns` columns where that is given.
 
-        Cut or continued by `fit` to that width. Raises InputError for another image than float32 of shape (C, T).
+        Cut or continued by `fit` to that width. Raises InputError for another image than float32 of shape (…, C, T).
         """
-        changed = flip(image) if self.flip else image
-        changed = resize(changed, self.speed)
-        kept = max(1, round(changed.shape[1] * self.keep))
-        changed = crop(changed, round((changed.shape[1] - kept) * self.place), kept)
+        made = flip(image) if self.flip else image
+        made = resize(made, self.speed)
+        kept = max(1, round(made.shape[-1] * self.keep))
+        made = crop(made, round((made.shape[-1] - kept) * self.place), kept)
         if columns is not None:
-            changed = fit(changed, columns)
+            made = fit(made, columns)
         rng = np.random.default_rng(self.seed)
-        slow = rng.standard_normal((len(changed), KNOTS), dtype=np.float32) * np.float32(self.drift)
-        noise = rng.standard_normal(changed.shape, dtype=np.float32) * np.float32(self.noise)
-        return jitter(changed, noise, slow)
+        slow = rng.standard_normal((*made.shape[:-1], KNOTS), dtype=np.float32) * np.float32(self.drift)
+        noise = rng.standard_normal(made.shape, dtype=np.float32) * np.float32(self.noise)
+        return jitter(made, noise, slow)
 
 
 @dataclass(frozen=True)
@@ -181,6 +190,36 @@ class Augmentation:
         """The image with all four changes, drawn from `rng`; see `Change.apply`."""
         return self.draw(rng).apply(image, columns)
 
+    def streams(self, streams: Sequence[Stream], rng: np.random.Generator) -> list[Stream]:
+        """Each of N streams as another touch of its material would have given it, drawn from `rng` for each alone.
+
+        None is made shorter than the 0.1 s that a stream has to last: it goes on as its mirror image up to there.
+        Raises InputError for a camera's stream.
+        """
+
+        def one(stream: Stream) -> Stream:
+            return changed(stream, partial(_long_enough, self.draw(rng), fewest_readings(stream.sensor)))
+
+        return [one(stream) for stream in streams]
+
+
+def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
+    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
+
+    `changed(stream, flip)` is the slide the other way. Raises InputError for a camera's stream, and what `validate`
+    raises for what came out.
+    """
+    sensor = stream.sensor
+    if sensor.camera:
+        raise InputError(f"changes are of channels along time, and camera {sensor.name!r} takes whole frames")
+    image = change(tactile_image(stream)).T.astype(np.float64)
+    return validate(sensor.low + (image + 1) / 2 * (sensor.high - sensor.low), sensor)
+
+
+def _long_enough(change: Change, least: int, image: Image) -> Image:
+    made = change.apply(image)
+    return made if made.shape[-1] >= least else fit(made, least)
+
 
 def augment(image: Image, rng: np.random.Generator, *, columns: int | None = None) -> Image:
     """A tactile image of shape (C, T) as another touch of the same material would have given it.
@@ -193,8 +232,8 @@ def augment(image: Image, rng: np.random.Generator, *, columns: int | None = Non
 
 
 def _require_image(image: Image) -> None:
-    if image.ndim != 2 or image.dtype != np.float32 or 0 in image.shape:
+    if image.ndim < 2 or image.dtype != np.float32 or 0 in image.shape:
         raise InputError(
-            f"expected a tactile image, float32 of shape (C, T) with a column or more; came {image.dtype} of shape "
-            f"{image.shape}. See tactile_image"
+            "expected a tactile image, float32 of shape (C, T) with a column or more, or a batch of them; "
+            f"came {image.dtype} of shape {image.shape}. See tactile_image"
         )

@@ -6,8 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scroll_tactile.augment import Augmentation, Change, augment, crop, fit, flip, jitter, resize
+from scroll_tactile.augment import Augmentation, Change, augment, changed, crop, fit, flip, jitter, resize
+from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.streams import fewest_readings, validate
+
+PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 
 few = settings(max_examples=100, deadline=None)
 images = hnp.arrays(
@@ -137,7 +142,7 @@ def test_by_default_touches_change_and_only_by_the_generator_given():
 
 
 WRONG_IMAGES = {
-    "three axes": np.zeros((3, 2, 4), np.float32),
+    "an empty batch": np.zeros((0, 2, 4), np.float32),
     "one axis": np.zeros(4, np.float32),
     "doubles": np.zeros((2, 4)),
     "no columns": np.zeros((2, 0), np.float32),
@@ -206,3 +211,53 @@ def test_strengths_that_cannot_be_are_refused(wrong):
 def test_a_change_that_cannot_be_is_refused(wrong):
     with pytest.raises(InputError, match="came Change"):
         Change(**wrong)
+
+
+@few
+@given(hnp.arrays(np.float32, (3, 2, 9), elements=st.floats(-1, 1, width=32)), st.floats(0.2, 4), st.integers(1, 20))
+def test_a_batch_is_changed_as_each_of_it(batch, factor, columns):
+    noise = np.linspace(-0.2, 0.2, batch.size, dtype=np.float32).reshape(batch.shape)
+    drift = noise[..., :4]
+    both = (
+        (flip(batch), [flip(one) for one in batch]),
+        (resize(batch, factor), [resize(one, factor) for one in batch]),
+        (crop(batch, 2, 5), [crop(one, 2, 5) for one in batch]),
+        (fit(batch, columns), [fit(one, columns) for one in batch]),
+        (jitter(batch, noise, drift), [jitter(*parts) for parts in zip(batch, noise, drift, strict=True)]),
+    )
+    for together, apart in both:
+        assert together.tobytes() == np.stack(apart).tobytes()
+    assert sound(Change(flip=True, speed=factor, keep=0.5, noise=0.1, drift=0.1).apply(batch, columns))
+
+
+def test_streams_are_changed_each_by_its_own_draw_of_the_seed():
+    scene = Scene(PATCH, seed=0)
+    streams = [scene.touch("felt", at) for at in range(3)]
+    made, again = (Augmentation().streams(streams, np.random.default_rng(5)) for _ in range(2))
+    assert made == again
+    assert len({len(stream) for stream in made}) > 1
+    assert all(one.sensor == PATCH and one != stream for one, stream in zip(made, streams, strict=True))
+    assert changed(streams[0], flip).readings[0].tolist() == pytest.approx(streams[0].readings[-1].tolist())
+    assert len(changed(streams[0], lambda image: resize(image, 0.5))) == len(streams[0]) // 2
+
+
+def test_a_stream_is_never_made_too_short_to_be_one():
+    stream = Scene(PATCH, seed=0).touch("felt", 0)
+    short = Augmentation(0, (0.05, 0.05), keep=0.1)
+    assert {len(one) for one in short.streams([stream] * 20, np.random.default_rng(0))} == {fewest_readings(PATCH)}
+
+
+def test_a_cameras_stream_is_refused():
+    camera = Sensor(
+        name="cam",
+        channels=192,
+        layout=(8, 8, 3),
+        camera=True,
+        rate=10.0,
+        low=0.0,
+        high=255.0,
+        unit="counts",
+        duration=1.0,
+    )
+    with pytest.raises(InputError, match="camera 'cam' takes whole frames"):
+        changed(validate(np.zeros((5, 8, 8, 3)), camera), flip)

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile.augment import Augmentation, fit
+from scroll_tactile.augment import Augmentation
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.passes import Labelled
-from scroll_tactile.pipelines.perturbations import changed
 from scroll_tactile.pipelines.robustness import Make, Progress
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
-from scroll_tactile.pipelines.systems.inputs import Image
 from scroll_tactile.pipelines.systems.protocol import System
-from scroll_tactile.streams import Stream, fewest_readings
 
 __all__ = ["BASELINES", "COPIES", "STRONG", "baseline"]
 
@@ -72,14 +69,4 @@ def _part(lessons: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[
 
 def _copies(touches: Sequence[Labelled], augmentation: Augmentation, seed: int) -> list[Labelled]:
     random = np.random.default_rng([seed, 4])
-
-    def copied(stream: Stream) -> Stream:
-        change, least = augmentation.draw(random), fewest_readings(stream.sensor)
-
-        def apply(image: Image) -> Image:
-            made = change.apply(image)
-            return made if made.shape[1] >= least else fit(made, least)
-
-        return changed(stream, apply)
-
-    return [(name, copied(stream)) for name, stream in touches for _ in range(COPIES)]
+    return [(name, copy) for name, stream in touches for copy in augmentation.streams([stream] * COPIES, random)]

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scroll_tactile.augment import Image, resize
+from scroll_tactile.augment import Image, changed, resize
 from scroll_tactile.copies import hiss, silence, wander
 from scroll_tactile.errors import InputError
-from scroll_tactile.images import tactile_image
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream, fewest_readings, validate
+from scroll_tactile.streams import Stream, fewest_readings
 
-__all__ = ["STUDIES", "Study", "changed", "dead", "drift", "length", "noise", "speed"]
+__all__ = ["STUDIES", "Study", "dead", "drift", "length", "noise", "speed"]
 
 _KINDS = {"noise": 0, "dead": 1, "drift": 2}
 
@@ -122,15 +121,3 @@ def _drawn(
     # With 2 in front, where copies that are learned from have 1: never the same draw.
     rng = np.random.default_rng([2, seed, _KINDS[kind], int.from_bytes(stream.key, "little")])
     return changed(stream, lambda image: change(image, rng))
-
-
-def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
-    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
-
-    Raises InputError for a camera's stream.
-    """
-    sensor = stream.sensor
-    if sensor.camera:
-        raise InputError(f"perturbations are of channels along time, and camera {sensor.name!r} takes whole frames")
-    image = change(tactile_image(stream)).T.astype(np.float64)
-    return validate(sensor.low + (image + 1) / 2 * (sensor.high - sensor.low), sensor)

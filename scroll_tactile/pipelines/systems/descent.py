@@ -149,7 +149,9 @@ def _epoch(
     for places in np.array_split(order, -(-len(order) // course.batch)):
         targets = taught.targets[torch.from_numpy(places)]
         try:
-            with torch.autocast(targets.device.type, torch.bfloat16, enabled=course.precision == "bfloat16"):
+            # Rounded weights are kept until the outermost autocast ends, which is that of `seeded`: not to be kept.
+            half = course.precision == "bfloat16"
+            with torch.autocast(targets.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
                 logits = net(taught.fetch(places))
             loss = functional.cross_entropy(logits.float(), targets)
             optimiser.zero_grad()

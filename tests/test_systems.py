@@ -317,6 +317,10 @@ class TestTraining:
         precision = {key: catalogue.make(key).course.precision for key in ("resnet", "resnet-pretrained", "conv-lstm")}  # type: ignore[attr-defined]
         assert precision == {"resnet": "bfloat16", "resnet-pretrained": "bfloat16", "conv-lstm": "float32"}
 
+    def test_a_course_in_proportion_is_the_papers_where_it_has_its_epochs(self):
+        assert Course.in_proportion(100) == Course()
+        assert [Course.in_proportion(epochs).patience for epochs in (1, 20, 200)] == [1, 2, 20]
+
     @pytest.mark.parametrize(
         "wrong", [{"epochs": 0}, {"batch": 1}, {"rate": 0.0}, {"factor": 1.0}, {"momentum": 1.0}, {"precision": "half"}]
     )

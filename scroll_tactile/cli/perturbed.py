@@ -59,7 +59,7 @@ class Asked:
     def catalogue(self, recordings: Recordings) -> Catalogue:
         """What the paper's systems are made with."""
         every = max(1, round(recordings.sensor.readings / QUICK_COLUMNS)) if self.quick else 1
-        course = Course(epochs=self.epochs, precision=self.precision)
+        course = Course.in_proportion(self.epochs, self.precision)
         return Catalogue(self.weights, course, self.device, every, self.seed)
 
     def made(self, recordings: Recordings) -> tuple[dict[str, Make], dict[str, Any]]:

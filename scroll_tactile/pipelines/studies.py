@@ -64,10 +64,15 @@ class Study:
             raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
         if len({one.name for one in self.sets}) < len(self.sets) or not self.sets:
             raise InputError(f"expected data sets of different names; came {[one.name for one in self.sets]}")
-        Course(epochs=self.epochs, precision=self.precision)
+        _ = self.course  # is refused where it cannot be
         require_device(self.device)
         if self.seed < 0:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
+
+    @property
+    def course(self) -> Course:
+        """How the networks are trained: as the paper's are, as far as the epochs reach."""
+        return Course(epochs=self.epochs, precision=self.precision)
 
     @property
     def plan(self) -> dict[str, Any]:

@@ -48,6 +48,14 @@ class Course:
     factor: float = 0.1
     precision: Precision = "float32"
 
+    @classmethod
+    def in_proportion(cls, epochs: int, precision: Precision = "float32") -> Course:
+        """A course of fewer or more epochs with a patience of a tenth of them, as the default has, 1 or more.
+
+        With ten epochs' patience the rate would not fall once in twenty, and a network swings until it does.
+        """
+        return cls(epochs=epochs, patience=max(1, epochs // 10), precision=precision)
+
     def __post_init__(self) -> None:
         whole = self.epochs >= 1 and self.batch >= 2 and self.patience >= 0
         if not (whole and 0 < self.rate < math.inf and 0 <= self.momentum < 1 and self.decay >= 0):

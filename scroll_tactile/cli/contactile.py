@@ -155,13 +155,16 @@ def _close(
     if json is None:
         return
     options = {name: getattr(study, name) for name in ("epochs", "biotac_epochs", "every", "take", "device", "seed")}
+    there = {cell.dataset for cell, _ in results}
     words = ["scroll-tactile", "fabric", "contactile", "--rows", ",".join(study.rows)]
+    words += ["--parts", ",".join(key for key, part in PARTS.items() if part in there)]
     words += ["--data", str(data)] if data is not None else ["--simulated", "--size", size]
     words += ["--weights", Path(study.weights).name] if study.weights is not None else []
     words += ["--biotac", "BIOTAC"] if study.biotac is not None else []
     words += [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
     made = origin(shlex.join(words), study.fabrics.recordings) | study.plan | options
     made |= {"simulated": data is None, "processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    made |= {"seconds": sum(figures["seconds"] for _, figures in results)}
     made |= {"not scored": [name for name in study.shares.names if name not in study.scored]}
     write_json(json, made | {"rows": found, "cells": {cell.key: figures for cell, figures in results}})
     say(f"figures: {json}")

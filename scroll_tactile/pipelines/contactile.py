@@ -195,11 +195,11 @@ class Contactile:
         for recordings in (self.fabrics.recordings, self.biotac):
             if recordings is not None:
                 require_data(notes, recordings)
-        for part in parts:
+        asked = [PARTS[part] for part in parts]
+        for part in asked:
             self.split(part)  # what is refused is refused before anything is measured
-        yield from run_cells(
-            notes, [Cell(part, 0, key) for key in self.rows for part in parts], self._measure, progress
-        )
+        cells = [Cell(part, 0, key) for key in self.rows for part in asked]
+        yield from run_cells(notes, cells, self._measure, progress)
 
     def split(self, part: str) -> Split:
         """The touches of HAND or HELD_OUT; those asked about are of fabrics of which something is known."""

@@ -151,8 +151,8 @@ class Contactile:
                 "expected a seed of 0 or more, every and take of 1 or more; came "
                 f"{self.seed}, {self.every}, {self.take}"
             )
-        if set(self.fabrics.protocol.tolist()) != {1, 2}:
-            raise InputError(f"expected touches under protocols 1 and 2; came {sorted(set(self.fabrics.protocol))}")
+        if (protocols := sorted(set(self.fabrics.protocol.tolist()))) != [1, 2]:
+            raise InputError(f"expected touches under protocols 1 and 2; came {protocols}")
         if not self.scored:
             raise InputError("expected a constituent that some fabrics have and others have not; there is none")
 

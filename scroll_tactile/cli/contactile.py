@@ -108,7 +108,10 @@ def contactile(
             touched = biotac_slide.load(biotac, "biotac", seed)
         study = Contactile(fabrics, wanted, weights, touched, device=device.value, seed=seed, folder=run, **settings)
         results = list(study.run(asked, progress))
-    _close(study, results, json, data, size)
+    reading = {"--limits": limits, "--pattern": pattern, "--constituents": constituents}
+    source = ["--simulated", "--size", size] if data is None else ["--data", str(data)]
+    source += [f"{option}={value}" for option, value in reading.items() if data is not None and value is not None]
+    _close(study, results, json, source)
 
 
 def _choose(asked: str | None, weights: str | None, biotac: Path | None) -> tuple[str, ...]:
@@ -148,38 +151,37 @@ def _limits(limits: str | None) -> tuple[float, float] | None:
 
 
 def _close(
-    study: Contactile, results: Sequence[tuple[Any, Mapping[str, Any]]], json: Path | None, data: Path | None, size: str
+    study: Contactile, results: Sequence[tuple[Any, Mapping[str, Any]]], json: Path | None, source: Sequence[str]
 ) -> None:
-    found = rows(results)
-    _show(found, study)
+    found, made_up = rows(results), source[0] == "--simulated"
+    _show(found, study, made_up)
     if json is None:
         return
     options = {name: getattr(study, name) for name in ("epochs", "biotac_epochs", "every", "take", "device", "seed")}
     there = {cell.dataset for cell, _ in results}
     words = ["scroll-tactile", "fabric", "contactile", "--rows", ",".join(study.rows)]
     words += ["--parts", ",".join(key for key, part in PARTS.items() if part in there)]
-    words += ["--data", str(data)] if data is not None else ["--simulated", "--size", size]
+    words += source
     words += ["--weights", Path(study.weights).name] if study.weights is not None else []
     words += ["--biotac", "BIOTAC"] if study.biotac is not None else []
     words += [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
     made = origin(shlex.join(words), study.fabrics.recordings) | study.plan | options
-    made |= {"simulated": data is None, "processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    made |= {"simulated": made_up, "processors": os.cpu_count(), "threads": torch.get_num_threads()}
     made |= {"seconds": sum(figures["seconds"] for _, figures in results)}
     made |= {"not scored": [name for name in study.shares.names if name not in study.scored]}
     write_json(json, made | {"rows": found, "cells": {cell.key: figures for cell, figures in results}})
     say(f"figures: {json}")
 
 
-def _show(found: Sequence[Mapping[str, Any]], study: Contactile) -> None:
-    name = study.fabrics.recordings.name
+def _show(found: Sequence[Mapping[str, Any]], study: Contactile, made_up: bool) -> None:
     for part in dict.fromkeys(part for row in found for part in row["parts"]):
-        _show_part(part, name, found)
+        _show_part(part, study.fabrics.recordings.name, found)
     if any(row["key"] in EPOCHAL for row in found):
         say(
             f"networks: {study.epochs} epochs (the paper has {PAPER_EPOCHS}), on {study.device}, images averaged over "
             f"{study.every} columns; learned was one touch of {study.take}"
         )
-    if name == "simulated fabrics":
+    if made_up:
         say(
             "[yellow]simulated:[/] the paper's figures are of real fabrics, and stand here to be compared in order only"
         )

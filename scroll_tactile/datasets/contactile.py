@@ -176,7 +176,7 @@ def _named(
             raise DatasetError(
                 f"expected {path} to be of protocol 1 (robot) or 2 (hand); it says {found['protocol']!r}"
             )
-        order = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", below) if part]
+        order = [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", below) if part]
         yield found["fabric"], protocol, order, path
 
 

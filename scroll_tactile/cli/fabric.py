@@ -1,4 +1,4 @@
-"""`scroll-tactile fabric letters` and `scroll-tactile fabric slide`."""
+"""`scroll-tactile fabric`: letters and slides here, `contactile` in a module of its own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from scroll_tactile.cli.contactile import contactile
 from scroll_tactile.cli.results import origin, parse_folds, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import fabric_slide, letter_spike
@@ -19,8 +20,11 @@ from scroll_tactile.pipelines.fabric import FIGURES, Letters, SlideTransfer, sum
 __all__ = ["fabric"]
 
 fabric = typer.Typer(
-    cls=Commands, no_args_is_help=True, help="What a touch is made of, on real data: letters of dots, slid fabrics."
+    cls=Commands,
+    no_args_is_help=True,
+    help="What a touch is made of: fabrics, and letters of dots; fabrics slid over otherwise.",
 )
+fabric.command()(contactile)
 
 RunFolder = Annotated[
     Path | None, typer.Option(help="Note finished parts in this folder; an interrupted run goes on from it.")

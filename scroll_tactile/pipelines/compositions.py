@@ -25,9 +25,10 @@ def score(
 ) -> dict[str, Any]:
     """Figures of N compositions of K constituents.
 
-    names: K. truth: whether each is there, shape (N, K). presence: the probability that was said, shape (N, K); said
-    to be there is what has more than a half, and NaN, said of a constituent without a head, counts as "not there".
-    shares: true and said ones, each of shape (N, K), NaN where there is none.
+    names: K. truth: whether each is there, shape (N, K), NaN where that is unknown, which counts for nothing. presence:
+    the probability that was said, shape (N, K); said to be there is what has more than a half, and NaN, said of a
+    constituent without a head, counts as "not there". shares: true and said ones, each of shape (N, K), NaN where there
+    is none.
 
     "score": the paper's, the mean over the constituents of correct presence (of six, each false positive or negative
     costs a sixth). "exact": the share of compositions without any. "always": the score of saying of each constituent
@@ -35,25 +36,29 @@ def score(
     absolute. "constituents": of each, how often it is there, correct, precision and recall (None without any said, or
     any there), and how often nothing was said.
 
-    Raises InputError where the shapes differ, or there are none.
+    Raises InputError where the shapes differ, there are none, or of a constituent or a composition nothing is known.
     """
-    there, chances = np.asarray(truth, dtype=bool), np.asarray(presence, dtype=np.float64)
-    if there.shape != chances.shape or there.ndim != 2 or there.shape[1] != len(names) or not there.size:
+    true, chances = np.asarray(truth, dtype=np.float64), np.asarray(presence, dtype=np.float64)
+    if true.shape != chances.shape or true.ndim != 2 or true.shape[1] != len(names) or not true.size:
         raise InputError(
-            f"expected truth and presence of shape (N, {len(names)}), N ≥ 1; came {there.shape} and {chances.shape}"
+            f"expected truth and presence of shape (N, {len(names)}), N ≥ 1; came {true.shape} and {chances.shape}"
         )
-    said = chances > 0.5  # False for NaN
-    right, told = said == there, np.isfinite(chances)
-    often = there.mean(axis=0)
+    known = np.isfinite(true)
+    if not known.any(axis=0).all() or not known.any(axis=1).all():
+        raise InputError("expected something to be known of every constituent and every composition that is scored")
+    there, said = true > 0, chances > 0.5  # False for NaN
+    right, told = said == there, np.isfinite(chances) & known
+    often = (there & known).sum(axis=0) / known.sum(axis=0)
     figures: dict[str, Any] = {
         "tested": len(there),
-        "score": float(right.mean()),
-        "exact": float(right.all(axis=1).mean()),
-        "always": float(np.maximum(often, 1 - often).mean()),
+        "score": float(right[known].mean()),
+        "exact": float((right | ~known).all(axis=1).mean()),
+        "always": float(np.average(np.maximum(often, 1 - often), weights=known.sum(axis=0))),
         "calibration_error": None,
         "share_error": None,
         "constituents": {
-            name: _of_one(there[:, at], said[:, at]) | {"unsaid": int((~told[:, at]).sum())}
+            name: _of_one(there[known[:, at], at], said[known[:, at], at])
+            | {"unsaid": int((known[:, at] & ~told[:, at]).sum())}
             for at, name in enumerate(names)
         },
     }
@@ -78,11 +83,12 @@ def _of_one(there: BoolArray, said: BoolArray) -> dict[str, float | None]:
 
 
 def score_compositions(
-    names: Sequence[str], truth: Sequence[Mapping[str, float | bool]], said: Sequence[Composition]
+    names: Sequence[str], truth: Sequence[Mapping[str, float | bool | None]], said: Sequence[Composition]
 ) -> dict[str, Any]:
     """Figures, as `score` gives them, of what a learner said; truth: presence or share of each constituent, N times.
 
-    A constituent that the truth does not name is not there. Raises InputError where the lengths differ.
+    A constituent that the truth does not name is not there, and one that it gives as None is unknown. Raises
+    InputError where the lengths differ.
     """
     if len(truth) != len(said):
         raise InputError(f"expected as many truths as compositions; came {len(truth)} and {len(said)}")
@@ -94,8 +100,11 @@ def score_compositions(
     presence = [[told(one, name, "presence") for name in names] for one in said]
     guessed = [[told(one, name, "share") for name in names] for one in said]
     masses = [any(isinstance(value, float) for value in one.values()) for one in truth]
-    shares = [
-        [float(one.get(name, 0.0)) if mass else float("nan") for name in names]
-        for one, mass in zip(truth, masses, strict=True)
-    ]
-    return score(names, [[bool(one.get(name, 0)) for name in names] for one in truth], presence, (shares, guessed))
+
+    def known(one: Mapping[str, float | bool | None], name: str) -> float:
+        value = one.get(name, 0.0)
+        return float("nan") if value is None else float(value)
+
+    there = [[known(one, name) for name in names] for one in truth]
+    shares = [true if mass else [float("nan")] * len(names) for true, mass in zip(there, masses, strict=True)]
+    return score(names, there, presence, (shares, guessed))

@@ -18,11 +18,13 @@ from scroll_tactile.embeddings.runtimes import full_float32
 from scroll_tactile.errors import InputError, TrainingError
 from scroll_tactile.training import Progress
 
-__all__ = ["AT_ONCE", "Batches", "Course", "Epoch", "Precision", "descend", "logits_of", "seeded"]
+__all__ = ["AT_ONCE", "Batches", "Course", "Epoch", "Loss", "Precision", "descend", "logits_of", "seeded"]
 
 Precision = Literal["float32", "bfloat16"]
 
 Fetch = Callable[[npt.NDArray[np.intp]], torch.Tensor]
+Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""(outputs, targets) of a batch → their mean loss in nats, a scalar."""
 AT_ONCE = 64  # images in a batch that nothing is learned from
 
 
@@ -71,7 +73,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Epoch:
-    """What one epoch came to: mean cross-entropies in nats, and the rate that it was trained at."""
+    """What one epoch came to: mean losses in nats, and the rate that it was trained at."""
 
     loss: float
     validation_loss: float | None
@@ -80,7 +82,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Batches:
-    """Touches to learn from: `fetch` gives the images at some of N places, `targets` are their classes, (N,)."""
+    """Touches to learn from: `fetch` gives the images at some of N places, `targets` is what the loss takes."""
 
     fetch: Fetch
     targets: torch.Tensor
@@ -113,11 +115,13 @@ def descend(
     random: np.random.Generator,
     progress: Progress,
     watch: Callable[[], object],
+    criterion: Loss = functional.cross_entropy,
 ) -> list[Epoch]:
-    """Train a network in place: cross-entropy, SGD, a rate that falls on plateaus; what each epoch came to.
+    """Train a network in place by SGD, at a rate that falls on plateaus; what each epoch came to.
 
     held: the validation; where there is none the plateaus are those of the training's own loss. In the end the
-    network has the weights of the epoch of least validation loss. watch: called after each epoch.
+    network has the weights of the epoch of least validation loss. watch: called after each epoch. criterion: the loss;
+    of classes, by default.
 
     Raises TrainingError where the loss is not finite, or the device has no memory left.
     """
@@ -127,8 +131,8 @@ def descend(
     best, state = math.inf, None
     for at in range(course.epochs):
         rate = float(optimiser.param_groups[0]["lr"])
-        loss = _epoch(net, taught, optimiser, course, random, at + 1)
-        validation = None if held is None else _loss(net, held)
+        loss = _epoch(net, taught, optimiser, course, random, at + 1, criterion)
+        validation = None if held is None else _loss(net, held, criterion)
         epochs.append(Epoch(loss, validation, rate))
         judged = loss if validation is None else validation
         if judged < best:
@@ -148,6 +152,7 @@ def _epoch(
     course: Course,
     random: np.random.Generator,
     number: int,
+    criterion: Loss,
 ) -> float:
     """Mean loss of one pass in a random order."""
     net.train()
@@ -161,7 +166,7 @@ def _epoch(
             half = course.precision == "bfloat16"
             with torch.autocast(targets.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
                 logits = net(taught.fetch(places))
-            loss = functional.cross_entropy(logits.float(), targets)
+            loss = criterion(logits.float(), targets)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
@@ -179,11 +184,11 @@ def _epoch(
     return mean
 
 
-def _loss(net: nn.Module, held: Batches) -> float:
-    """Mean cross-entropy on touches that nothing is learned from."""
+def _loss(net: nn.Module, held: Batches, criterion: Loss) -> float:
+    """Mean loss on touches that nothing is learned from."""
     places = np.arange(len(held.targets))
     logits = torch.cat([logits_of(net, held.fetch(places[at : at + AT_ONCE])) for at in range(0, len(places), AT_ONCE)])
-    return float(functional.cross_entropy(logits.double(), held.targets))
+    return float(criterion(logits.double(), held.targets))
 
 
 def logits_of(net: nn.Module, images: torch.Tensor) -> torch.Tensor:

@@ -118,9 +118,13 @@ class ResNetClassifier(nn.Module):
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Logits (B, materials)."""
-        last: torch.Tensor = self.net(to_planes(images))[-1]
-        logits: torch.Tensor = self.head(functional.adaptive_avg_pool2d(last, 1).flatten(1))
+        logits: torch.Tensor = self.head(self.features(images))
         return logits
+
+    def features(self, images: torch.Tensor) -> torch.Tensor:
+        """What the linear layer reads, (B, d)."""
+        last: torch.Tensor = self.net(to_planes(images))[-1]
+        return functional.adaptive_avg_pool2d(last, 1).flatten(1)
 
     def prepare(self, batches: Iterable[torch.Tensor]) -> None:
         """Be told of all images that will be learned from; of a trained network the statistics become theirs.

@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
+from torch.nn import functional
 
 from scroll_tactile.augment import Augmentation
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.passes import Labelled
-from scroll_tactile.pipelines.systems.descent import AT_ONCE, Batches, Course, Epoch, descend, logits_of, seeded
+from scroll_tactile.pipelines.systems.descent import AT_ONCE, Batches, Course, Epoch, Loss, descend, logits_of, seeded
 from scroll_tactile.pipelines.systems.inputs import Image, one_width, picture, usual_columns
 from scroll_tactile.pipelines.systems.networks import ResNetClassifier
 from scroll_tactile.pipelines.systems.protocol import Watch, require_touches, silent, unwatched
@@ -22,7 +23,7 @@ from scroll_tactile.training import Progress
 __all__ = ["Make", "Trained", "require_device"]
 
 Make = Callable[[tuple[int, ...], int, int], nn.Module]
-"""(shape of an input, materials, seed) → a new network, which may draw from torch's generator."""
+"""(shape of an input, outputs, seed) → a new network, which may draw from torch's generator."""
 
 
 class Trained:
@@ -33,7 +34,12 @@ class Trained:
     paper's table.
 
     epochs: what each epoch of the last fit came to. Raises InputError for a device that is not there.
+
+    An output is a material, trained by cross-entropy; a subclass has other targets, outputs and loss (`_targets`,
+    `_outputs`, `_criterion`).
     """
+
+    _criterion: Loss = staticmethod(functional.cross_entropy)
 
     def __init__(
         self,
@@ -77,11 +83,11 @@ class Trained:
             held = self._batches([picture(one) for _, one in validation], [name for name, _ in validation], columns)
         with seeded(seed, self._device):
             shape = self._read(one_width(images[0], columns)).shape
-            self._net = self._make(shape, len(self._names), seed).to(self._device)
+            self._net = self._make(shape, self._outputs, seed).to(self._device)
             if isinstance(self._net, ResNetClassifier):
                 places = np.array_split(np.arange(len(images)), -(-len(images) // AT_ONCE))
                 self._net.prepare(taught.fetch(some) for some in places)
-            self.epochs = descend(self._net, taught, held, self.course, random, progress, watch)
+            self.epochs = descend(self._net, taught, held, self.course, random, progress, watch, self._criterion)
 
     @property
     def network(self) -> nn.Module:
@@ -92,17 +98,31 @@ class Trained:
 
     def predict(self, streams: Sequence[Stream]) -> list[str]:
         """See `System.predict`."""
-        network = self.network
-        said = [""] * len(streams)
+        return [self._names[place] for place in self.outputs(streams).argmax(dim=1).tolist()]
+
+    def outputs(self, streams: Sequence[Stream], of: nn.Module | None = None) -> torch.Tensor:
+        """What the network, or a part `of` it, gives for N streams of any length, (N, outputs), on the processor.
+
+        Raises InputError before `fit`.
+        """
+        network = self.network if of is None else of
+        given: list[torch.Tensor] = [torch.empty(0)] * len(streams)
         sizes: dict[tuple[int, ...], list[int]] = {}
         images = [picture(stream) for stream in streams]
         for at, image in enumerate(images):
             sizes.setdefault(image.shape, []).append(at)
         for members in sizes.values():
             inputs = torch.from_numpy(np.stack([self._read(images[at]) for at in members])).to(self._device)
-            for at, place in zip(members, logits_of(network, inputs).argmax(dim=1).tolist(), strict=True):
-                said[at] = self._names[place]
-        return said
+            for at, row in zip(members, logits_of(network, inputs).cpu(), strict=True):
+                given[at] = row
+        return torch.stack(given) if given else torch.empty(0, 1)
+
+    @property
+    def _outputs(self) -> int:
+        return len(self._names)
+
+    def _targets(self, materials: Sequence[str]) -> torch.Tensor:
+        return torch.tensor([self._names.index(name) for name in materials], device=self._device)
 
     def _batches(
         self,
@@ -112,7 +132,7 @@ class Trained:
         random: np.random.Generator | None = None,
     ) -> Batches:
         """Images of one width on the device; augmented at each look where there is a generator to draw from."""
-        targets = torch.tensor([self._names.index(name) for name in materials], device=self._device)
+        targets = self._targets(materials)
         if random is not None and self._augmentation is not None:
             augmentation = self._augmentation
 

@@ -22,6 +22,8 @@ from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.pipelines.few_touches import COUNTS
 from scroll_tactile.pipelines.transfer import TRAINING, TaskTransfer, rows, some_frames
+from scroll_tactile.pipelines.transfer_sensors import WAYS, SensorTransfer
+from scroll_tactile.pipelines.transfer_sensors import rows as sensor_rows
 from scroll_tactile.plots_transfer import draw_transfer
 
 __all__ = ["transfer"]
@@ -113,6 +115,57 @@ def tasks(
         say(f"plot: {plot}")
 
 
+@transfer.command()
+def sensors(
+    data: Annotated[Path, typer.Option(help="Folder with biotac_slide_20_50/ in it.")],
+    folds: Folds = "all",
+    ways: Annotated[str | None, typer.Option(help=f"Which ways, of {', '.join(WAYS)}.")] = None,
+    counts: Annotated[str, typer.Option(help="Touches of each material of the new sensor; 0: none.")] = "0,1,2,5",
+    draws: Annotated[int, typer.Option(min=1, help="Of these touches.")] = 5,
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="The first fold, one draw: for a look.")] = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Learn twenty materials with BioTac and be asked with RoboSkin, and the reverse, after few touches or none."""
+    require_folders(json)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        pair = (load(data, "biotac", seed), load(data, "roboskin", seed))
+        study = SensorTransfer(
+            pair,
+            ways=tuple(WAYS) if ways is None else tuple(dict.fromkeys(part.strip() for part in ways.split(","))),
+            folds=(0,) if quick else tuple(parse_folds(folds or "all", pair[0])),
+            counts=_counts(counts),
+            draws=1 if quick else draws,
+            seed=seed,
+            folder=run,
+        )
+        results = list(study.run(progress))
+        progress("how far the sensors agree", 0, 1)
+        agreement = study.agreement()
+    found = sensor_rows(results)
+    for direction in dict.fromkeys(row["direction"] for row in found):
+        mine = [row for row in found if row["direction"] == direction]
+        title = f"{direction}: right, after so many touches of each material with the new sensor; {study.draws} draws"
+        table = Table("way", *map(str, study.counts), title=title)
+        for row in mine:
+            points = [row["points"].get(str(count)) for count in study.counts]
+            table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
+        console().print(table)
+    chance = 1 / len(set(pair[0].materials))
+    told = ", ".join(f"{one['correlation']:+.2f} in {kind} ({one['chance']:.2f})" for kind, one in agreement.items())
+    say(f"chance: {percent(chance)}. Which materials feel alike, one sensor against the other: {told} (by chance)")
+    if json is not None:
+        words = ["scroll-tactile", "transfer", "sensors", "--data", "DATA"]
+        words += ["--folds", ",".join(map(str, study.folds)), "--ways", ",".join(study.ways), "--counts", counts]
+        words += ["--draws", str(study.draws), "--seed", str(seed)] + (["--run", "RUN"] if run else [])
+        cells = {cell.key: figures for cell, figures in results}
+        measured = {"folds": study.folds, "chance": chance, "agreement": agreement, "rows": found, "cells": cells}
+        write_json(json, _made(words, pair) | study.plan | measured)
+        say(f"figures: {json}")
+
+
 def _counts(asked: str) -> tuple[int, ...]:
     try:
         return tuple(sorted({int(part) for part in asked.split(",")}))
@@ -140,9 +193,12 @@ def _show(name: str, found: Sequence[Mapping[str, Any]], study: TaskTransfer) ->
     table = Table("embedding", *counts, title=title)
     for row in found:
         mark = " (its own)" if row["tuned on"] == name else ""
-        cells = [f"{percent(row['points'][k]['mean'])} ± {100 * row['points'][k]['sd']:.1f}" for k in counts]
-        table.add_row(row["system"] + mark, *cells)
+        table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
     console().print(table)
+
+
+def _cell(point: Mapping[str, float]) -> str:
+    return f"{percent(point['mean'])} ± {100 * point['sd']:.1f}"
 
 
 def _made(words: Sequence[str], read: Sequence[Recordings]) -> dict[str, Any]:

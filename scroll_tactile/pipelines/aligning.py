@@ -83,7 +83,8 @@ class Known:
         about = self.means - self.means.mean(axis=0)
         with one_thread():
             products: FloatArray = about @ cho_solve(cho_factor(self.scatter), about.T)
-        return np.divide(products, np.diagonal(products).mean())
+        likeness: FloatArray = products / np.diagonal(products).mean()
+        return likeness
 
 
 class _Touches:

@@ -79,11 +79,15 @@ class Known:
 
     @cached_property
     def likeness(self) -> FloatArray:
-        """Products of the means about their centre where the scatter is white, of mean diagonal 1, (C, C)."""
+        """Cosines between the means, about their centre, where the scatter is white, (C, C).
+
+        Not products: mat7 lies so far from all others that it alone would make two sensors agree.
+        """
         about = self.means - self.means.mean(axis=0)
         with one_thread():
             products: FloatArray = about @ cho_solve(cho_factor(self.scatter), about.T)
-        likeness: FloatArray = products / np.diagonal(products).mean()
+        lengths = np.sqrt(np.diagonal(products))
+        likeness: FloatArray = products / np.maximum(np.outer(lengths, lengths), 1e-12)
         return likeness
 
 
@@ -212,8 +216,8 @@ class MapsAcross(_Touches):
 class SharesPrior(_Touches):
     """The new sensor's means drawn towards each other as the old sensor's materials lie.
 
-    The means have the prior N(0, K ⊗ Σ), K = r G + (1 − r) I, with G the old sensor's means' products in the space
-    where their scatter is white, of mean diagonal 1; given k touches they are K (K + s/k I)⁻¹ of what was felt.
+    The means have the prior N(0, K ⊗ Σ), K = r G + (1 − r) I, with G the cosines between the old sensor's means where
+    their scatter is white; given k touches they are K (K + s/k I)⁻¹ of what was felt.
 
     likeness: r, from 0 (materials lie apart alike, the control) to 1.
     """

@@ -121,8 +121,8 @@ class SensorTransfer:
     def agreement(self) -> dict[str, dict[str, float]]:
         """How far the sensors agree on which materials feel alike: of spectra and kernels, all touches.
 
-        correlation: over pairs of materials, of the products of their means where the scatter within is white; chance:
-        its standard deviation where one sensor's materials are exchanged at random.
+        correlation: over pairs of materials, of the cosines between their means where the scatter within is white;
+        chance: its standard deviation where one sensor's materials are exchanged at random.
         """
         found = {}
         random = np.random.default_rng([self.seed, 1])

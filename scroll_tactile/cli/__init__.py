@@ -15,6 +15,7 @@ from scroll_tactile.cli.reproduce import reproduce
 from scroll_tactile.cli.robustness import robustness
 from scroll_tactile.cli.schedules import schedules
 from scroll_tactile.cli.terminal import Commands
+from scroll_tactile.cli.transfer import transfer
 from scroll_tactile.cli.upkeep import memory
 
 __all__ = ["app"]
@@ -33,3 +34,4 @@ app.add_typer(memory, name="memory")
 app.add_typer(bench, name="bench")
 app.add_typer(reproduce, name="reproduce")
 app.add_typer(fabric, name="fabric")
+app.add_typer(transfer, name="transfer")

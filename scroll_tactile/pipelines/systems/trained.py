@@ -31,7 +31,7 @@ class Trained:
 
     make: a new network for each fit. read: from an image to what the network reads, both (…, T). course: of the
     training. device: torch's name of one. augmentation: of every touch in every epoch, drawn anew; none as in the
-    paper's table.
+    paper's table. view: a stream's image; `tactile_image` for a network that is to be an embedding afterwards.
 
     epochs: what each epoch of the last fit came to. Raises InputError for a device that is not there.
 
@@ -49,12 +49,13 @@ class Trained:
         course: Course | None = None,
         device: str = "cpu",
         augmentation: Augmentation | None = None,
+        view: Callable[[Stream], Image] = picture,
     ) -> None:
         require_device(device)
         self.name = name
         self.course = course or Course()
         self.epochs: list[Epoch] = []
-        self._make, self._read = make, read
+        self._make, self._read, self._view = make, read, view
         self._device = device
         self._augmentation = augmentation
         self._names: list[str] = []
@@ -74,13 +75,13 @@ class Trained:
         Raises TrainingError where the loss is not finite or the device has no memory left.
         """
         self._names = require_touches(streams, materials, validation)
-        images = [picture(stream) for stream in streams]
+        images = [self._view(stream) for stream in streams]
         columns = usual_columns(images)
         random = np.random.default_rng([seed, 0])
         taught = self._batches(images, materials, columns, random if self._augmentation is not None else None)
         held = None
         if validation:
-            held = self._batches([picture(one) for _, one in validation], [name for name, _ in validation], columns)
+            held = self._batches([self._view(one) for _, one in validation], [name for name, _ in validation], columns)
         with seeded(seed, self._device):
             shape = self._read(one_width(images[0], columns)).shape
             self._net = self._make(shape, self._outputs, seed).to(self._device)
@@ -108,7 +109,7 @@ class Trained:
         network = self.network if of is None else of
         given: list[torch.Tensor] = [torch.empty(0)] * len(streams)
         sizes: dict[tuple[int, ...], list[int]] = {}
-        images = [picture(stream) for stream in streams]
+        images = [self._view(stream) for stream in streams]
         for at, image in enumerate(images):
             sizes.setdefault(image.shape, []).append(at)
         for members in sizes.values():

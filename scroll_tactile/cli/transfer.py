@@ -1,0 +1,211 @@
+"""`scroll-tactile transfer`: what is learned with one task or sensor, and used with another."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+from rich.table import Table
+
+from scroll_tactile import plots
+from scroll_tactile.cli.results import origin, parse_folds, require_folders
+from scroll_tactile.cli.studies import Device, Epochs, Folds, InPrecision, Json, Plot, PrecisionChoice, Run, Seed, Where
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.datasets import Recordings, fabric_slide, letter_spike, physiclear
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.pipelines.few_touches import COUNTS
+from scroll_tactile.pipelines.transfer import TRAINING, TaskTransfer, rows, some_frames
+from scroll_tactile.pipelines.transfer_sensors import WAYS, SensorTransfer
+from scroll_tactile.pipelines.transfer_sensors import rows as sensor_rows
+from scroll_tactile.plots_transfer import draw_transfer
+
+__all__ = ["transfer"]
+
+transfer = typer.Typer(
+    cls=Commands, no_args_is_help=True, help="Learn with one task or sensor, and be asked with another."
+)
+
+
+def _slides(data: Path, seed: int) -> Recordings:
+    """FabricSlide over distance, as ratios: how fast and how hard it was slid would tell nothing of the fabric."""
+    slides = fabric_slide.load(data, seed=seed).recordings
+    return replace(slides, sensor=fabric_slide.CPM_RATIOS, streams=[fabric_slide.ratios(one) for one in slides.streams])
+
+
+SETS: dict[str, Callable[[Path, int], Recordings]] = {
+    "biotac-20": lambda data, seed: load(data, "biotac", seed),
+    "roboskin-20": lambda data, seed: load(data, "roboskin", seed),
+    "letter-spike": letter_spike.load,
+    "fabric-slide": _slides,
+    "gelsight": physiclear.load,
+}
+QUICK_SETS = ("biotac-20", "roboskin-20")
+QUICK = {"epochs": 3, "draws": 2, "every": 2}
+EPOCHS, DRAWS = 6, 3
+
+Data = Annotated[Path, typer.Option(help="Folder with the data sets' folders, as published, in it.")]
+
+
+@transfer.command()
+def tasks(
+    data: Data,
+    weights: Annotated[str, typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18.")],
+    sets: Annotated[str | None, typer.Option(help=f"Which data sets, two or more of {', '.join(SETS)}.")] = None,
+    folds: Folds = "0",
+    counts: Annotated[str, typer.Option(help="Touches of each material learned before a test.")] = "1,2,5,10,20",
+    draws: Annotated[int | None, typer.Option(min=1, help="Of the touches that are learned.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Of each video of a camera.")] = 2,
+    epochs: Epochs = None,
+    device: Where = Device.CPU,
+    precision: InPrecision = PrecisionChoice.FLOAT32,
+    seed: Seed = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Two sets, 3 epochs on every second touch, 2 draws: minutes, for a look.")
+    ] = False,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Fine-tune the vision model on each data set, freeze it, and learn few touches of every other with it."""
+    require_folders(json, plot)
+    stops = _counts(counts)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        read = [some_frames(one, frames) for one in _read(sets, data, seed, quick)]
+        study = TaskTransfer(
+            read,
+            weights,
+            folds=tuple(parse_folds(folds or "0", read[0])),
+            counts=stops,
+            draws=draws or (QUICK["draws"] if quick else DRAWS),
+            epochs=epochs or (QUICK["epochs"] if quick else EPOCHS),
+            device=device.value,
+            precision=precision.value,
+            every=QUICK["every"] if quick else 1,
+            seed=seed,
+            folder=run,
+        )
+        results = list(study.run(progress))
+    found = rows(results)
+    for one in read:
+        _show(one.name, [row for row in found if row["dataset"] == one.name], study)
+    trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
+    told = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
+    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {told}")
+    if json is not None:
+        words = ["scroll-tactile", "transfer", "tasks", "--data", "DATA", "--weights", Path(weights).name]
+        words += ["--sets", sets] if sets is not None else []
+        words += ["--folds", ",".join(map(str, study.folds)), "--counts", counts, "--draws", str(study.draws)]
+        words += ["--frames", str(frames), "--epochs", str(study.epochs), "--device", study.device]
+        words += (
+            ["--precision", study.precision, "--seed", str(seed)]
+            + ["--quick"] * quick
+            + (["--run", "RUN"] if run else [])
+        )
+        cells = {cell.key: figures for cell, figures in results}
+        write_json(json, _made(words, read) | study.plan | {"frames": frames, "rows": found, "cells": cells})
+        say(f"figures: {json}")
+    if plot is not None and not plots.available():
+        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+    elif plot is not None:
+        draw_transfer(plot, found)
+        say(f"plot: {plot}")
+
+
+@transfer.command()
+def sensors(
+    data: Annotated[Path, typer.Option(help="Folder with biotac_slide_20_50/ in it.")],
+    folds: Folds = "all",
+    ways: Annotated[str | None, typer.Option(help=f"Which ways, of {', '.join(WAYS)}.")] = None,
+    counts: Annotated[str, typer.Option(help="Touches of each material of the new sensor; 0: none.")] = "0,1,2,5",
+    draws: Annotated[int, typer.Option(min=1, help="Of these touches.")] = 5,
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="The first fold, one draw: for a look.")] = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Learn twenty materials with BioTac and be asked with RoboSkin, and the reverse, after few touches or none."""
+    require_folders(json)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        pair = (load(data, "biotac", seed), load(data, "roboskin", seed))
+        study = SensorTransfer(
+            pair,
+            ways=tuple(WAYS) if ways is None else tuple(dict.fromkeys(part.strip() for part in ways.split(","))),
+            folds=(0,) if quick else tuple(parse_folds(folds or "all", pair[0])),
+            counts=_counts(counts),
+            draws=1 if quick else draws,
+            seed=seed,
+            folder=run,
+        )
+        results = list(study.run(progress))
+        progress("how far the sensors agree", 0, 1)
+        agreement = study.agreement()
+    found = sensor_rows(results)
+    for direction in dict.fromkeys(row["direction"] for row in found):
+        mine = [row for row in found if row["direction"] == direction]
+        title = f"{direction}: right, after so many touches of each material with the new sensor; {study.draws} draws"
+        table = Table("way", *map(str, study.counts), title=title)
+        for row in mine:
+            points = [row["points"].get(str(count)) for count in study.counts]
+            table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
+        console().print(table)
+    chance = 1 / len(set(pair[0].materials))
+    told = ", ".join(f"{one['correlation']:+.2f} in {kind} ({one['chance']:.2f})" for kind, one in agreement.items())
+    say(f"chance: {percent(chance)}. Which materials feel alike, one sensor against the other: {told} (by chance)")
+    if json is not None:
+        words = ["scroll-tactile", "transfer", "sensors", "--data", "DATA"]
+        words += ["--folds", ",".join(map(str, study.folds)), "--ways", ",".join(study.ways), "--counts", counts]
+        words += ["--draws", str(study.draws), "--seed", str(seed)] + (["--run", "RUN"] if run else [])
+        cells = {cell.key: figures for cell, figures in results}
+        measured = {"folds": study.folds, "chance": chance, "agreement": agreement, "rows": found, "cells": cells}
+        write_json(json, _made(words, pair) | study.plan | measured)
+        say(f"figures: {json}")
+
+
+def _counts(asked: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted({int(part) for part in asked.split(",")}))
+    except ValueError:
+        usual = ",".join(map(str, COUNTS))
+        raise InputError(f"expected --counts as numbers such as {usual}; came {asked!r}") from None
+
+
+def _read(asked: str | None, data: Path, seed: int, quick: bool) -> list[Recordings]:
+    names = list(dict.fromkeys(part.strip() for part in asked.split(","))) if asked is not None else [*SETS]
+    if asked is None and quick:
+        names = [*QUICK_SETS]
+    if strange := [name for name in names if name not in SETS]:
+        raise InputError(f"expected --sets out of {', '.join(SETS)}; came {', '.join(map(repr, strange))}")
+    try:
+        return [SETS[name](data, seed) for name in names]
+    except DatasetError as error:
+        error.add_note(f"Or name the sets that are there: --sets {','.join(QUICK_SETS)}")
+        raise
+
+
+def _show(name: str, found: Sequence[Mapping[str, Any]], study: TaskTransfer) -> None:
+    title = f"{name}: right, after so many touches of each material; {study.draws} draws, folds {study.folds}"
+    counts = list(found[0]["points"])
+    table = Table("embedding", *counts, title=title)
+    for row in found:
+        mark = " (its own)" if row["tuned on"] == name else ""
+        table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
+    console().print(table)
+
+
+def _cell(point: Mapping[str, float]) -> str:
+    return f"{percent(point['mean'])} ± {100 * point['sd']:.1f}"
+
+
+def _made(words: Sequence[str], read: Sequence[Recordings]) -> dict[str, Any]:
+    threads = {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    sensors = {one.name: one.sensor.model_dump(mode="json") for one in read}
+    return origin(shlex.join(words)) | threads | {"sensors": sensors}

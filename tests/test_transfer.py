@@ -182,6 +182,7 @@ class TestTasks:
             ({"folds": ()}, "one fold or more"),
             ({"seed": -1}, "a seed of 0 or more"),
             ({"rate": 0.0}, "a rate above 0"),
+            ({"sources": ("patch", "felt")}, r"expected sources out of .*; came \['felt'\]"),
         ],
     )
     def test_what_cannot_be_is_refused(self, study, change, words):
@@ -352,25 +353,14 @@ class TestCommands:
         words = ["transfer", "tasks", "--data", tmp_path, "--weights", weights, "--counts", "1,2", "--draws", 1]
         out = tmp_path / "tasks.json"
         picture = tmp_path / "tasks.png"
-        result = run(
-            *words,
-            "--epochs",
-            1,
-            "--precision",
-            "bfloat16",
-            "--run",
-            tmp_path / "run",
-            "--json",
-            out,
-            "--plot",
-            picture,
-        )
+        words += ["--sources", "patch", "--epochs", 1, "--precision", "bfloat16", "--run", tmp_path / "run"]
+        result = run(*words, "--json", out, "--plot", picture)
         assert result.exit_code == 0, result.output
         assert "vision tuned on patch" in result.output.replace("\n", " ") or "tuned on" in result.output
         written = json.loads(out.read_text())
         assert written["precision"] == "bfloat16"
         assert written["command"].startswith("scroll-tactile transfer tasks --data DATA --weights random.pth")
-        assert len(written["rows"]) == 8
+        assert len(written["rows"]) == 6  # two sets asked about: kernels, vision, and vision tuned on one of them
         assert picture.stat().st_size > 1000
         text = tables_transfer.tasks(lambda name: written)
         assert text.count("| **") == 0
@@ -394,6 +384,7 @@ class TestCommands:
             (["--counts", "a few"], "expected --counts as numbers"),
             (["--folds", "one"], "expected --folds all"),
             (["--sets", "patch"], "two data sets or more"),
+            (["--sources", "felt"], "expected --sources out of patch, strip"),
             (["--folds", "8"], "expected a fold of patch"),
         ],
     )

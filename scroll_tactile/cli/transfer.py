@@ -58,6 +58,7 @@ def tasks(
     data: Data,
     weights: Annotated[str, typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18.")],
     sets: Annotated[str | None, typer.Option(help=f"Which data sets, two or more of {', '.join(SETS)}.")] = None,
+    sources: Annotated[str | None, typer.Option(help="Which of them to fine-tune on; all unless given.")] = None,
     folds: Folds = "0",
     counts: Annotated[str, typer.Option(help="Touches of each material learned before a test.")] = "1,2,5,10,20",
     draws: Annotated[int | None, typer.Option(min=1, help="Of the touches that are learned.")] = None,
@@ -78,7 +79,8 @@ def tasks(
     stops = _counts(counts)
     with progress_bar() as progress:
         progress("reading", 0, 1)
-        read = [some_frames(one, frames) for one in _read(sets, data, seed, quick)]
+        by_name = {name: some_frames(one, frames) for name, one in _read(sets, data, seed, quick).items()}
+        read = [*by_name.values()]
         study = TaskTransfer(
             read,
             weights,
@@ -91,6 +93,7 @@ def tasks(
             every=QUICK["every"] if quick else 1,
             seed=seed,
             folder=run,
+            sources=None if sources is None else _named(sources, by_name),
         )
         results = list(study.run(progress))
     found = rows(results)
@@ -102,6 +105,7 @@ def tasks(
     if json is not None:
         words = ["scroll-tactile", "transfer", "tasks", "--data", "DATA", "--weights", Path(weights).name]
         words += ["--sets", sets] if sets is not None else []
+        words += ["--sources", sources] if sources is not None else []
         words += ["--folds", ",".join(map(str, study.folds)), "--counts", counts, "--draws", str(study.draws)]
         words += ["--frames", str(frames), "--epochs", str(study.epochs), "--device", study.device]
         words += (
@@ -178,14 +182,22 @@ def _counts(asked: str) -> tuple[int, ...]:
         raise InputError(f"expected --counts as numbers such as {usual}; came {asked!r}") from None
 
 
-def _read(asked: str | None, data: Path, seed: int, quick: bool) -> list[Recordings]:
+def _named(asked: str, read: Mapping[str, Recordings]) -> tuple[str, ...]:
+    """What the data sets call themselves that are asked for by their names on the command line."""
+    names = list(dict.fromkeys(part.strip() for part in asked.split(",")))
+    if strange := [name for name in names if name not in read]:
+        raise InputError(f"expected --sources out of {', '.join(read)}; came {', '.join(map(repr, strange))}")
+    return tuple(read[name].name for name in names)
+
+
+def _read(asked: str | None, data: Path, seed: int, quick: bool) -> dict[str, Recordings]:
     names = list(dict.fromkeys(part.strip() for part in asked.split(","))) if asked is not None else [*SETS]
     if asked is None and quick:
         names = [*QUICK_SETS]
     if strange := [name for name in names if name not in SETS]:
         raise InputError(f"expected --sets out of {', '.join(SETS)}; came {', '.join(map(repr, strange))}")
     try:
-        return [SETS[name](data, seed) for name in names]
+        return {name: SETS[name](data, seed) for name in names}
     except DatasetError as error:
         error.add_note(f"Or name the sets that are there: --sets {','.join(QUICK_SETS)}")
         raise

@@ -48,7 +48,8 @@ Tensors = Mapping[str, torch.Tensor]
 class TaskTransfer:
     """Which embeddings are fine-tuned on what, and how they are tried.
 
-    sets: of different names, two or more; each is both trained on and asked about. weights: of the pre-trained ResNet.
+    sets: of different names, two or more, all asked about. sources: the names of those fine-tuned on; all unless given.
+    weights: of the pre-trained ResNet.
     folds: tested, of each set. counts: touches of each material learned before a test; draws: of those touches.
     epochs, rate: of a fine-tuning; device: where it runs; precision: see `Course`. every: learn every
     so many recordings only when fine-tuning. seed: of all that is drawn.
@@ -69,11 +70,14 @@ class TaskTransfer:
     every: int = 1
     seed: int = 0
     folder: Path | None = None
+    sources: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         names = [one.name for one in self.sets]
         if len(set(names)) < max(2, len(names)):
             raise InputError(f"expected two data sets or more, of different names; came {names}")
+        if strange := sorted(set(self.sources or ()) - set(names)):
+            raise InputError(f"expected sources out of {names}; came {strange}")
         if not self.folds or not self.counts or min(self.counts) < 1 or self.draws < 1 or self.every < 1:
             raise InputError(
                 "expected one fold or more, counts of 1 touch or more, 1 draw or more and every 1 or more; came "
@@ -91,7 +95,7 @@ class TaskTransfer:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """All that each figure depends on, beside the data; sets and folds can be added to a run later."""
+        """All that each figure depends on, beside the data; sets, sources and folds can be added to a run later."""
         names = ("counts", "draws", "epochs", "rate", "device", "precision", "every", "seed")
         options = {name: getattr(self, name) for name in names}
         return {"run": "transfer tasks", **options, "weights": weights_digest(self.weights)}
@@ -102,7 +106,7 @@ class TaskTransfer:
         names = [one.name for one in self.sets]
         for fold in self.folds:
             found += [Cell(name, fold, system) for system in ("kernels", "vision") for name in names]
-            for source in names:
+            for source in names if self.sources is None else self.sources:
                 found.append(Cell(source, fold, TRAINING))
                 found += [Cell(name, fold, TUNED + source) for name in names]
         return found

@@ -44,7 +44,7 @@ def letters(
     folds: Annotated[str, typer.Option(help='Which folds of known letters: "all", or numbers such as 0,1.')] = "all",
     groups: Annotated[int, typer.Option(min=2, max=27, help="The letters are left out in so many groups.")] = 9,
     seed: Annotated[int, typer.Option(min=0, help="Deals presses into folds and letters into groups.")] = 0,
-    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 2000,
+    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 3000,
     json: JsonFile = None,
     run: RunFolder = None,
 ) -> None:

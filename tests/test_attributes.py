@@ -97,4 +97,3 @@ def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
     assert set(found["sets"]["roboskin-20"]["means"]["shaking"]) == {"ours", "untold", "trees", "always"}
     assert found["command"].startswith("scroll-tactile fabric attributes --data")
     assert "gelsight" in refused(*words, "--sets", "gelsight")
-    assert "Get it from github.com" in refused()

@@ -22,6 +22,7 @@ LAYERS = [
     {"exemplars", "tuned", "packing", "descriptions", "filling"},
     {"memory", "tuning", "perception"},
     {"model", "identity", "history"},
+    {"heads"},
     {"training", "following", "composing"},
     {"finetune", "ledger"},
     {"learner"},

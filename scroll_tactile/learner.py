@@ -364,7 +364,7 @@ class TactileLearner:
     def _fitted_composer(self, model: Model) -> Composer:
         described = self._ledger.described
         if self._composer is None or self._composer[0] is not model or self._composer[1] != described:
-            self._composer = model, described, Composer.of(model, self._memory.pool, self._memory.descriptions)
+            self._composer = model, described, Composer.of(model, self._memory)
         return self._composer[2]
 
     def _mended(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -12,7 +12,7 @@ from scroll_tactile.memory import Memory, give_back_scratch
 from scroll_tactile.ridge.calibration import Calibration, calibrate, calibrate_stage
 from scroll_tactile.ridge.moments import one_thread
 from scroll_tactile.ridge.readouts import ReadoutName
-from scroll_tactile.ridge.selection import Selection, select
+from scroll_tactile.ridge.selection import PENALTIES, Selection, select
 from scroll_tactile.windows import CHANNELS, NOISY, Reading
 
 __all__ = ["Judgement", "Model"]
@@ -51,7 +51,8 @@ class Model:
         scales = statistics.scales
         stages = [memory.reading.judging(length) for length in memory.reading.milestones()]
         with one_thread():
-            chosen = {scale: select(statistics, scale, kind) for scale in scales if scale != CHANNELS}
+            penalties = memory.reading.penalties or PENALTIES
+            chosen = {scale: select(statistics, scale, kind, penalties) for scale in scales if scale != CHANNELS}
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
             noisy = None

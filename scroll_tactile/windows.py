@@ -139,6 +139,7 @@ class Reading:
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
     is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
+    penalties: the λ that the readouts are tried with; none: those of `ridge.selection`.
     """
 
     widths: tuple[int, ...]
@@ -147,19 +148,22 @@ class Reading:
     beginning: bool = False
     noisy: bool = False
     filled: bool = False
+    penalties: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, sensor: Sensor, embedding: Any) -> Reading:
         """As the embedding asks for by its attributes, where it has them.
 
-        These are `partial_windows`, `judged_scales`, `reads_beginnings`, `fills_channels`, and whether there is an
-        `embed_noisy`.
+        These are `partial_windows`, `judged_scales`, `reads_beginnings`, `fills_channels`, `penalties`, and whether
+        there is an `embed_noisy`.
         """
         partial = bool(getattr(embedding, "partial_windows", True))
         beginning = bool(getattr(embedding, "reads_beginnings", False))
         noisy = hasattr(embedding, "embed_noisy")
         filled = bool(getattr(embedding, "fills_channels", False)) and sensor.channels <= embedding.dimension
-        return cls(scales(sensor), partial, getattr(embedding, "judged_scales", "all"), beginning, noisy, filled)
+        judged: Literal["all", "widest"] = getattr(embedding, "judged_scales", "all")
+        penalties = tuple(float(one) for one in getattr(embedding, "penalties", ()))
+        return cls(scales(sensor), partial, judged, beginning, noisy, filled, penalties)
 
     @property
     def scales(self) -> tuple[int, ...]:

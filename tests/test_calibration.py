@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.ridge.calibration import Calibration, _fit_weights, calibrate
+from scroll_tactile.ridge.calibration import Calibration, calibrate, fit_weights
 from scroll_tactile.ridge.pool import Pool, Touch
 from scroll_tactile.ridge.selection import select
 from scroll_tactile.ridge.statistics import Statistics, fold_of
@@ -55,35 +55,35 @@ def logits(touches, classes, seed=0, size=2.0):
 @pytest.mark.parametrize("factor", [0.01, 0.3, 1.0, 30.0])
 def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
     scores, targets = logits(1500, 5)
-    weights = _fit_weights([one * factor for one in scores], targets, np.array([1 / factor]))
+    weights = fit_weights([one * factor for one in scores], targets, np.array([1 / factor]))
     assert weights * factor == pytest.approx(1.0, rel=0.12)
 
 
 def test_overconfident_scores_are_softened_and_timid_ones_sharpened():
     scores, targets = logits(800, 4)
     prior = np.array([1.0])
-    assert _fit_weights([4 * one for one in scores], targets, prior)[0] < 0.5
-    assert _fit_weights([one / 4 for one in scores], targets, prior)[0] > 2
+    assert fit_weights([4 * one for one in scores], targets, prior)[0] < 0.5
+    assert fit_weights([one / 4 for one in scores], targets, prior)[0] > 2
 
 
 def test_scores_that_mislead_get_no_weight():
     scores, targets = logits(800, 4)
-    assert _fit_weights([-one for one in scores], targets, np.array([1.0]))[0] == pytest.approx(0, abs=1e-6)
+    assert fit_weights([-one for one in scores], targets, np.array([1.0]))[0] == pytest.approx(0, abs=1e-6)
 
 
 def test_of_two_scales_the_one_that_knows_is_believed():
     scores, targets = logits(800, 4)
     noise = np.random.default_rng(9).normal(size=(800, 4)) * 2
     both = [np.stack([one[0], other]) for one, other in zip(scores, noise, strict=True)]
-    weights = _fit_weights(both, targets, np.array([0.5, 0.5]))
+    weights = fit_weights(both, targets, np.array([0.5, 0.5]))
     assert weights[0] == pytest.approx(1, rel=0.15)
     assert weights[1] < 0.1
 
 
 def test_without_touches_the_prior_stays_and_a_few_move_it_little():
     prior = np.array([0.05, 0.05])
-    assert _fit_weights([], [], prior).tolist() == prior.tolist()
-    one = _fit_weights([np.array([[3.0, 0.0], [3.0, 0.0]])], [0], prior)
+    assert fit_weights([], [], prior).tolist() == prior.tolist()
+    one = fit_weights([np.array([[3.0, 0.0], [3.0, 0.0]])], [0], prior)
     assert (one > prior).all()
     assert (one < 1000 * prior).all()
 
@@ -91,7 +91,7 @@ def test_without_touches_the_prior_stays_and_a_few_move_it_little():
 def test_touches_with_different_numbers_of_classes_count_together():
     wide, targets = logits(600, 5)
     narrow, others = logits(600, 3, seed=1)
-    weights = _fit_weights(wide + narrow, targets + others, np.array([1.0]))
+    weights = fit_weights(wide + narrow, targets + others, np.array([1.0]))
     assert weights == pytest.approx(1.0, rel=0.15)
 
 

@@ -91,3 +91,26 @@ def test_settings_that_cannot_be_are_refused(settings):
 def test_an_image_of_other_channels_is_refused():
     with pytest.raises(InputError, match=r"shape \(42, T\); came \(41, 9\)"):
         Maps(layout=(6, 7)).embed(np.zeros((41, 9), np.float32))
+
+
+def test_cosines_are_dealt_out_among_the_views_and_each_sees_its_own():
+    maps = Maps(layout=(6, 7), parts=1, views=["as-felt", "corner"], cosines=101)
+    shape = {(1, 1): 0.9, (1, 3): 0.5, (2, 2): 0.7}
+    further = {(row + 1, column + 2): force for (row, column), force in shape.items()}
+    moved = maps.embed(pressed(shape)) - maps.embed(pressed(further))
+    assert np.abs(moved[:51]).mean() > 0.2
+    assert np.abs(moved[51:]).mean() < 0.01  # the corner's cosines see the same shape
+
+
+def test_cosines_fall_off_with_the_sum_of_differences():
+    maps = Maps(layout=(3,), parts=1, cosines=8000, reach=0.5)
+    near, far = (np.array([[x], [0.2], [-0.4]], np.float32) for x in (0.1, 0.6))
+    product = 2 * (maps.embed(near) * maps.embed(far)).mean()
+    assert product == pytest.approx(np.exp(-1), abs=0.03)
+
+
+def test_cosines_ask_for_larger_penalties_and_maps_for_none():
+    assert Maps(layout=(3,), cosines=64).penalties[-1] == 1.0
+    assert Maps(layout=(3,)).penalties == ()
+    with pytest.raises(InputError, match="one or more for each of 3 views"):
+        Maps(layout=(4, 4), cosines=2)

@@ -1,4 +1,4 @@
-"""`scroll-tactile fabric`: letters and slides here, `contactile` in a module of its own."""
+"""`scroll-tactile fabric`: letters, slides and attributes here, `contactile` in a module of its own."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import typer
 from rich.table import Table
 
 from scroll_tactile.cli.contactile import contactile
-from scroll_tactile.cli.results import origin, parse_folds, require_folders
+from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
-from scroll_tactile.datasets import fabric_slide, letter_spike
+from scroll_tactile.datasets import biotac_slide, fabric_slide, letter_spike
 from scroll_tactile.datasets.letter_spike import DOTS
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.attributes import Attributes
+from scroll_tactile.pipelines.attributes import summary as summary_of_attributes
 from scroll_tactile.pipelines.fabric import FIGURES, Letters, SlideTransfer, summary
 
 __all__ = ["fabric"]
@@ -22,7 +25,7 @@ __all__ = ["fabric"]
 fabric = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    help="What a touch is made of: fabrics, and letters of dots; fabrics slid over otherwise.",
+    help="What a touch is made of: fabrics, letters of dots, attributes; fabrics slid over otherwise.",
 )
 fabric.command()(contactile)
 
@@ -42,13 +45,16 @@ _LABELS = {
 }
 
 
+_WAYS = {"ours": "ours", "untold": "… not told that it is new", "trees": "trees", "always": "most common grade"}
+
+
 @fabric.command()
 def letters(
     data: Annotated[Path, typer.Option(help="Folder of letter-spike, or the one it lies in.")],
     folds: Annotated[str, typer.Option(help='Which folds of known letters: "all", or numbers such as 0,1.')] = "all",
     groups: Annotated[int, typer.Option(min=2, max=27, help="The letters are left out in so many groups.")] = 9,
     seed: Annotated[int, typer.Option(min=0, help="Deals presses into folds and letters into groups.")] = 0,
-    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 2000,
+    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 3000,
     json: JsonFile = None,
     run: RunFolder = None,
 ) -> None:
@@ -90,6 +96,42 @@ def slide(
     if json is not None:
         words = ["scroll-tactile", "fabric", "slide", "--data", str(data), "--parts", str(parts), "--seed", str(seed)]
         write_json(json, origin(shlex.join(words), slides.recordings) | task.plan | {"seed": seed, "parts": results})
+        say(f"figures: {json}")
+
+
+@fabric.command()
+def attributes(
+    data: Annotated[Path, typer.Option(help="Folder of BioTac_slide_20_50, or the one it lies in.")],
+    sets: Annotated[str, typer.Option(help="Which sensors touch: biotac-20, roboskin-20.")] = "biotac-20,roboskin-20",
+    dimension: Annotated[int, typer.Option(min=64, help="Of the kernels.")] = 504,
+    seed: Annotated[int, typer.Option(min=0, help="Of the trees.")] = 0,
+    json: JsonFile = None,
+    run: RunFolder = None,
+) -> None:
+    """Tell the stiffness and roughness of materials never touched before."""
+    require_folders(json)
+    asked = list(dict.fromkeys(part.strip() for part in sets.split(",")))
+    if strange := [name for name in asked if name not in list(Dataset)]:
+        raise InputError(f"expected --sets out of {', '.join(Dataset)}; came {strange[0]!r}")
+    found: dict[str, Any] = {}
+    with progress_bar() as progress:
+        for name in asked:
+            recordings = read(Dataset(name), data, seed)
+            task = Attributes(recordings, biotac_slide.GRADES, dimension, seed, run)
+            results = list(task.run(progress))
+            found[name] = task.plan | {"means": summary_of_attributes(results), "parts": results}
+    table = Table(
+        "set", "attribute", *_WAYS.values(), title="grades right, of materials never touched (standard error)"
+    )
+    for name, one in found.items():
+        for attribute, means in one["means"].items():
+            cells = [f"{percent(means[way]['mean'])} ({percent(means[way]['error'])})" for way in _WAYS]
+            table.add_row(name, attribute, *cells)
+    console().print(table)
+    if json is not None:
+        words = ["fabric", "attributes", "--data", data, "--sets", sets, "--dimension", dimension, "--seed", seed]
+        command = shlex.join(["scroll-tactile", *map(str, words)])
+        write_json(json, origin(command) | {"seed": seed, "sets": found})
         say(f"figures: {json}")
 
 

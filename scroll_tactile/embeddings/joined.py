@@ -45,6 +45,8 @@ class Joined:
         # at the price of a pass for each narrow window.
         widest = any(getattr(part, "judged_scales", "all") == "widest" for part in embeddings)
         self.judged_scales: Literal["widest", "all"] = "widest" if widest else "all"
+        asked = [tuple(getattr(part, "penalties", ())) for part in embeddings]
+        self.penalties: tuple[float, ...] = tuple(sorted(set().union(*asked))) if all(asked) else ()
 
     def __repr__(self) -> str:
         return f"Joined({', '.join(map(repr, self.parts))})"

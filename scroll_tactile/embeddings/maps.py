@@ -29,6 +29,8 @@ SPREAD = 0.5  # taxels: a dot between two of them is felt by either
 PRESSED = 0.5  # of the square root of the range: a quarter of it is a taxel that is pressed
 MARGIN = 4  # taxels that a map may be moved by without losing an edge
 STEPS = 2**12  # of a random feature: coarse enough for a machine's cosine not to matter
+STEEPEST = 2.0**10  # of a cosine's weights, of which one in 1600 would be steeper: more turns say no more
+PENALTIES = (0.03, 0.1, 0.3, 1.0)  # as shares of a feature's variance
 
 
 class Maps:
@@ -42,9 +44,11 @@ class Maps:
     layout: how the channels lie, (n,) or (rows, columns) in the order of the channels. parts: of a touch, of equal
     length, whose means are taken. views: of a grid: "as-felt"; "centre", moved so that the centre of pressure lies in
     the middle; "corner", moved so that the first row and the first column that are pressed come first.
-    cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007) take the maps' place: they tell known
-    shapes apart as wholes, where the maps tell of a new shape what parts it has. reach: the distance between two
-    touches' maps at which cosines tell them apart. seed: of the cosines.
+    cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007), dealt out evenly among the views,
+    take the maps' place: they tell known shapes apart as wholes, where the maps tell of a new shape what parts it has.
+    Their weights are Cauchy's, so that together they come to Σ exp(−‖x − x'‖₁ / reach) over the views: a touch that
+    was felt nearly so in any one view is near. reach: the sum of absolute differences at which that is 1/e.
+    seed: of the cosines.
 
     Raises InputError for settings that cannot be, and for an image of other channels than the layout's.
 
@@ -63,13 +67,15 @@ class Maps:
         parts: int = 6,
         views: Sequence[View] = VIEWS,
         cosines: int = 0,
-        reach: float = 3.4,
+        reach: float = 9.0,
         seed: int = 1,
     ) -> None:
         if not 1 <= len(layout) <= 2 or any(not isinstance(size, int) or size < 1 for size in layout):
             raise InputError(f"expected a layout of one or two sizes of at least 1; came {layout!r}")
         if not views or set(views) - set(VIEWS):
             raise InputError(f"expected one or more views out of {VIEWS}; came {views!r}")
+        if 0 < cosines < len(views):
+            raise InputError(f"expected no cosines, or one or more for each of {len(views)} views; came {cosines}")
         if parts < 1 or cosines < 0 or seed < 0 or not 0 < reach < math.inf:
             raise InputError(
                 f"expected parts of at least 1, cosines and a seed of at least 0 and a positive reach; came {parts}, "
@@ -81,8 +87,11 @@ class Maps:
         self.cosines = cosines
         self.reach = reach
         self.seed = seed
-        self._plain = math.prod(layout) * (parts if len(layout) == 1 else len(self.views) * (parts + SUMMARIES))
-        self.dimension = cosines or self._plain
+        self._seen = math.prod(layout) * (parts if len(layout) == 1 else parts + SUMMARIES)  # by each view
+        self._read = 1 if len(layout) == 1 else len(self.views)
+        self.dimension = cosines or self._read * self._seen
+        # As many cosines as touches know each touch by heart: with the λ of other features letters fall by four points.
+        self.penalties: tuple[float, ...] = PENALTIES if cosines else ()
 
     def __repr__(self) -> str:
         return (
@@ -93,7 +102,7 @@ class Maps:
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the settings and of the features of two fixed images."""
-        digest = hashlib.sha256(f"maps 1 {self!r} {SPREAD} {PRESSED} {MARGIN} {STEPS}".encode())
+        digest = hashlib.sha256(f"maps 2 {self!r} {SPREAD} {PRESSED} {MARGIN} {STEPS} {STEEPEST}".encode())
         for columns in (9, 75):
             features = self.embed(canary(math.prod(self.layout), columns))
             # To what a machine's own square roots and filters cannot change.
@@ -101,10 +110,16 @@ class Maps:
         return digest.hexdigest()
 
     @cached_property
-    def _waves(self) -> tuple[torch.Tensor, FloatArray]:
+    def _waves(self) -> list[tuple[torch.Tensor, FloatArray]]:
+        """Weights, (cosines, maps' values), and phases, (cosines,), of each view."""
         rng = np.random.default_rng([self.seed, *self.layout, self.parts, self.cosines])
-        weights = rng.standard_normal((self.cosines, self._plain)) / self.reach
-        return torch.from_numpy(weights), rng.uniform(0, 2 * np.pi, self.cosines)
+        each, more = divmod(self.cosines, self._read)
+        made = []
+        for view in range(self._read):
+            count = each + (view < more)
+            weights = np.clip(rng.standard_cauchy((count, self._seen)), -STEEPEST, STEEPEST) / self.reach
+            made.append((torch.from_numpy(weights), rng.uniform(0, 2 * np.pi, count)))
+        return made
 
     def embed(self, image: npt.NDArray[np.float32]) -> FloatArray:
         """Features in [-1, 1], shape (d,), of a tactile image of shape (C, T) in [-1, 1], C as in the layout."""
@@ -114,10 +129,13 @@ class Maps:
         plain = _means(values, self.parts).ravel() if len(self.layout) == 1 else self._grids(values)
         if not self.cosines:
             return plain
-        weights, phases = self._waves
+        views = plain.reshape(self._read, self._seen)
         with one_torch_thread():  # in one order, whatever the threads
-            turned = torch.mv(weights, torch.from_numpy(plain)).numpy() + phases
-        rounded: FloatArray = np.rint(np.cos(turned) * STEPS) / STEPS
+            turned = [
+                torch.mv(weights, torch.from_numpy(view)).numpy() + phases
+                for view, (weights, phases) in zip(views, self._waves, strict=True)
+            ]
+        rounded: FloatArray = np.rint(np.cos(np.concatenate(turned)) * STEPS) / STEPS
         return rounded
 
     def _grids(self, values: FloatArray) -> FloatArray:

@@ -48,6 +48,7 @@ class Robust:
         self.bound = max(1.0, self.inner.bound)
         self.partial_windows: bool = getattr(self.inner, "partial_windows", True)
         self.judged_scales: Literal["widest", "all"] = getattr(self.inner, "judged_scales", "all")
+        self.penalties: tuple[float, ...] = getattr(self.inner, "penalties", ())
 
     def __repr__(self) -> str:
         return f"Robust({self.inner!r}, seed={self.seed})"

@@ -52,7 +52,7 @@ class Letters:
     recordings: Recordings
     groups: int = 9
     seed: int = 0
-    cosines: int = 2000
+    cosines: int = 3000
     folder: Path | None = None
 
     @property
@@ -79,7 +79,7 @@ class Letters:
         parts += [("never touched", " ".join(group), at, np.isin(names, group)) for at, group in enumerate(groups)]
         # With the embedding: whether the touches asked about are of letters never touched, which whoever asks knows.
         settings: dict[str, tuple[Embedding, float]] = {
-            "known": (Cached(Maps(layout=GRID, parts=4, cosines=self.cosines)), 0.0),
+            "known": (Cached(Maps(layout=GRID, parts=4, views=["as-felt", "corner"], cosines=self.cosines)), 0.0),
             "never touched": (Cached(Maps(layout=GRID, parts=1, views=["corner"])), 1.0),
         }
         for kind, title, at, tested in parts:

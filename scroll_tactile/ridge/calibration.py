@@ -19,7 +19,7 @@ from scroll_tactile.ridge.readouts import Readout, ReadoutName
 from scroll_tactile.ridge.selection import Selection
 from scroll_tactile.ridge.statistics import fold_of
 
-__all__ = ["Calibration", "calibrate", "calibrate_stage"]
+__all__ = ["FEWEST", "Calibration", "calibrate", "calibrate_stage", "fit_weights"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: R
     """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
     scores, targets, distances = _held_out(stage, pool, selections, kind)
     prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
-    weights = _fit_weights(scores, targets, prior)
+    weights = fit_weights(scores, targets, prior)
     if len(distances) < FEWEST:
         return Calibration(weights, _assumed(selections), np.zeros(0))
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
@@ -124,7 +124,7 @@ def _judge(
     return np.stack(rows), common.index(material), np.array(distances)
 
 
-def _fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray) -> FloatArray:
+def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray) -> FloatArray:
     """Weights ≥ 0 of least held-out log loss, a convex problem, drawn to the prior where touches are few."""
     if not scores:
         return prior

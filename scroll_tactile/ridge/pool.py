@@ -48,6 +48,11 @@ class Touch:
         pairs = [(stage, scale, len(places)) for stage, scale, _, places in chosen]
         return cls(np.stack(sums), np.array(pairs))
 
+    def windows(self, stage: int) -> list[int]:
+        """How many windows of each scale are in the sums of a stage; none where it was not reached."""
+        windows: list[int] = self.pairs[self.pairs[:, 0] == stage, 2].tolist()
+        return windows
+
     def means(self, stage: int) -> list[npt.NDArray[np.float64]] | None:
         """Mean codes of the windows of each scale at a stage, each of shape (d,); None where it was not reached."""
         rows = np.flatnonzero(self.pairs[:, 0] == stage)

@@ -9,7 +9,7 @@ from functools import cached_property
 
 from torch import nn
 
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
+from scroll_tactile.embeddings import Embedding, Frames, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
@@ -64,7 +64,8 @@ class Catalogue:
 
     weights: of a trained ResNet: a file or a published name; None: the systems in NEED_WEIGHTS cannot be made.
     course: of the networks' training. device: of all networks but ours. every: columns that the residual networks'
-    images are averaged over (1: as recorded). seed: of the control's random weights.
+    images are averaged over (1: as recorded). seed: of the control's random weights. camera: whether frames are read:
+    then ours are `Frames`, by its counts in place of kernels, and by its network in place of vision.
     """
 
     weights: str | os.PathLike[str] | None = None
@@ -72,6 +73,7 @@ class Catalogue:
     device: str = "cpu"
     every: int = 1
     seed: int = 0
+    camera: bool = False
 
     def make(self, key: str) -> System:
         """A new system. Raises InputError for a name that is not there, or weights that are needed and not given."""
@@ -131,12 +133,12 @@ class Catalogue:
 
     @cached_property
     def _kernels(self) -> Embedding:
-        return Cached(Kernels())
+        return Cached(Frames(rest=None) if self.camera else Kernels())
 
     @cached_property
     def _vision(self) -> Embedding:
         assert self.weights is not None
-        return Cached(Vision(self.weights))
+        return Cached(Frames(self.weights, rest=None) if self.camera else Vision(self.weights))
 
     @cached_property
     def _both(self) -> Embedding:

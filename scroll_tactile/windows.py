@@ -20,6 +20,7 @@ __all__ = [
     "BEGINNING",
     "CHANNELS",
     "ENOUGH",
+    "FRAMES",
     "MOST_WINDOWS",
     "NOISY",
     "Extent",

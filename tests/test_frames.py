@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refused, run
 
 from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, check_embedding, sensors
 from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
@@ -16,6 +17,8 @@ from scroll_tactile.errors import (
     NotFiniteError,
     ReadingsTypeError,
 )
+from scroll_tactile.images import tactile_image
+from scroll_tactile.streams import validate
 
 GEL = Gel()
 NETWORK = ResNet.random(0).state_dict()
@@ -37,6 +40,7 @@ def taught(repetitions=4, **settings):
 
 def test_it_keeps_the_promises_of_an_embedding():
     check_embedding(Frames(), channels=(3, 180, 360), columns=(1, 9, 80, 160))
+    check_embedding(Frames(cosines=64), channels=(3, 180), columns=(1, 80))
     check_embedding(SEEING, channels=(3, 180), columns=(1, 80))
 
 
@@ -81,9 +85,30 @@ def test_the_network_sees_relief_and_no_level():
     assert np.linalg.norm(one[LIGHT : LIGHT + 64]) == pytest.approx(1, abs=1e-5)
 
 
+def test_cosines_approximate_a_kernel_of_the_surface_alone():
+    """The mean product of two frames' cosines is half of exp(−‖s − s'‖² / (2 · 1.2²)), of their counts s and s'."""
+    embedding = Frames(cosines=4000)
+    frames = [GEL.touch(name, 0).readings[-1] for name in MATERIALS[:3]]
+    images = [tactile_image(validate(frame[None], SMALL)) for frame in frames]
+    waves = [embedding.embed(image).astype(np.float64) for image in images]
+    counts = [Frames().embed(image)[LIGHT:].astype(np.float64) for image in images]
+    for one in range(3):
+        for other in range(3):
+            near = np.exp(-np.square(counts[one] - counts[other]).sum() / (2 * 1.2**2))
+            assert 2 * np.mean(waves[one] * waves[other]) == pytest.approx(near, abs=0.08)
+    assert np.array_equal(embedding.embed(images[0] + np.float32(0.25)), embedding.embed(images[0]))
+
+
+@pytest.mark.parametrize("bad", [{"cosines": -1}, {"seed": -1}, {"cosines": 9, "weights": NETWORK}])
+def test_settings_that_cannot_be_are_refused(bad):
+    with pytest.raises(InputError, match="expected cosines and a seed of 0 or more"):
+        Frames(**bad)
+
+
 def test_the_fingerprint_tells_rests_and_networks_apart():
     rest = np.zeros(SMALL.shape)
     kinds = [Frames(), Frames(rest=None), Frames(rest=rest), Frames(rest=rest + 1), SEEING, Frames(NETWORK, rest=None)]
+    kinds += [Frames(cosines=64), Frames(cosines=64, seed=2)]
     assert len({one.fingerprint for one in kinds}) == len(kinds)
     assert Frames(rest=rest).fingerprint == Frames(rest=rest.astype(int).tolist()).fingerprint
 
@@ -150,6 +175,17 @@ def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
         assert {len(one.readings) for those in learner._ranked().values() for one in those} <= {3, 4, 5}  # of 5
     with pytest.raises(EmbeddingMismatchError):
         TactileLearner.open(tmp_path / "eye", embedding=Frames(rest=None))
+
+
+def test_the_commands_read_frames(tmp_path):
+    (tmp_path / "eye.json").write_text(SMALL.model_dump_json())
+    for name in MATERIALS[:2]:
+        np.save(tmp_path / f"{name}.npy", GEL.touch(name, 0).readings.astype(np.uint8))
+        words = ("observe", tmp_path / "memory", name, tmp_path / f"{name}.npy")
+        assert run(*words, "--sensor", tmp_path / "eye.json").exit_code == 0
+    assert "cord" in run("predict", tmp_path / "memory", tmp_path / "cord.npy").output
+    np.save(tmp_path / "rest.npy", np.full((3, *SMALL.shape), 90, np.uint8))
+    assert "none differs from the resting image" in refused("predict", tmp_path / "memory", tmp_path / "rest.npy")
 
 
 @pytest.mark.parametrize("size", [(240, 320), (480, 640), (37, 51)])

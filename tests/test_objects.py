@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
+from scroll_tactile.bench.tables_cameras import cameras
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
@@ -39,7 +40,7 @@ def results():
 
 
 def test_known_objects_are_told_by_video_by_vote_and_by_frame(results):
-    known = [one for one in results if one["part"] == "known"]
+    known = [one for one in results if one["part"] == "known, counts"]
     assert [one["tested"] for one in known] == [6]
     assert all(one["learned"] == 18 for one in known)
     assert np.mean([one["video"] for one in known]) >= 0.75
@@ -58,7 +59,9 @@ def test_attributes_are_told_of_objects_left_out(results):
             assert told.keys() == {"right", "always", "trees"}
             assert all(0 <= share <= 1 for share in told.values())
     means = summary(results)
-    assert means["known"]["video"]["mean"] == np.mean([one["video"] for one in results if one["part"] == "known"])
+    assert means["known, counts"]["video"]["mean"] == np.mean(
+        [one["video"] for one in results if one["part"] == "known, counts"]
+    )
     assert "grain, always" in means["never touched"]
 
 
@@ -71,6 +74,18 @@ def test_an_interrupted_run_goes_on_and_another_is_refused(tmp_path, results):
     assert again == first  # its seconds too: it was read back
     with pytest.raises(InputError, match="seed 0 there, 1 here"):
         next(iter(Objects(recordings(), FINE, groups=2, seed=1, trees=0, folder=tmp_path / "run").run([0])))
+
+
+def test_the_table_of_the_readme_holds_the_figures(results):
+    means = summary(results)
+    record = {"means": means, "parts": results, "groups": 2}
+    table = cameras(lambda name: {"gelsight-objects": record}[name])
+    video = means["known, counts"]["video"]
+    assert f"| a video's frames together | {100 * video['mean']:.1f} ± {100 * video['sd']:.1f} | |" in table
+    assert "6 objects, 2 groups" in table
+    hardness = {"hardness": {"mean": 0.61, "sd": 0.1}, "hardness, always": {"mean": 0.4, "sd": 0.0}}
+    told = cameras(lambda name: record | {"means": {"never touched": hardness}})
+    assert "| hardness | 61.0 ± 10.0 | | 40.0 ± 0.0 |" in told
 
 
 def test_settings_that_cannot_be_are_refused():
@@ -122,7 +137,7 @@ class TestCommand:
         result = json.loads((tmp_path / "g.json").read_text())
         assert result["command"].startswith("scroll-tactile fabric gelsight --data")
         assert result["attributes"].keys() == {"apple", "pen", "rug"}
-        assert result["means"]["known"]["video"]["mean"] == 1.0
+        assert result["means"]["known, counts"]["video"]["mean"] == 1.0
         assert len(result["parts"]) == 3
 
     @pytest.mark.parametrize("told", ["", "{}", '{"hardness": {"apple": 5}, "roughness": {}, "texture": {}}'])

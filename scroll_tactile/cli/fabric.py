@@ -98,11 +98,11 @@ def gelsight(
     weights: Annotated[
         str | None,
         typer.Option(
-            help="Of a trained ResNet: a file, or a published name such as resnet18. Without, counts are read."
+            help="Of a trained ResNet: a file, or a published name such as resnet18. Without, only counts are read."
         ),
     ] = None,
     folds: Annotated[str, typer.Option(help='Which folds of videos: "all", or numbers such as 0,1.')] = "all",
-    groups: Annotated[int, typer.Option(min=2, help="Objects are left out in so many groups.")] = 10,
+    groups: Annotated[int, typer.Option(min=2, help="Objects are left out in so many groups.")] = 5,
     seed: Annotated[int, typer.Option(min=0, help="Deals videos and objects, and grows the trees.")] = 0,
     trees: Annotated[int, typer.Option(min=0, help="Of the baseline, scikit-learn's; 0: none.")] = objects.TREES,
     json: JsonFile = None,
@@ -132,11 +132,14 @@ def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Non
     def told(figure: Mapping[str, float] | None) -> str:
         return "" if figure is None else f"{percent(figure['mean'])} ({percent(figure['sd'])})"
 
-    known = means.get("known", {})
-    table = Table("GelSight, objects that were touched", "ours", "trees", title="right by video (sd over folds)")
-    table.add_row("frames together", told(known.get("video")), told(known.get("trees")))
-    table.add_row("majority of its frames", told(known.get("vote")), told(known.get("trees' vote")))
-    table.add_row("a single frame", told(known.get("frame")), "")
+    counts, network = means.get("known, counts", {}), means.get("known, network", {})
+    head = ("counts", "network", "trees")
+    table = Table("GelSight, objects that were touched", *head, title="right by video (sd over folds)")
+    table.add_row("frames together", *map(told, (counts.get("video"), network.get("video"), counts.get("trees"))))
+    table.add_row(
+        "majority of frames", *map(told, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
+    )
+    table.add_row("a single frame", *map(told, (counts.get("frame"), network.get("frame"), None)))
     console().print(table)
     new = means.get("never touched", {})
     table = Table("GelSight, objects never touched", "ours", "trees", "always the commonest", title="right by video")

@@ -29,7 +29,9 @@ STAGES = (1, 2, 3)  # of the network
 # Columns of a frame in the standard deviation of the blur that is taken off before the network sees it.
 SMOOTH = 20
 GAIN = 4.0  # relief is faint: a few levels of 255
-REACH = 3  # standard deviations that the blur reaches
+BLURRED = 3  # standard deviations that the blur reaches
+REACH = 1.2  # between two frames' counts, at which cosines tell them apart: about the usual distance
+STEPS = 2**12  # of a cosine
 
 
 class Frames:
@@ -61,13 +63,22 @@ class Frames:
         weights: str | os.PathLike[str] | Mapping[str, torch.Tensor] | None = None,
         *,
         rest: Rest | npt.ArrayLike = "first",
+        cosines: int = 0,
+        seed: int = 1,
         runtime: RuntimeName = "torch",
     ) -> None:
+        if cosines < 0 or seed < 0 or (cosines and weights is not None):
+            raise InputError(
+                f"expected cosines and a seed of 0 or more, and no weights beside cosines; came {cosines} and {seed}"
+                + (" with weights" if weights is not None else "")
+            )
         self.rest: Rest = _checked(rest)
+        self.cosines = cosines
+        self.seed = seed
         self.runtime: RuntimeName = runtime
         self._net = None if weights is None else load_network(weights)
         self._source = "weights" if isinstance(weights, Mapping) else repr(weights and os.fspath(weights))
-        self.dimension = LIGHT + SURFACE
+        self.dimension = cosines or LIGHT + SURFACE
         if self._net is not None:
             self._net.requires_grad_(False)
             self._run = make_runtime(runtime, self._net, STAGES[-1])
@@ -75,12 +86,13 @@ class Frames:
 
     def __repr__(self) -> str:
         rest = "<picture>" if isinstance(self.rest, np.ndarray) else repr(self.rest)
-        return f"Frames({self._source}, rest={rest})"
+        waves = f", cosines={self.cosines}, seed={self.seed}" if self.cosines else ""
+        return f"Frames({self._source}, rest={rest}{waves})"
 
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the resting image, the network and its runtime, and of the features of three fixed images."""
-        digest = hashlib.sha256(f"frames 1 {LEVELS} {SMOOTH} {GAIN} {STAGES}".encode())
+        digest = hashlib.sha256(f"frames 1 {LEVELS} {SMOOTH} {GAIN} {STAGES} {self.cosines} {self.seed}".encode())
         digest.update(self.rest.tobytes() if isinstance(self.rest, np.ndarray) else repr(self.rest).encode())
         if self._net is not None:
             digest.update(f"{self._net.depth} {self._net.stem} {self.runtime} {version_of(self.runtime)}".encode())
@@ -102,6 +114,8 @@ class Frames:
             )
         planes = image.reshape(-1, COLOURS, image.shape[1]).swapaxes(0, 1)
         levels = to_levels(planes).astype(np.int64)
+        if self.cosines:
+            return self._waved(surface(levels))
         relief = surface(levels) if self._net is None else self._seen(planes)
         return np.concatenate([light(levels), relief])
 
@@ -113,6 +127,20 @@ class Frames:
             width: np.stack([self.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts])
             for width, starts in windows.items()
         }
+
+    @cached_property
+    def _waves(self) -> tuple[torch.Tensor, torch.Tensor]:
+        rng = np.random.default_rng([self.seed, self.cosines])
+        weights = rng.standard_normal((self.cosines, SURFACE)) / REACH
+        return torch.from_numpy(weights), torch.from_numpy(rng.uniform(0, 2 * np.pi, self.cosines))
+
+    def _waved(self, counts: FloatArray) -> FloatArray:
+        """Cosines of counts, rounded so coarsely that a machine's own cosine does not matter."""
+        weights, phases = self._waves
+        with steady():
+            waves = torch.cos(weights @ torch.from_numpy(counts).double() + phases)
+            told: FloatArray = (torch.round(waves * STEPS) / STEPS).float().numpy()
+            return told
 
     def _seen(self, planes: npt.NDArray[np.float32]) -> FloatArray:
         """What the network sees of the relief: of each stage the mean and the spread of its maps, of length 1 each."""
@@ -132,7 +160,7 @@ class Frames:
 
 def _blurred(planes: torch.Tensor, deviation: int) -> torch.Tensor:
     """Planes (1, 3, H, W) less what is finer than a Gaussian; beyond its edges a plane goes on as at them."""
-    reach = REACH * deviation
+    reach = BLURRED * deviation
     taps = torch.exp(-torch.arange(-reach, reach + 1).square() / (2 * deviation**2))
     taps = (taps / taps.sum()).expand(COLOURS, 1, 1, -1)
     wide = functional.pad(planes, (reach,) * 4, mode="replicate")

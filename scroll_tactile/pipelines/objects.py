@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from scroll_tactile.contact import image_of
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Frames
+from scroll_tactile.embeddings import Embedding, Frames, embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.cached import Cached
@@ -30,15 +30,18 @@ from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.studies import weights_digest
 from scroll_tactile.prediction import Composition
 from scroll_tactile.streams import Stream
+from scroll_tactile.windows import FRAMES
 
-__all__ = ["TREES", "VALUES", "Objects", "most_often", "object_groups", "summary"]
+__all__ = ["COSINES", "TREES", "VALUES", "Objects", "most_often", "object_groups", "summary"]
 
 FloatArray = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 VALUES = (0, 1, 2)
 """Of every attribute."""
-TREES = 300
+COSINES = 1500
+"""Of the surface's counts, by which attributes are told."""
+TREES = 100
 """Of the baseline, scikit-learn's extremely randomised trees on the counts and the light of each frame."""
 
 
@@ -47,7 +50,8 @@ class Objects:
     """Objects in folds of their videos, and attributes of objects in groups that are left out.
 
     recordings: whole videos, see `physiclear.videos`. attributes: object → attribute → value, of those that are known.
-    weights: of a trained ResNet, for `Frames`; None: its counts. groups: into which the objects with attributes are
+    weights: of a trained ResNet, by which objects that were touched are told, too; None: by `Frames`' counts alone.
+    Attributes are told by cosines of the counts. groups: into which the objects with attributes are
     dealt, one of which is never touched; seed: deals them, and grows the trees. trees: of the baseline; 0: none.
     folder: where finished parts are noted, so that an interrupted run goes on; or None.
 
@@ -57,7 +61,7 @@ class Objects:
     recordings: Recordings
     attributes: Mapping[str, Mapping[str, int]]
     weights: str | None = None
-    groups: int = 10
+    groups: int = 5
     seed: int = 0
     trees: int = TREES
     folder: Path | None = None
@@ -72,7 +76,7 @@ class Objects:
     @property
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
-        settings = {"groups": self.groups, "seed": self.seed, "trees": self.trees}
+        settings = {"groups": self.groups, "seed": self.seed, "trees": self.trees, "cosines": COSINES}
         known = {"attributes": {name: dict(one) for name, one in self.attributes.items()}}
         weights = None if self.weights is None else weights_digest(self.weights)
         data = {"dataset": self.recordings.name, "data": data_digest(self.recordings)}
@@ -87,10 +91,11 @@ class Objects:
         if not folds or set(folds) - set(there):
             raise InputError(f"expected folds out of {there}; came {list(folds)}")
         notes = RunFile(None if self.folder is None else self.folder / "objects.json", self.plan)
-        for fold in folds:
-            if (name := f"fold {fold}") not in notes.notes:
-                notes.note(name, {"part": "known", "number": fold} | self._known(fold, name, progress))
-            yield notes.notes[name]
+        for by in self._embeddings:
+            for fold in folds:
+                if (name := f"{by}, fold {fold}") not in notes.notes:
+                    notes.note(name, {"part": f"known, {by}", "number": fold} | self._known(by, fold, name, progress))
+                yield notes.notes[name]
         for at, group in enumerate(object_groups(sorted(self.attributes), self.groups, self.seed)):
             if (name := f"group {at}") not in notes.notes:
                 result = {"part": "never touched", "number": at, "objects": group}
@@ -102,33 +107,38 @@ class Objects:
         return np.array(self.recordings.materials)
 
     @cached_property
-    def _embedding(self) -> Embedding:
+    def _embeddings(self) -> dict[str, Embedding]:
         # Every frame is one of contact, and none shows the gel at rest.
-        return Cached(Frames(self.weights, rest=None))
+        made: dict[str, Embedding] = {"counts": Cached(Frames(rest=None))}
+        if self.weights is not None:
+            made["network"] = Cached(Frames(self.weights, rest=None))
+        return made
+
+    @cached_property
+    def _waves(self) -> Embedding:
+        return Cached(Frames(rest=None, cosines=COSINES))
 
     @cached_property
     def _counts(self) -> FloatArray:
         """Of every frame what the trees read: `Frames` without a network, (videos, frames, d)."""
-        plain, width = Frames(rest=None), self.recordings.sensor.shape[1]
+        plain, width = self._embeddings["counts"], min(FRAMES, self.recordings.sensor.shape[1])
+        images = (image_of(stream, None) for stream in self.recordings.streams)
         return np.stack(
-            [
-                plain.embed_windows(image, {width: range(0, image.shape[1], width)})[width]
-                for image in (image_of(stream, None) for stream in self.recordings.streams)
-            ]
+            [embed_windows(plain, one, {width: list(range(0, one.shape[1], width))})[width] for one in images]
         ).astype(np.float64)
 
-    def _taught(self, taught: Mask, what: str, progress: Progress) -> TactileLearner:
-        learner = TactileLearner(sensor=self.recordings.sensor, embedding=self._embedding, exemplars=0)
+    def _taught(self, embedding: Embedding, taught: Mask, what: str, progress: Progress) -> TactileLearner:
+        learner = TactileLearner(sensor=self.recordings.sensor, embedding=embedding, exemplars=0)
         lessons = np.flatnonzero(taught).tolist()
         for done, at in enumerate(lessons, start=1):
             learner.observe(self.recordings.materials[at], self.recordings.streams[at])
             progress(what, done, len(lessons))
         return learner
 
-    def _known(self, fold: int, what: str, progress: Progress) -> dict[str, Any]:
+    def _known(self, by: str, fold: int, what: str, progress: Progress) -> dict[str, Any]:
         begun = time.perf_counter()
         tested = self.recordings.fold == fold
-        learner = self._taught(~tested, what, progress)
+        learner = self._taught(self._embeddings[by], ~tested, what, progress)
         streams = [self.recordings.streams[at] for at in np.flatnonzero(tested)]
         truth = self._names[tested].tolist()
         said = [learner.predict(stream) for stream in streams]
@@ -145,7 +155,7 @@ class Objects:
             "called unknown": float(np.mean([not one.known for one in said])),
             "digest": learner.digest(),
         }
-        if self.trees:
+        if self.trees and by == "counts":  # they read nothing else
             progress(f"{what}: trees", 0, 1)
             chances, classes = self._grown(~tested, tested, self._names)
             figures["trees"] = accuracy(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
@@ -156,7 +166,7 @@ class Objects:
     def _unknown(self, group: Sequence[str], what: str, progress: Progress) -> dict[str, Any]:
         begun = time.perf_counter()
         tested = np.isin(self._names, group)
-        learner = self._taught(~tested, what, progress)
+        learner = self._taught(self._waves, ~tested, what, progress)
         for name, values in self.attributes.items():
             if name not in group:
                 learner.describe(name, {_constituent(key, v): one == v for key, one in values.items() for v in VALUES})

@@ -65,7 +65,8 @@ class TactileLearner:
     fresh solve to rounding. "recursive": the paper's recursive least squares, whose rounding errors add up until the
     next fit; it is there to be compared with, and what the memory keeps is exact all the same.
     exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
-    choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
+    choose from. 0: none are; so it is for a camera, whose frames are large (480 × 640: 4 MB), unless it is given.
+    exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
     augmentation: the copies that each touch is observed with, see `Augmented`; none unless given. A touch and its
     copies are one observation: it is taken back with them, and is as exact. Each copy costs as much time and space as
     the touch does, when it is observed; `predict` reads what it is given and nothing else.
@@ -96,7 +97,7 @@ class TactileLearner:
         self.solver: SolverName = solver
         self._reading = Reading.of(sensor, self.embedding)
         self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
-        self._capacity = capacity_of(exemplars, exemplar_bytes)
+        self._capacity = capacity_of(exemplars, exemplar_bytes, camera=sensor.camera)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
         self._tuned_reader: TunedReader | None = None
         self._model: tuple[int, Model] | None = None
@@ -131,7 +132,7 @@ class TactileLearner:
         require_settings(readout, false_alarms, refit, solver)
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        asked = capacity_of(exemplars, exemplar_bytes)
+        asked = capacity_of(exemplars, exemplar_bytes, camera=sensor is not None and sensor.camera)
         identity = None if sensor is None else identity_of(sensor, embedding or _usual(sensor), asked, augmentation)
         store = Store.open(path, identity=identity, mode=mode)
         try:

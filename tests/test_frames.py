@@ -164,7 +164,7 @@ def test_any_order_gives_the_same_memory(embedding):
 
 
 def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
-    with TactileLearner.open(tmp_path / "eye", sensor=SMALL) as learner:
+    with TactileLearner.open(tmp_path / "eye", sensor=SMALL, exemplars=9) as learner:
         for name in MATERIALS[:2]:
             learner.observe(name, GEL.touch(name, 0))
         before = learner.digest()
@@ -173,6 +173,9 @@ def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
     with TactileLearner.open(tmp_path / "eye") as learner:
         assert learner.digest() == before
         assert {len(one.readings) for those in learner._ranked().values() for one in those} <= {3, 4, 5}  # of 5
+    with TactileLearner.open(tmp_path / "other", sensor=SMALL) as learner:
+        learner.observe("cord", GEL.touch("cord", 0))
+        assert learner.exemplars == {}  # a camera's frames are large: none are kept unless asked for
     with pytest.raises(EmbeddingMismatchError):
         TactileLearner.open(tmp_path / "eye", embedding=Frames(rest=None))
 
@@ -251,7 +254,7 @@ def test_constituents_are_told_of_frames(memory):
 
 
 def test_f_star_reads_what_f_reads():
-    learner = taught(3, embedding=Frames())
+    learner = taught(3, exemplars=18)
     report = learner.fine_tune(epochs=1)
     assert report.exemplars == 18
     assert learner.tuned_digest() is not None

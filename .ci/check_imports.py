@@ -16,7 +16,7 @@ LAYERS = [
     {"sensors"},
     {"streams"},
     {"images", "windows", "prediction"},
-    {"augment"},
+    {"augment", "contact"},
     {"copies"},
     {"embeddings", "ridge", "requests"},
     {"exemplars", "tuned", "packing", "descriptions", "filling"},

@@ -7,7 +7,17 @@ learner.predict(stream).material         # "felt"; or known=False: never felt th
 
 from scroll_tactile import errors, sensors
 from scroll_tactile.copies import Augmented
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision, check_embedding
+from scroll_tactile.embeddings import (
+    Embedding,
+    Frames,
+    Joined,
+    Kernels,
+    Maps,
+    ModuleEmbedding,
+    Robust,
+    Vision,
+    check_embedding,
+)
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction import Composition, Constituent, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -18,6 +28,7 @@ __all__ = [
     "Composition",
     "Constituent",
     "Embedding",
+    "Frames",
     "Joined",
     "Kernels",
     "Maps",

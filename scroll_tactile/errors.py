@@ -7,6 +7,7 @@
     │   ├── StreamError                      the readings cannot be made into a stream
     │   │   ├── EmptyStreamError             there are none: the sensor sent nothing
     │   │   ├── StreamTooShortError          touch for longer
+    │   │   ├── NoContactError               no frame of a camera differs from its resting image: press the gel
     │   │   ├── ChannelCountError            they are not laid out as (time, channel) for this sensor
     │   │   ├── NotFiniteError               NaN or infinity: leave the touch out, or repair the readings
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
@@ -47,6 +48,10 @@ class EmptyStreamError(StreamError):
 
 class StreamTooShortError(StreamError):
     """There are too few readings to feel anything in: touch for longer."""
+
+
+class NoContactError(StreamError):
+    """No frame of a camera differs from the resting image: nothing was touched."""
 
 
 class ChannelCountError(StreamError):

@@ -19,10 +19,10 @@ import numpy.typing as npt
 import torch
 from scipy.special import logsumexp
 
+from scroll_tactile.contact import Rest, image_of, rest_of
 from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.exemplars import Exemplar
-from scroll_tactile.images import tactile_image
 from scroll_tactile.model import Model
 from scroll_tactile.ridge.statistics import FOLDS
 from scroll_tactile.sensors import Sensor
@@ -73,7 +73,7 @@ def fine_tune(
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars)
     touches = TouchFeatures(embedding, model.reading)
-    lessons = list(_lessons(touches, model, exemplars, sensor, progress))
+    lessons = list(_lessons(touches, model, exemplars, (sensor, rest_of(embedding)), progress))
     names = sorted({lesson.material for lesson in lessons})
     if len(names) < 2:
         raise InputError(
@@ -125,17 +125,17 @@ def _lessons(
     touches: TouchFeatures,
     model: Model,
     exemplars: Mapping[str, Sequence[Exemplar]],
-    sensor: Sensor,
+    seen: tuple[Sensor, Rest],
     progress: Progress,
 ) -> Iterator[Lesson]:
-    """The exemplars that reach the last stage, by material and rank."""
+    """The exemplars that reach the last stage, by material and rank; seen: by which sensor, against what at rest."""
     if len(model.calibrations) < len(model.stages):  # nothing was felt for long enough
         return
     felt = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
     total, done = sum(map(len, exemplars.values())), 0
     for material, those in sorted(exemplars.items()):
         for one in those:
-            image = tactile_image(validate(one.readings, sensor))
+            image = image_of(validate(one.readings, seen[0]), seen[1])
             columns = image.shape[1]
             if material in felt and model.is_last(columns) and touches.reads(columns):
                 yield Lesson(material, one.key, image, touches.frozen(image))

@@ -17,13 +17,13 @@ from store import Store
 __all__ = ["capacity_of", "identity_of", "kept_augmentation", "kept_capacity", "require_same"]
 
 
-def capacity_of(streams: int | None, nbytes: int | None) -> Capacity:
-    """The size of the buffer that was asked for. Raises InputError for one below 0."""
+def capacity_of(streams: int | None, nbytes: int | None, *, camera: bool = False) -> Capacity:
+    """The size of the buffer that was asked for; a camera has none unless asked. Raises InputError for one below 0."""
     for what, size in (("exemplars", streams), ("exemplar_bytes", nbytes)):
         if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 0):
             raise InputError(f"expected {what} as a whole number of 0 or more; came {size!r}")
     if streams is None and nbytes is None:
-        return Capacity()
+        return Capacity(0) if camera else Capacity()
     return Capacity(0 if nbytes == 0 else streams, nbytes or None)
 
 

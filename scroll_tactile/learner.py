@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scroll_tactile.composing import Composer
 from scroll_tactile.copies import Augmented
 from scroll_tactile.descriptions import Description, checked, require_constituents
-from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.embeddings import Embedding, Frames, Kernels
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.exemplars import Exemplar, mean_code, rank
 from scroll_tactile.filling import Filling
@@ -24,24 +24,21 @@ from scroll_tactile.finetune import fine_tune
 from scroll_tactile.following import Following, SolverName
 from scroll_tactile.history import Choice
 from scroll_tactile.identity import capacity_of, identity_of, kept_augmentation, kept_capacity, require_same
-from scroll_tactile.images import tactile_image
 from scroll_tactile.ledger import Ledger
 from scroll_tactile.memory import Memory
 from scroll_tactile.model import Judgement, Model
-from scroll_tactile.perception import Perception
+from scroll_tactile.perception import Perception, Readings
 from scroll_tactile.prediction import Compacted, Composition, Constituent, Merged, Prediction, Receipt
 from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.ridge.readouts import ReadoutName
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream, validate
+from scroll_tactile.streams import Stream
 from scroll_tactile.tuned import TuneReport
 from scroll_tactile.tuning import TunedReader
 from scroll_tactile.windows import Reading
 from store import Store
 
 __all__ = ["TactileLearner"]
-
-Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +54,8 @@ class TactileLearner:
     >>> learner.predict(scene.touch(scene.materials[1], 9)).material == scene.materials[1]
     True
 
-    sensor: whose streams it reads. embedding: the frozen features, `Kernels()` unless given.
+    sensor: whose streams it reads. embedding: the frozen features; unless given `Kernels()`, and `Frames()` for a
+    camera, of whose frames those count in which the gel is pressed (see `scroll_tactile.contact`).
     readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
     false_alarms: the share of touches of known materials that may be called unknown.
     refit: the share by which the memory may grow before λ and the calibration are chosen again. 0: they are at each
@@ -67,7 +65,8 @@ class TactileLearner:
     fresh solve to rounding. "recursive": the paper's recursive least squares, whose rounding errors add up until the
     next fit; it is there to be compared with, and what the memory keeps is exact all the same.
     exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
-    choose from. 0: none are. exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
+    choose from. 0: none are; so it is for a camera, whose frames are large (480 × 640: 4 MB), unless it is given.
+    exemplar_bytes: a limit of bytes of raw readings, in place of it or beside it.
     augmentation: the copies that each touch is observed with, see `Augmented`; none unless given. A touch and its
     copies are one observation: it is taken back with them, and is as exact. Each copy costs as much time and space as
     the touch does, when it is observed; `predict` reads what it is given and nothing else.
@@ -90,7 +89,7 @@ class TactileLearner:
     ) -> None:
         require_settings(readout, false_alarms, refit, solver)
         self.sensor = sensor
-        self.embedding: Embedding = Kernels() if embedding is None else embedding
+        self.embedding: Embedding = _usual(sensor) if embedding is None else embedding
         self.readout: ReadoutName = readout
         self.false_alarms = false_alarms
         self.refit = refit
@@ -98,7 +97,7 @@ class TactileLearner:
         self.solver: SolverName = solver
         self._reading = Reading.of(sensor, self.embedding)
         self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
-        self._capacity = capacity_of(exemplars, exemplar_bytes)
+        self._capacity = capacity_of(exemplars, exemplar_bytes, camera=sensor.camera)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
         self._tuned_reader: TunedReader | None = None
         self._model: tuple[int, Model] | None = None
@@ -131,16 +130,16 @@ class TactileLearner:
         where a new memory is given no sensor, and StoreError (locked, damaged, not a store, a newer version …).
         """
         require_settings(readout, false_alarms, refit, solver)
-        chosen: Embedding = Kernels() if embedding is None else embedding
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        asked = capacity_of(exemplars, exemplar_bytes)
-        identity = None if sensor is None else identity_of(sensor, chosen, asked, augmentation)
+        asked = capacity_of(exemplars, exemplar_bytes, camera=sensor is not None and sensor.camera)
+        identity = None if sensor is None else identity_of(sensor, embedding or _usual(sensor), asked, augmentation)
         store = Store.open(path, identity=identity, mode=mode)
         try:
             if "sensor" not in store.identity:
                 raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
             kept = Sensor.model_validate(store.identity["sensor"])
+            chosen: Embedding = _usual(kept) if embedding is None else embedding
             require_same(store, kept, sensor, chosen)
             capacity = kept_capacity(store, asked, given=exemplars is not None or exemplar_bytes is not None)
             learner = cls(
@@ -179,13 +178,15 @@ class TactileLearner:
         """Learn that this stream is how the material feels; it is durable when this returns.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
-        unit, T of at least 0.1 s: an array, a tensor, lists, or an iterable of readings.
+        unit, T of at least 0.1 s: an array, a tensor, lists, or an iterable of readings; of a camera frames,
+        (T, height, width, 3), the first of the gel at rest (see `Frames`), of which those in contact are kept.
 
-        Raises StreamError, MaterialError (nothing was kept), CapacityError, or StoreError.
+        Raises StreamError (NoContactError where the gel was not pressed), MaterialError (nothing was kept),
+        CapacityError, or StoreError.
         """
         require_name(material)
-        felt = validate(stream, self.sensor)
-        image = tactile_image(felt)
+        felt = self._perception.felt(stream)
+        image = self._perception.image(felt)
         return self._ledger.observe(material, felt, image.shape[1], self._perception.codes(image, felt.key))
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
@@ -296,7 +297,7 @@ class TactileLearner:
         Raises StreamError, UnknownMaterialError for a scene that names a material never felt, InputError for an
         empty one. Before anything was felt the answer is material None, known False.
         """
-        felt = validate(stream, self.sensor)
+        felt = self._perception.felt(stream)
         with self._ledger.lock:
             memory = self._memory
             model, longest = self._present(), memory.statistics.longest
@@ -305,7 +306,7 @@ class TactileLearner:
         if not candidates:
             return Prediction(None, 0.0, (), float("inf"), False, felt.seconds)
         felt = self._perception.as_far_as(felt, longest)
-        image = tactile_image(felt)
+        image = self._perception.image(felt)
         columns = image.shape[1]
         if model.noisy is not None and self._perception.is_noisy(image):
             judgement = model.judge_noisy(candidates, self._perception.noisy_mean(image))
@@ -340,7 +341,7 @@ class TactileLearner:
         """
         if not 0 <= unfamiliar <= 1:
             raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
-        felt = validate(stream, self.sensor)
+        felt = self._perception.felt(stream)
         with self._ledger.lock:
             described, longest = self._memory.descriptions, self._memory.statistics.longest
             known = {name for one in described.values() for name in one}
@@ -354,7 +355,7 @@ class TactileLearner:
             nothing = tuple(Constituent(name, None, None, (), "nothing was felt yet") for name in wanted)
             return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
         felt = self._perception.as_far_as(felt, longest)
-        image = self._mended(tactile_image(felt))
+        image = self._mended(self._perception.image(felt))
         columns = image.shape[1]
         means = self._perception.means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
         prediction = self._told(model, model.names, means, felt, columns, None)
@@ -520,3 +521,8 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _usual(sensor: Sensor) -> Embedding:
+    """The embedding of a memory that asks for none."""
+    return Frames() if sensor.camera else Kernels()

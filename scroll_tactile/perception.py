@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.contact import Rest, image_of, pressed, require_rest, rest_of
 from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import Embedding, Robust, embed_windows
 from scroll_tactile.errors import EmbeddingError
@@ -15,22 +16,39 @@ from scroll_tactile.filling import sampled_readings
 from scroll_tactile.packing import Codes
 from scroll_tactile.ridge.codes import in_units, to_codes
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream
+from scroll_tactile.streams import Stream, validate
 from scroll_tactile.windows import BEGINNING, CHANNELS, NOISY, Reading
 
-__all__ = ["Perception"]
+__all__ = ["Perception", "Readings"]
 
+Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
 
 
 class Perception:
-    """What a learner's sensor, embedding, windows and augmentation make of touches; it learns nothing."""
+    """What a learner's sensor, embedding, windows and augmentation make of touches; it learns nothing.
+
+    Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
+    """
 
     def __init__(self, sensor: Sensor, embedding: Embedding, reading: Reading, augmentation: Augmented | None) -> None:
         self._sensor = sensor
         self._embedding = embedding
         self._reading = reading
         self._augmentation = augmentation
+        require_rest(embedding, sensor)
+        self._rest: Rest = rest_of(embedding)
+
+    def felt(self, readings: Readings) -> Stream:
+        """What is read of readings: a sound stream; of a camera's, the frames in contact.
+
+        Raises StreamError: see `validate` and `pressed`.
+        """
+        return pressed(validate(readings, self._sensor), self._rest)
+
+    def image(self, felt: Stream) -> Image:
+        """The tactile image of what was `felt`."""
+        return image_of(felt, self._rest)
 
     def codes(self, image: Image, key: bytes) -> Codes:
         """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
@@ -80,7 +98,8 @@ class Perception:
         BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
         """
         frame = self._reading.widths[0] if self._sensor.camera else 1
-        return felt.first(longest // frame / self._sensor.rate)
+        before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column
+        return felt.first((longest // frame + before) / self._sensor.rate)
 
     def is_noisy(self, image: Image) -> bool:
         """Whether a touch was felt through noise, by an embedding that tells; a function of the touch alone."""

@@ -13,7 +13,7 @@ class Receipt:
 
     sequence: its place in the memory's journal, from 1; in a memory without a store, the count of observations.
     material: what it was said to be. key: hash of the stream's content, 32 bytes.
-    seconds: the stream's length. clipped: values that lay outside the sensor's range.
+    seconds: the stream's length; of a camera's, of what was kept of it. clipped: values outside the sensor's range.
     durable: whether it is on disk; False in a memory without a store, and in a batch, which is when it ends.
     """
 
@@ -63,7 +63,8 @@ class Prediction:
     known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
         then `material` is only what comes nearest.
     seconds: how much touch the answer rests on: the stream's length, or that of the longest touch learned where the
-        stream is longer, for nothing was ever felt of how a material goes on after that.
+        stream is longer, for nothing was ever felt of how a material goes on after that. Of a camera's stream only the
+        frames in contact count, and the one at rest.
     tuned: whether f*, the fine-tuned model, gave the probabilities; f did otherwise. Novelty is always f's.
     """
 

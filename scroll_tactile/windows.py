@@ -20,6 +20,7 @@ __all__ = [
     "BEGINNING",
     "CHANNELS",
     "ENOUGH",
+    "FRAMES",
     "MOST_WINDOWS",
     "NOISY",
     "Extent",
@@ -37,7 +38,7 @@ LONGEST = 0.75  # of the usual duration: a usual touch has several windows of it
 ENOUGH = 0.65  # of a window: a touch half the usual one is read with the kernels of the wide windows as far as it goes
 FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
-FRAMES = 80  # columns of a camera's frame in its tactile image
+FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
 # Scales that are no widths, and smaller than any width:
 NOISY = 0  # the whole of a touch felt through noise
@@ -61,16 +62,20 @@ def scales(sensor: Sensor) -> tuple[int, ...]:
     return (shortest, longest) if two else (shortest,)
 
 
-def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> Extent:
+def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
     """The windows that are read of a touch of so many columns, at every scale that fits.
 
     The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
     rests on: their steps grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
     few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale, but not
-    much, is one window of it, if windows may be `partial`; of the shortest scale every touch is.
+    much, is one window of it, if windows may be `partial`; of the shortest scale every touch is. A camera's windows are
+    its `frames`, and lie across no two of them.
     """
     return {
-        width: _starts(columns, width, dense=width == widths[0]) for width in fitting(columns, widths, partial=partial)
+        width: _thinned(range(0, max(1, columns - width + 1), width))
+        if frames
+        else _starts(columns, width, dense=width == widths[0])
+        for width in fitting(columns, widths, partial=partial)
     }
 
 
@@ -89,10 +94,14 @@ def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
         begin += range(begin[-1] + width, room + 1, width)
     else:
         begin = list(range(0, room + 1, max(1, width // 6, min(width // 2, room // 2))))
-    begin = [start for start in begin if start <= room]
-    if len(begin) > MOST_WINDOWS:
-        begin = [begin[at] for at in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
-    return begin
+    return _thinned([start for start in begin if start <= room])
+
+
+def _thinned(begin: Sequence[int]) -> list[int]:
+    """At most MOST_WINDOWS of them, evenly."""
+    if len(begin) <= MOST_WINDOWS:
+        return list(begin)
+    return [begin[at] for at in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
 
 
 def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
@@ -139,7 +148,8 @@ class Reading:
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
     is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
-    penalties: the λ that the readouts are tried with; none: those of `ridge.selection`.
+    penalties: the λ that the readouts are tried with; none: those of `ridge.selection`. frames: whether windows are a
+    camera's frames.
     """
 
     widths: tuple[int, ...]
@@ -149,6 +159,7 @@ class Reading:
     noisy: bool = False
     filled: bool = False
     penalties: tuple[float, ...] = ()
+    frames: bool = False
 
     @classmethod
     def of(cls, sensor: Sensor, embedding: Any) -> Reading:
@@ -163,7 +174,7 @@ class Reading:
         filled = bool(getattr(embedding, "fills_channels", False)) and sensor.channels <= embedding.dimension
         judged: Literal["all", "widest"] = getattr(embedding, "judged_scales", "all")
         penalties = tuple(float(one) for one in getattr(embedding, "penalties", ()))
-        return cls(scales(sensor), partial, judged, beginning, noisy, filled, penalties)
+        return cls(scales(sensor), partial, judged, beginning, noisy, filled, penalties, sensor.camera)
 
     @property
     def scales(self) -> tuple[int, ...]:
@@ -172,7 +183,7 @@ class Reading:
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""
-        return extent(columns, self.widths, partial=self.partial)
+        return extent(columns, self.widths, partial=self.partial, frames=self.frames)
 
     def judging(self, length: int) -> list[int]:
         """The scales that judge when so many columns have been felt."""

@@ -50,11 +50,11 @@ def test_the_range_maps_onto_minus_one_to_one(low, span, seed):
 def test_a_frame_is_averaged_down_and_scanned_column_by_column():
     frames = np.random.default_rng(1).integers(0, 256, (2, 480, 640, 3), dtype=np.uint8)
     image = tactile_image(validate(frames, GELSIGHT))
-    assert image.shape == (180, 160)
+    assert image.shape == (360, 320)
     assert image.flags.c_contiguous
-    small = frames.astype(float).reshape(2, 60, 8, 80, 8, 3).mean(axis=(2, 4)) / 127.5 - 1
-    for frame, row, column, colour in [(0, 0, 0, 0), (1, 59, 79, 2), (1, 7, 30, 1)]:
-        assert image[row * 3 + colour, frame * 80 + column] == pytest.approx(
+    small = frames.astype(float).reshape(2, 120, 4, 160, 4, 3).mean(axis=(2, 4)) / 127.5 - 1
+    for frame, row, column, colour in [(0, 0, 0, 0), (1, 119, 159, 2), (1, 7, 30, 1)]:
+        assert image[row * 3 + colour, frame * 160 + column] == pytest.approx(
             small[frame, row, column, colour], abs=1e-6
         )
 
@@ -66,6 +66,16 @@ def test_a_small_frame_keeps_its_pixels():
     assert np.allclose(image, frames[0].transpose(0, 2, 1).reshape(15, 7) / 127.5 - 1, atol=1e-6)
 
 
+def test_with_a_resting_image_what_is_shown_is_the_difference_from_it():
+    frames = np.random.default_rng(5).integers(0, 256, (2, 5, 7, 3)).astype(np.float32)
+    rest = np.random.default_rng(6).integers(0, 256, (5, 7, 3)).astype(np.float32)
+    image = tactile_image(validate(frames, camera(5, 7)), rest)
+    gap = np.clip((frames - rest) / 127.5, -1, 1)
+    assert image.dtype == np.float32
+    assert np.allclose(image, gap.transpose(1, 3, 0, 2).reshape(15, 14), atol=1e-6)
+    assert not tactile_image(validate(rest[None], camera(5, 7)), rest).any()
+
+
 def shares(length, size):
     """(size, length): the share that each pixel has in each of `size` equal areas."""
     edges = np.arange(size + 1)[:, None] * length / size
@@ -74,11 +84,11 @@ def shares(length, size):
     return np.maximum(inside, 0) * size / length
 
 
-@pytest.mark.parametrize(("height", "width"), [(61, 81), (90, 200), (119, 80), (60, 333)])
+@pytest.mark.parametrize(("height", "width"), [(121, 161), (180, 400), (239, 160), (120, 333)])
 def test_areas_that_divide_pixels_share_them(height, width):
     frame = np.random.default_rng(3).uniform(0, 255, (height, width, 3))
     image = tactile_image(validate(frame[None], camera(height, width)))
-    rows, columns = min(height, 60), min(width, 80)
+    rows, columns = min(height, 120), min(width, 160)
     truth = np.einsum("rh,hwk,cw->rck", shares(height, rows), frame, shares(width, columns), optimize=True)
     assert np.allclose(image, truth.transpose(0, 2, 1).reshape(rows * 3, columns) / 127.5 - 1, atol=1e-6)
 

@@ -20,6 +20,7 @@ from scroll_tactile.errors import DatasetError, InputError, WeightsError
 from scroll_tactile.pipelines.cells import Cell, pooled, split, time_left
 from scroll_tactile.pipelines.efficiency import Efficiency, curves, first_touches
 from scroll_tactile.pipelines.studies import Study
+from scroll_tactile.pipelines.systems.trained import Trained
 from scroll_tactile.pipelines.table1 import PAPER, Table1, blocked, rows
 from scroll_tactile.sensors import Sensor
 
@@ -204,6 +205,14 @@ class TestTable1:
         file.write_bytes(b"other")
         assert Study([recordings], ("svm",), weights=str(file)).plan != one
         assert Study([recordings], ("svm",), weights="resnet18").plan["weights"] == "resnet18"
+
+
+def test_the_table_trains_a_whole_course_and_efficiency_the_papers_beginning(recordings: Recordings):
+    cell = Cell("RoboSkin-20", 0, "conv-lstm")
+    for study, patience in ((Table1, 2), (Efficiency, 10)):
+        system = study([recordings], ("conv-lstm",), epochs=20)._system(cell)
+        assert isinstance(system, Trained)
+        assert (system.course.epochs, system.course.patience) == (20, patience)
 
 
 class TestEfficiency:

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.windows import MOST_WINDOWS, extent, fitting, milestones, scales, scored, stages
+from scroll_tactile.windows import MOST_WINDOWS, Reading, extent, fitting, milestones, scales, scored, stages
 
 
 def sensor(rate, duration, **settings):
@@ -26,7 +26,7 @@ def test_the_shortest_scale_is_a_third_of_a_second_and_a_camera_has_one():
     assert scales(BIOTAC)[0] == 30
     assert scales(ROBOSKIN)[0] == 15
     assert scales(SLOW)[0] == 9  # no fewer than a kernel has taps
-    assert scales(GELSIGHT) == (80,)
+    assert scales(GELSIGHT) == (160,)
     assert scales(CAMERA) == (32,)
     assert scales(SHORT) == (30,)
 
@@ -116,3 +116,14 @@ def test_a_longer_touch_never_has_fewer_stages_or_scales():
         assert now[0] >= before[0]
         assert now[1] >= before[1]
         before = now
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])
+def test_the_windows_of_a_camera_are_its_frames(frames):
+    reading = Reading.of(CAMERA, None)
+    starts = reading.extent(32 * frames)[32]
+    assert len(starts) == min(frames, MOST_WINDOWS)
+    assert starts[0] == 0
+    assert starts[-1] == 32 * (frames - 1)
+    assert all(start % 32 == 0 for start in starts)
+    assert reading.scored(32 * frames, 32 * frames) == {32: list(range(len(starts)))}

@@ -1,4 +1,4 @@
-"""`scroll-tactile fabric`: letters, slides and attributes here, `contactile` in a module of its own."""
+"""`scroll-tactile fabric`: letters, slides, attributes and objects here, `contactile` in a module of its own."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from rich.table import Table
 from scroll_tactile.cli.contactile import contactile
 from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
-from scroll_tactile.datasets import biotac_slide, fabric_slide, letter_spike
+from scroll_tactile.datasets import biotac_slide, fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.letter_spike import DOTS
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines import objects
 from scroll_tactile.pipelines.attributes import Attributes
 from scroll_tactile.pipelines.attributes import summary as summary_of_attributes
 from scroll_tactile.pipelines.fabric import FIGURES, Letters, SlideTransfer, summary
@@ -25,7 +26,7 @@ __all__ = ["fabric"]
 fabric = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    help="What a touch is made of: fabrics, letters of dots, attributes; fabrics slid over otherwise.",
+    help="What a touch is made of: fabrics, letters of dots, attributes, objects; fabrics slid over otherwise.",
 )
 fabric.command()(contactile)
 
@@ -133,6 +134,61 @@ def attributes(
         command = shlex.join(["scroll-tactile", *map(str, words)])
         write_json(json, origin(command) | {"seed": seed, "sets": found})
         say(f"figures: {json}")
+
+
+def gelsight(
+    data: Annotated[Path, typer.Option(help="Folder of physiclear, or the one it lies in.")],
+    weights: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a trained ResNet: a file, or a published name such as resnet18. Without, only counts are read."
+        ),
+    ] = None,
+    folds: Annotated[str, typer.Option(help='Which folds of videos: "all", or numbers such as 0,1.')] = "all",
+    groups: Annotated[int, typer.Option(min=2, help="Objects are left out in so many groups.")] = 5,
+    seed: Annotated[int, typer.Option(min=0, help="Deals videos and objects, and grows the trees.")] = 0,
+    trees: Annotated[int, typer.Option(min=0, help="Of the baseline, scikit-learn's; 0: none.")] = objects.TREES,
+    json: JsonFile = None,
+    run: RunFolder = None,
+) -> None:
+    """Tell everyday objects by a GelSight's videos, and how hard and rough those are that were never touched."""
+    require_folders(json)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        recordings = physiclear.videos(physiclear.load(data, seed))
+        attributes = physiclear.read_attributes(data)
+        felt = set(recordings.materials)
+        known = {name: values for name, values in attributes.items() if name in felt}
+        task = objects.Objects(recordings, known, weights, groups, seed, trees, run)
+        results = list(task.run(parse_folds(folds, recordings), progress))
+    means = objects.summary(results)
+    _show_objects(means)
+    if json is not None:
+        words = ["fabric", "gelsight", "--data", data, *(["--weights", weights] if weights else []), "--folds", folds]
+        words += ["--groups", groups, "--seed", seed, "--trees", trees]
+        command = shlex.join(["scroll-tactile", *map(str, words)])
+        write_json(json, origin(command, recordings) | task.plan | {"means": means, "parts": results})
+        say(f"figures: {json}")
+
+
+def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    def told(figure: Mapping[str, float] | None) -> str:
+        return "" if figure is None else f"{percent(figure['mean'])} ({percent(figure['sd'])})"
+
+    counts, network = means.get("known, counts", {}), means.get("known, network", {})
+    head = ("counts", "network", "trees")
+    table = Table("GelSight, objects that were touched", *head, title="right by video (sd over folds)")
+    table.add_row("frames together", *map(told, (counts.get("video"), network.get("video"), counts.get("trees"))))
+    table.add_row(
+        "majority of frames", *map(told, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
+    )
+    table.add_row("a single frame", *map(told, (counts.get("frame"), network.get("frame"), None)))
+    console().print(table)
+    new = means.get("never touched", {})
+    table = Table("GelSight, objects never touched", "ours", "trees", "always the commonest", title="right by video")
+    for name in physiclear.ATTRIBUTES:
+        table.add_row(name, *(told(new.get(name + what)) for what in ("", ", trees", ", always")))
+    console().print(table)
 
 
 def _show_letters(results: Sequence[Mapping[str, Any]]) -> None:

@@ -104,6 +104,7 @@ def table1(
             "GelSight frames are those of PhysiCLeAR, split by video: the paper's GelSight-45 is not public, and its "
             "figures stand beside nothing of ours: "
             + "; ".join(f"{SYSTEMS[k]} {percent(p['GelSight-45'])}" for k, p in PAPER.items() if "GelSight-45" in p)
+            + ". Ours read frames with Frames: kernels are its counts, vision its network"
         )
     close(study, results, json, {"rows": found}, sets, folds)
 

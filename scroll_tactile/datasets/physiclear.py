@@ -4,14 +4,17 @@ From github.com/clear-nus/octopi (S. Yu et al., Octopi: Object Property Reasonin
 RSS 2024), laid out as::
 
     physiclear/<object>/<object>_<video>_<frame>.jpg      four frames, 0 to 3, in which the gel touches the object
+    physiclear/attributes.json                            hardness, roughness and texture of most objects: 0, 1 or 2
 
 Frames of one video are all but the same picture: they lie in one fold, or the test would be of what was learned.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +26,14 @@ from scroll_tactile.errors import DatasetError, InputError, StreamError
 from scroll_tactile.sensors import GELSIGHT, Sensor
 from scroll_tactile.streams import Stream, validate
 
-__all__ = ["FRAMES", "HALF_SIZE", "load"]
+__all__ = ["ATTRIBUTES", "FRAMES", "HALF_SIZE", "load", "read_attributes", "videos"]
 
 FOLDER = "physiclear"
 FRAMES = 4
 """Frames of a video."""
+
+ATTRIBUTES = ("hardness", "roughness", "texture")
+"""Of objects, each 0, 1 or 2."""
 
 HALF_SIZE: Sensor = GELSIGHT.model_copy(update={"channels": 120 * 160 * 3, "layout": (120, 160, 3)})
 """The camera at the size that frames are read in: 320 × 240, averaged over 2 × 2 pixels."""
@@ -73,6 +79,50 @@ def load(root: str | Path, seed: int = 0) -> Recordings:
         fold=np.array(folds),
         ordered=False,
     )
+
+
+def videos(recordings: Recordings) -> Recordings:
+    """The recordings that `load` gives with each video as one stream, (4, 120, 160, 3): all its frames in contact.
+
+    Raises InputError for recordings whose frames of a video are not in one fold.
+    """
+    marks = list(zip(recordings.materials, recordings.repetition.tolist(), strict=True))
+    places: dict[tuple[str, int], list[int]] = {}
+    for at, mark in enumerate(marks):
+        places.setdefault(mark, []).append(at)
+    if any(len(set(recordings.fold[those].tolist())) > 1 for those in places.values()):
+        raise InputError(f"expected the frames of each video of {recordings.name} in one fold; some are in several")
+    first = [those[0] for those in places.values()]
+    joined = [np.concatenate([recordings.streams[at].readings for at in those]) for those in places.values()]
+    return replace(
+        recordings,
+        name="GelSight videos",
+        streams=[validate(readings, recordings.sensor) for readings in joined],
+        materials=[recordings.materials[at] for at in first],
+        repetition=recordings.repetition[first],
+        fold=recordings.fold[first],
+    )
+
+
+def read_attributes(root: str | Path) -> dict[str, dict[str, int]]:
+    """Object → hardness, roughness and texture, each 0, 1 or 2, of the objects of which all three are published.
+
+    root: as for `load`. Raises DatasetError where the file is missing or not as published.
+    """
+    path = _find(Path(root).expanduser()) / "attributes.json"
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        of_each = {name: {key: told[name][key] for key in told[name]} for name in ATTRIBUTES}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"expected {', '.join(ATTRIBUTES)} of the objects in {path}; they cannot be read: {error!r}. It is part of "
+            "the annotations of github.com/clear-nus/octopi"
+        ) from error
+    strange = {value for values in of_each.values() for value in values.values()} - {0, 1, 2}
+    if strange:
+        raise DatasetError(f"expected attributes of 0, 1 or 2 in {path}; it also has {sorted(map(str, strange))}")
+    known = set.intersection(*(set(values) for values in of_each.values()))
+    return {key: {name: of_each[name][key] for name in ATTRIBUTES} for key in sorted(known)}
 
 
 def _find(root: Path) -> Path:

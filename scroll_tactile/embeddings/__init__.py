@@ -1,6 +1,7 @@
 """Embeddings: frozen maps from a tactile image of any size to a feature vector."""
 
 from scroll_tactile.embeddings.check import check_embedding
+from scroll_tactile.embeddings.frames import Frames
 from scroll_tactile.embeddings.joined import Joined
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.maps import Maps
@@ -11,6 +12,7 @@ from scroll_tactile.embeddings.vision import Vision
 
 __all__ = [
     "Embedding",
+    "Frames",
     "Joined",
     "Kernels",
     "Maps",

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.contact import rest_of
 from scroll_tactile.embeddings.protocol import Embedding, embed_windows
 from scroll_tactile.errors import InputError
 
@@ -22,7 +23,7 @@ class Joined:
     Each one's features are divided by its bound, so that all lie in [-1, 1]. Windows are those that every part can
     read, and they are judged as the most demanding part asks for.
 
-    Raises InputError for fewer than two embeddings.
+    Raises InputError for fewer than two embeddings, or two that have other resting images of a camera.
 
     >>> from scroll_tactile.embeddings.kernels import Kernels
     >>> Joined(Kernels(dimension=64), Kernels(seed=2, dimension=128))
@@ -47,6 +48,11 @@ class Joined:
         self.judged_scales: Literal["widest", "all"] = "widest" if widest else "all"
         asked = [tuple(getattr(part, "penalties", ())) for part in embeddings]
         self.penalties: tuple[float, ...] = tuple(sorted(set().union(*asked))) if all(asked) else ()
+        framed = [part for part in embeddings if getattr(part, "reads_frames", False)]
+        self.reads_frames = bool(framed)
+        self.rest = rest_of(framed[0]) if framed else None
+        if not all(np.array_equal(rest_of(part), self.rest) for part in framed):  # type: ignore[arg-type]
+            raise InputError(f"expected embeddings of frames with one resting image; came {framed}")
 
     def __repr__(self) -> str:
         return f"Joined({', '.join(map(repr, self.parts))})"

@@ -130,7 +130,7 @@ class Kernels:
                 for width, count in uses.items():
                     last = first + len(windows[width])
                     places = min(width, readings) - (TAPS - 1) * dilation
-                    pooled[width].append(_angles(places)[counts[first:last, :count]])
+                    pooled[width].append(angles(places)[counts[first:last, :count]])
                     first = last
             for width, starts in windows.items():
                 if self._proportions(width) == self.dimension:
@@ -219,7 +219,7 @@ def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ..
 
 
 @lru_cache(maxsize=1024)
-def _angles(places: int) -> npt.NDArray[np.float32]:
+def angles(places: int) -> npt.NDArray[np.float32]:
     """(2/π)·asin √(k/places) for k = 0 … places, rounded to 2⁻²⁰, so that machines' sines do not matter."""
     exact = np.arcsin(np.sqrt(np.arange(places + 1) / places)) * (2 / np.pi)
     return (np.rint(exact * 2.0**20) / 2.0**20).astype(np.float32)

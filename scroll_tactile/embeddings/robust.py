@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.noisy import is_noisy, noisy_features
 from scroll_tactile.embeddings.protocol import Embedding, canary, embed_windows
+from scroll_tactile.errors import InputError
 
 __all__ = ["Robust"]
 
@@ -33,6 +34,8 @@ class Robust:
     Broken wires: a channel that reads the low end of the range throughout is filled in from the others before anything
     is embedded, see `scroll_tactile.filling`.
 
+    Raises InputError for an embedding of a camera's frames.
+
     >>> Robust(Kernels(dimension=64))
     Robust(Kernels(seed=1, dimension=64), seed=1)
     """
@@ -49,6 +52,8 @@ class Robust:
         self.partial_windows: bool = getattr(self.inner, "partial_windows", True)
         self.judged_scales: Literal["widest", "all"] = getattr(self.inner, "judged_scales", "all")
         self.penalties: tuple[float, ...] = getattr(self.inner, "penalties", ())
+        if getattr(self.inner, "reads_frames", False):
+            raise InputError(f"expected an embedding of channels, whose noise and wires are known; came {self.inner!r}")
 
     def __repr__(self) -> str:
         return f"Robust({self.inner!r}, seed={self.seed})"

@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings import Embedding, Kernels
+from scroll_tactile.embeddings import Embedding, Frames, Kernels
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
@@ -53,8 +53,8 @@ def open_memory(
 ) -> TactileLearner:
     """Open a memory, or make one where there is nothing and a sensor is given.
 
-    A memory of kernels is opened with as many of them as it was made with; of another embedding, or another seed,
-    with the default one, which the learner then refuses by name.
+    A memory of kernels is opened with as many of them as it was made with, one of frames with `Frames()`; of another
+    embedding, seed or resting image, with the default one, which the learner then refuses by name.
 
     Raises InputError for a new memory without a sensor, and what `TactileLearner.open` raises.
     """
@@ -68,7 +68,9 @@ def open_memory(
             raise InputError(f"{error}. To make a new memory, say whose readings these are, with --sensor") from error
         return TactileLearner.open(path, sensor=sensor, mode=mode)
     usual = Kernels()
-    embedding = usual
-    if isinstance(made, dict) and made.get("name") == usual.name and isinstance(made.get("dimension"), int):
+    embedding: Embedding | None = usual
+    if isinstance(made, dict) and made.get("name") == Frames.name:
+        embedding = None  # the usual one of a camera
+    elif isinstance(made, dict) and made.get("name") == usual.name and isinstance(made.get("dimension"), int):
         embedding = Kernels(dimension=made["dimension"])
     return TactileLearner.open(path, sensor=sensor, embedding=embedding, mode=mode)

@@ -22,8 +22,9 @@ from scroll_tactile.training import Progress
 
 __all__ = ["NOT_OF_FRAMES", "Study", "weights_digest"]
 
-NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn")
-"""Systems of streams, for which the paper has no figure on a camera's frames, and which are not run on them."""
+NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda")
+"""What is not run on a camera's frames: systems of streams, for which the paper has no figure there, and ours of two
+embeddings, for `Frames` with a network is one."""
 
 QUICK_COLUMNS = 50  # about, of the residual networks' images in a quick run
 QUICK_EVERY = 2  # of the recordings that are learned in a quick run
@@ -126,9 +127,8 @@ class Study:
     def _catalogue(self, recordings: Recordings) -> Catalogue:
         columns = recordings.sensor.shape[1] if recordings.sensor.camera else recordings.sensor.readings
         every = max(1, round(columns / QUICK_COLUMNS)) if self.quick else 1
-        return Catalogue(
-            self.weights, Course(epochs=self.epochs, precision=self.precision), self.device, every, self.seed
-        )
+        camera = recordings.sensor.camera
+        return Catalogue(self.weights, self.course, self.device, every, self.seed, camera=camera)
 
 
 def weights_digest(weights: str) -> str:

@@ -10,7 +10,7 @@ from functools import cached_property
 from torch import nn
 
 from scroll_tactile.augment import Augmentation
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
+from scroll_tactile.embeddings import Embedding, Frames, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
@@ -65,9 +65,10 @@ class Catalogue:
 
     weights: of a trained ResNet: a file or a published name; None: the systems in NEED_WEIGHTS cannot be made.
     course: of the networks' training, in whose precision the residual ones alone are trained: the others are small.
-    device: of all networks but ours. every: columns that the residual networks'
-    images are averaged over (1: as recorded). seed: of the control's random weights. augmentation: of every touch that
-    a network is trained on, in every epoch; the paper's table has none.
+    device: of all networks but ours. every: columns that the residual networks' images are averaged over (1: as
+    recorded). seed: of the control's random weights. augmentation: of every touch that a network is trained on, in
+    every epoch; the paper's table has none. camera: whether frames are read: then ours are `Frames`, by its counts in
+    place of kernels, and by its network in place of vision.
     """
 
     weights: str | os.PathLike[str] | None = None
@@ -76,6 +77,7 @@ class Catalogue:
     every: int = 1
     seed: int = 0
     augmentation: Augmentation | None = None
+    camera: bool = False
 
     def make(self, key: str) -> System:
         """A new system. Raises InputError for a name that is not there, or weights that are needed and not given."""
@@ -139,12 +141,12 @@ class Catalogue:
 
     @cached_property
     def _kernels(self) -> Embedding:
-        return Cached(Kernels())
+        return Cached(Frames(rest=None) if self.camera else Kernels())
 
     @cached_property
     def _vision(self) -> Embedding:
         assert self.weights is not None
-        return Cached(Vision(self.weights))
+        return Cached(Frames(self.weights, rest=None) if self.camera else Vision(self.weights))
 
     @cached_property
     def _both(self) -> Embedding:

@@ -66,6 +66,9 @@ class Augmented:
     until the end of the touch. noisy: how many copies more that differ in noise alone. noise: its largest amplitude,
     uniform and as a share of the range; the least is a tenth of that.
 
+    thinned: whether the fastest copy has every n-th reading, n the whole part of `speed`, 2 or more. Readings of the
+    other copies lie between two of the touch's, and are smoothed by that as no sensor smooths.
+
     The speeds are spread evenly over the copies, two of them faster for each that is slower: there is less of a fast
     touch to be known by. A copy is no longer than the touch: what is slower is cut off there, as it is where it is
     asked about.
@@ -80,21 +83,26 @@ class Augmented:
     gain: float = 0.0
     noisy: int = 0
     noise: float = 1.0
+    thinned: bool = False
 
     def __post_init__(self) -> None:
         counts = (self.copies, self.noisy)
-        whole = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in counts)
+        counted = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in counts)
         strengths = (self.speed - 1, self.dead, self.offset, self.gain, self.noise)
         possible = all(math.isfinite(one) and one >= 0 for one in strengths) and self.dead < 1
-        if not whole or not possible or not sum(counts):
+        thinnable = self.speed >= 2 and self.copies > 0
+        if not counted or not possible or not sum(counts) or (self.thinned and not thinnable):
             raise InputError(
-                f"expected 1 copy or more in all, a speed of 1 or more, dead in [0, 1), and offset, gain and noise of "
-                f"0 or more; came {self}"
+                f"expected 1 copy or more in all, a speed of 1 or more, dead in [0, 1), offset, gain and noise of 0 or "
+                f"more, and to be thinned a copy and a speed of 2 or more; came {self}"
             )
 
     def to_json(self) -> dict[str, Any]:
-        """All of it in JSON's types, as a memory keeps it."""
-        return asdict(self)
+        """All of it in JSON's types, as a memory keeps it.
+
+        `thinned` only where it is asked for: memories from before it was there are of the same making as without it.
+        """
+        return {name: one for name, one in asdict(self).items() if name != "thinned" or one}
 
     def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> tuple[list[Image], list[Image]]:
         """The copies of a touch and its noisy copies, each float32 of shape (C, T') in [-1, 1], T' ≤ T.
@@ -103,16 +111,24 @@ class Augmented:
         `Stream.key`.
         """
         rng = np.random.default_rng([1, int.from_bytes(key, "little")])
-        copies = [self._copy(image, (at + rng.random()) / self.copies, rng) for at in range(self.copies)]
+        copies = [self._copy(image, at, rng) for at in range(self.copies)]
         amplitudes = self.noise * (0.1 + 0.9 * rng.random(self.noisy))
         return copies, [hiss(image, float(amplitude), rng) for amplitude in amplitudes]
 
-    def _copy(self, image: Image, pace: float, rng: np.random.Generator) -> Image:
+    def _copy(self, image: Image, at: int, rng: np.random.Generator) -> Image:
+        pace = (at + rng.random()) / self.copies
         dead, offset, gain = rng.random(3)
+        copy = self._paced(image, pace) if at + 1 < self.copies or not self.thinned else self._thinned(image)
+        copy = wander(copy, offset * self.offset, gain * self.gain, rng)
+        return silence(copy, dead * self.dead, rng)
+
+    def _paced(self, image: Image, pace: float) -> Image:
         much = (3 * pace - 1) / 2 if pace > 1 / 3 else 3 * pace
         factor = 1 + much * (self.speed - 1)
         columns = image.shape[1]
         copy = resize(image, max(1 / factor if pace > 1 / 3 else factor, FEWEST / columns))
-        copy = crop(copy, 0, min(columns, copy.shape[1]))
-        copy = wander(copy, offset * self.offset, gain * self.gain, rng)
-        return silence(copy, dead * self.dead, rng)
+        return crop(copy, 0, min(columns, copy.shape[1]))
+
+    def _thinned(self, image: Image) -> Image:
+        step = min(math.floor(self.speed), max(1, image.shape[1] // FEWEST))
+        return np.ascontiguousarray(image[:, ::step])

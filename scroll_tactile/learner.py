@@ -309,7 +309,7 @@ class TactileLearner:
         image = self._perception.image(felt)
         columns = image.shape[1]
         if model.noisy is not None and self._perception.is_noisy(image):
-            judgement = model.judge_noisy(candidates, self._perception.noisy_mean(image))
+            judgement = model.judge_noisy(candidates, self._perception.noisy_means(image))
             return self._prediction(candidates, judgement, felt)
         image = self._mended(image)
         means = self._perception.means(image, model.needed(candidates, columns))

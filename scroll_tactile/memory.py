@@ -233,9 +233,9 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> Touch:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-        if NOISY in codes:  # the first noisy copy, at a stage behind all that a touch can reach
+        if all(scale in codes for scale in NOISY):  # the first noisy copy, at a stage behind all that a touch can reach
             unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
-            stages += [*unreached, {NOISY: [0]}]
+            stages += [*unreached, {scale: [0] for scale in NOISY}]
         return Touch.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:

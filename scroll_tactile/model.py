@@ -56,8 +56,8 @@ class Model:
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
             noisy = None
-            if NOISY in selections:
-                noisy = calibrate_stage(len(stages), memory.pool, [selections[NOISY]], kind)
+            if all(scale in selections for scale in NOISY):
+                noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISY], kind)
         give_back_scratch()
         return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations, noisy)
 
@@ -99,7 +99,7 @@ class Model:
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
-                logits = self._logits(stage, z, names)
+                logits = self._weighted(self.stages[stage], self.calibrations[stage], z, names)
             chances = np.exp(logits - logits.max())
             probability[members] = chances / chances.sum() * mass
             later = decided[at + 1][1] if at + 1 < len(decided) else []
@@ -110,15 +110,13 @@ class Model:
         distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
 
-    def judge_noisy(self, candidates: Sequence[str], features: FloatArray) -> Judgement:
-        """Weigh the candidates for a touch felt through noise; features: in the codes' unit, (d,)."""
+    def judge_noisy(self, candidates: Sequence[str], means: Mapping[int, FloatArray]) -> Judgement:
+        """Weigh the candidates for a touch felt through noise; means: scale → its features in the codes' unit, (d,)."""
         assert self.noisy is not None
-        selection = self.selections[NOISY]
-        z = selection.readout.project(features)
-        places = [selection.places[name] for name in candidates]
-        logits = self.noisy.weights[0] * selection.readout.scores(z, self.kind)[places]
+        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
+        logits = self._weighted(NOISY, self.noisy, z, candidates)
         chances = np.exp(logits - logits.max())
-        novelty = self.noisy.novelty(np.array([self._distance(NOISY, z, candidates)]))
+        novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISY]))
         return Judgement(chances / chances.sum(), float(novelty), self.noisy)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
@@ -135,9 +133,11 @@ class Model:
         known = [self.selections[scale].places for scale in scales]
         return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
 
-    def _logits(self, stage: int, z: Mapping[int, FloatArray], names: Sequence[str]) -> FloatArray:
+    def _weighted(
+        self, scales: Sequence[int], calibration: Calibration, z: Mapping[int, FloatArray], names: Sequence[str]
+    ) -> FloatArray:
         logits = np.zeros(len(names))
-        for scale, weight in zip(self.stages[stage], self.calibrations[stage].weights, strict=True):
+        for scale, weight in zip(scales, calibration.weights, strict=True):
             selection = self.selections[scale]
             places = [selection.places[name] for name in names]
             logits += weight * selection.readout.scores(z[scale], self.kind)[places]

@@ -60,7 +60,7 @@ class Perception:
         own, *others = [self.features(one) for one in (image, *copies, *noisy * (not self._reading.noisy))]
         read = {scale: [rows, *(one[scale] for one in others if scale in one)] for scale, rows in own.items()}
         if self._reading.noisy and noisy:
-            read[NOISY] = [self._noisy_features(one)[None] for one in noisy]
+            read |= {scale: [rows] for scale, rows in zip(NOISY, self._noisy_features(noisy), strict=True)}
         if self._reading.filled:
             read[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
         return {scale: to_codes(np.concatenate(rows), self._embedding.bound) for scale, rows in sorted(read.items())}
@@ -105,10 +105,11 @@ class Perception:
         """Whether a touch was felt through noise, by an embedding that tells; a function of the touch alone."""
         return self._reading.noisy and cast(Robust, self._embedding).is_noisy(image)
 
-    def noisy_mean(self, image: Image) -> npt.NDArray[np.float64]:
-        """The features of a touch felt through noise, in the codes' unit, (d,)."""
-        return in_units(self._noisy_features(image), self._embedding.bound)
+    def noisy_means(self, image: Image) -> dict[int, npt.NDArray[np.float64]]:
+        """The features of a touch felt through noise, in the codes' unit, (d,) by scale."""
+        sets = self._noisy_features([image])
+        return {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISY, sets, strict=True)}
 
-    def _noisy_features(self, image: Image) -> npt.NDArray[np.floating]:
+    def _noisy_features(self, images: Sequence[Image]) -> npt.NDArray[np.floating]:
         embedding = cast(Robust, self._embedding)  # which `Reading.of` found to have it
-        return embedding.embed_noisy(image)
+        return embedding.embed_noisy(images)

@@ -41,7 +41,7 @@ MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenl
 FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
 # Scales that are no widths, and smaller than any width:
-NOISY = 0  # the whole of a touch felt through noise
+NOISY = (0, 3)  # the whole of a touch felt through noise, in two sets of features
 BEGINNING = 1  # the first of the narrowest windows, by itself
 CHANNELS = 2  # readings themselves, by which silent channels are filled in; it judges nothing
 
@@ -179,7 +179,8 @@ class Reading:
     @property
     def scales(self) -> tuple[int, ...]:
         """All that has statistics of its own, ascending: the widths, and before them NOISY, BEGINNING, CHANNELS."""
-        return (NOISY,) * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled + self.widths
+        own = NOISY * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled
+        return (*sorted(own), *self.widths)
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""

@@ -79,6 +79,33 @@ def test_roboskin_is_the_publishers_five_files(roboskin, real_data):
     assert stream.readings[40, 3 * 10 + 6] == raw[17, 3, 6, 40]
 
 
+def test_unmixed_roboskin_is_in_the_order_of_time(roboskin, real_data):
+    unmixed = load(real_data, "roboskin", unmixed=True)
+    assert unmixed.name == "RoboSkin-20, unmixed"
+    assert unmixed.materials == roboskin.materials
+    steps = []
+    for one, mixed in zip(unmixed.streams, roboskin.streams, strict=True):
+        assert np.array_equal(np.sort(one.readings, axis=None), np.sort(mixed.readings, axis=None))
+        steps.append([np.abs(np.diff(stream.readings, axis=0)).mean(axis=1) for stream in (one, mixed)])
+    mean, mixed = np.mean(steps, axis=0)
+    assert mean.max() < 0.2 * mixed.min()  # at the ends of published rows, too
+
+
+def test_readings_are_put_back_where_they_were_mixed_up(tmp_path):
+    in_order = np.arange(10 * 75 * 6).reshape(10, 75, 6) % 190  # taxels, readings, patches
+    folder = tmp_path / "compiled_data"
+    folder.mkdir()
+    published = np.stack([in_order.reshape(10, 6, 75).transpose(1, 0, 2)] * 200).astype(np.float32)
+    for name in ("val_0", "val_1", "val_2", "val_3", "test"):
+        np.save(folder / f"icub_{name}.npy", published)
+        np.save(folder / f"labels_{name}.npy", np.arange(200) % 20)
+    stream = load(tmp_path, "roboskin", unmixed=True).streams[0]
+    assert stream.readings[40, 3 * 10 + 6] == in_order[6, 40, 3]
+    assert load(tmp_path, "roboskin").streams[0].readings[40, 3 * 10 + 6] == published[0, 3, 6, 40]
+    with pytest.raises(InputError, match="published in order"):
+        load(tmp_path, "biotac", unmixed=True)
+
+
 def test_roboskin_repetitions_count_within_material_and_fold(roboskin):
     seen = {
         (material, fold, repetition)

@@ -73,6 +73,18 @@ class TestCopies:
         plain = Augmented(copies=2, speed=1, noisy=1, noise=0)
         assert [copy.tobytes() for copy in both(plain, RAMP, b"key")] == [RAMP.tobytes()] * 3
 
+    def test_the_fastest_is_thinned_and_the_others_are_as_without(self):
+        settings = {"copies": 3, "speed": 3.5, "dead": 0.5, "noisy": 2}
+        thinned, plain = (both(Augmented(**settings, thinned=one), RAMP, b"key") for one in (True, False))
+        assert [one.tobytes() for one in thinned[:2] + thinned[3:]] == [one.tobytes() for one in plain[:2] + plain[3:]]
+        heard = (thinned[2] != -1).any(axis=1)
+        assert thinned[2][heard].tobytes() == RAMP[heard, ::3].tobytes()
+        assert both(Augmented(copies=1, thinned=True), RAMP[:, :3], b"key")[0].shape == (3, 3)  # of which no two can go
+
+    def test_memories_from_before_there_were_thinned_copies_are_of_the_same_making(self):
+        assert "thinned" not in Augmented().to_json()
+        assert Augmented(**Augmented(thinned=True).to_json()).thinned
+
     def test_noise_fills_its_amplitude_and_the_range_ends_it(self):
         noise = hiss(np.zeros((4, 2000), np.float32), 0.25, np.random.default_rng(0))
         assert 0.49 < noise.max() <= 0.5
@@ -101,6 +113,8 @@ class TestCopies:
             {"dead": 1.0},
             {"noise": -1},
             {"gain": np.nan},
+            {"thinned": True, "speed": 1.9},
+            {"thinned": True, "copies": 0, "noisy": 1},
         ],
     )
     def test_strengths_that_cannot_be_are_refused(self, wrong):

@@ -8,6 +8,7 @@ from test_copies import contents
 from test_learner_machine import PAD, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner, sensors
+from scroll_tactile.copies import hiss
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings import Robust, check_embedding
 from scroll_tactile.embeddings.noisy import is_noisy, noisy_statistics
@@ -79,13 +80,29 @@ class TestEmbedding:
             np.ones((channels, columns)),
             rng.uniform(-1, 1, (channels, columns)),
         ):
-            features = SMALL.embed_noisy(image.astype(np.float32))
-            assert features.shape == (64,)
+            features = SMALL.embed_noisy([image.astype(np.float32)])
+            assert features.shape == (2, 1, 64)
             assert np.abs(features).max() <= 1
             statistics = noisy_statistics(image.astype(np.float32), 4)
             assert statistics.shape == (28, channels)
             assert (statistics == np.rint(statistics)).all()
             assert np.abs(statistics).max() < 2**15
+
+    def test_noisy_features_are_the_same_bits_in_any_company(self):
+        images = [np.random.default_rng(at).uniform(-1, 1, (3, 40 + at)).astype(np.float32) for at in range(5)]
+        alone = np.concatenate([SMALL.embed_noisy([image]) for image in images], axis=1)
+        assert SMALL.embed_noisy(images).tobytes() == alone.tobytes()
+        assert not np.array_equal(*SMALL.embed_noisy(images))  # the second set says other things
+
+    def test_more_noise_says_the_same_of_the_touch_beneath(self):
+        rest, pressed = np.full((6, 4000), -1, np.float32), np.full((2, 4000), -0.6, np.float32)
+        touch = np.concatenate([rest, pressed])  # two channels at a fifth of the range
+        rng = np.random.default_rng(0)
+        little, much = (noisy_statistics(hiss(touch, amplitude, rng)) for amplitude in (0.25, 0.5))
+        spread = noisy_statistics(hiss(touch, 0.5, rng)) - much
+        told = np.r_[0:4, 6]  # how often the edge is passed by margins below a fifth, and how often all is lost
+        assert np.abs(little - much)[told].max() <= 200 + 3 * np.abs(spread)[told].max()
+        assert (much[told, 6:].min(axis=1) - much[told, :6].max(axis=1) > 300).all()
 
     def test_noise_is_told_from_touch(self, scene):
         for name in NAMES:
@@ -100,9 +117,9 @@ class TestMemory:
     def test_what_each_observation_adds(self):
         learner = fed(FELT[:2])
         statistics = learner._memory.statistics
-        assert statistics.scales[:3] == (NOISY, BEGINNING, CHANNELS)
-        rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (NOISY, BEGINNING, CHANNELS)]
-        assert rows == [2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
+        assert statistics.scales[:4] == (NOISY[0], BEGINNING, CHANNELS, NOISY[1])
+        rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISY, BEGINNING, CHANNELS)]
+        assert rows == [2 * 2, 2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
         assert learner.materials == {"a": 1, "b": 1}
 
     def test_every_order_gives_the_same_bytes(self):

@@ -53,7 +53,7 @@ def speed(
     with progress_bar() as progress:
         result = run_speed(seed=seed, observations=observations, rounds=rounds, note=lambda what: progress(what, 0, 1))
         if data is not None:
-            sets = [read(dataset, data, seed) for dataset in Dataset]
+            sets = [read(dataset, data, seed) for dataset in (Dataset.BIOTAC, Dataset.ROBOSKIN)]
             result |= measure_frontier(sets, seed=seed, quick=quick, note=lambda what: progress(what, 0, 1))
     show_speed(result)
     if plot is not None:

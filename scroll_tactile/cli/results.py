@@ -8,7 +8,7 @@ from enum import StrEnum
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
@@ -25,11 +25,13 @@ class Dataset(StrEnum):
 
     BIOTAC = "biotac-20"
     ROBOSKIN = "roboskin-20"
+    UNMIXED = "roboskin-20-unmixed"  # in the order of time, which the published arrays are not in
 
 
 def read(dataset: Dataset, data: Path, seed: int) -> Recordings:
     """Read a recorded set. Raises DatasetError for a folder that is not laid out as published."""
-    return load(data, "biotac" if dataset is Dataset.BIOTAC else "roboskin", seed)
+    sensor: Literal["biotac", "roboskin"] = "biotac" if dataset is Dataset.BIOTAC else "roboskin"
+    return load(data, sensor, seed, unmixed=dataset is Dataset.UNMIXED)
 
 
 def parse_folds(folds: str, recordings: Recordings) -> list[int]:

@@ -5,11 +5,16 @@ see more, and the edges of the noise most of all: the range ends the noise at th
 amplitude never lifts a channel at rest beyond its edge, so that a single reading beyond it is evidence. So the noise's
 edge is estimated from the touch itself, and each channel is described by how often it passes the edge by some margins,
 by its highest readings, its mean, and how often it lies at the low end. Roots of frequencies have a spread that does
-not depend on them. The estimate is a function of the touch alone, and all arithmetic is exact, as in `levels`.
+not depend on them. Each of these is turned by the edge into what it says of the reading beneath: noise spread evenly in
+± e lets a reading s pass e with frequency s / 2e, and leaves it at the low end with (e − s) / 2e. So touches through
+little noise and much are alike, and one set of statistics serves all amplitudes (RoboSkin 80 % with copies of 30 to
+70 % of the range in it, 77 without the turning). The estimate is a function of the touch alone, and all arithmetic is
+exact, as in `levels`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,13 +24,12 @@ import torch
 from scroll_tactile.embeddings.banks import LEVELS, to_levels
 from scroll_tactile.embeddings.levels import PERIOD, TriangleFeatures
 
-__all__ = ["NoisyFeatures", "is_noisy", "noisy_features", "noisy_statistics"]
+__all__ = ["SETS", "NoisyFeatures", "is_noisy", "noisy_features", "noisy_statistics"]
 
 NOISY = 0.03  # of the range: the mean step between neighbours in the quieter channels of a noisy touch
 QUIET_CHANNELS = 4  # a quarter of the channels: enough of them are at rest
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.18, 0.28)  # of the range, above the noise's edge
 MARGINS_OF_PARTS = (0.0, 0.05)
-PARTS = 4  # where there is room for them: sensors of few channels
 HIGHEST = (0, 1, 3, 7)  # places among a channel's readings, from the top, of a hundred
 RANGE = 2 * LEVELS
 UNIT = 2**11  # statistics are integers, in 1/UNIT of what they are a share of
@@ -33,7 +37,9 @@ UNIT = 2**11  # statistics are integers, in 1/UNIT of what they are a share of
 FREQUENCY, LOW, MEAN, TOP = 2, 2, 6, 3
 MOST_TERMS = 64
 PACE = 1.2  # how many spreads of the noise turn a feature by one radian
-LINEAR = 0.5  # of the features, at most: the statistics themselves
+# Of each set: how many stretches of time where there is room for them, as for sensors of few channels; and the share
+# of features that are the statistics themselves, at most.
+SETS = ((4, 0.5), (20, 0.9))
 
 
 def is_noisy(image: npt.NDArray[np.float32]) -> bool:
@@ -50,7 +56,7 @@ def is_noisy(image: npt.NDArray[np.float32]) -> bool:
 
 
 def noisy_statistics(image: npt.NDArray[np.float32], parts: int = 0) -> npt.NDArray[np.float64]:
-    """Statistics of each channel about the noise's edge, shape (12 + 4 · parts, C), integers below 2¹⁵.
+    """Statistics of each channel about the noise's edge, shape (12 + 4 · parts, C), integers in ± 2¹⁵.
 
     image: shape (C, T) in [-1, 1]. The noise's edge is how far the highest reading lies above the middle one, in the
     quarter of the channels where that is least. parts: equal stretches of time that a third of the statistics are
@@ -60,7 +66,7 @@ def noisy_statistics(image: npt.NDArray[np.float32], parts: int = 0) -> npt.NDAr
     columns = above.shape[1]
     ordered = np.sort(above, axis=1)[:, ::-1]
     edge = int(np.sort(ordered[:, 0] - ordered[:, columns // 2])[len(above) // QUIET_CHANNELS])
-    tops = [ordered[:, place * columns // 100] * UNIT // RANGE * TOP for place in HIGHEST]
+    tops = [(ordered[:, place * columns // 100] - edge) * UNIT // RANGE * TOP for place in HIGHEST]
     rows = [*_frequencies(above, edge, MARGINS), *tops]
     for part in range(parts):
         first = min(part * columns // parts, columns - 1)
@@ -70,41 +76,48 @@ def noisy_statistics(image: npt.NDArray[np.float32], parts: int = 0) -> npt.NDAr
 
 
 def _frequencies(above: npt.NDArray[np.int64], edge: int, margins: tuple[float, ...]) -> list[npt.NDArray[np.integer]]:
-    """How often each channel passes the edge by each margin, how often it lies at the low end, and its mean."""
+    """What is told of each channel's readings by how often it passes the edge by each margin, by how often it lies at
+    the low end, and by its mean, as shares of the range: roots of the first."""
     columns = above.shape[1]
-    passed = [_root(np.count_nonzero(above - edge > margin * RANGE, axis=1), columns) for margin in margins]
-    low = np.count_nonzero(above == 0, axis=1) * UNIT // columns
-    mean = above.sum(axis=1) * UNIT // (RANGE * columns)
+    passed = [_root(np.count_nonzero(above - edge > margin * RANGE, axis=1) * 2 * edge, columns) for margin in margins]
+    low = (columns - 2 * np.count_nonzero(above == 0, axis=1)) * edge * UNIT // (RANGE * columns)
+    mean = (4 * above.sum(axis=1) - edge * columns) * UNIT // (4 * RANGE * columns)
     return [*(one * FREQUENCY for one in passed), low * LOW, mean * MEAN]
 
 
-def _root(counts: npt.NDArray[np.integer], columns: int) -> npt.NDArray[np.int64]:
-    roots: npt.NDArray[np.int64] = np.floor(np.sqrt(counts / columns) * UNIT).astype(np.int64)
+def _root(sums: npt.NDArray[np.integer], columns: int) -> npt.NDArray[np.int64]:
+    roots: npt.NDArray[np.int64] = np.floor(np.sqrt(sums / (RANGE * columns)) * UNIT).astype(np.int64)
     return roots
 
 
 class NoisyFeatures:
-    """`dimension` features of a noisy touch of C channels: statistics as they are, and triangle features of them."""
+    """`dimension` features of a noisy touch of C channels: statistics as they are, and triangle features of them.
 
-    def __init__(self, seed: int, channels: int, dimension: int) -> None:
-        room = int(dimension * LINEAR)
+    parts: stretches of time with statistics of their own, where they fit. linear: the largest share of the former.
+    """
+
+    def __init__(self, seed: int, channels: int, dimension: int, parts: int, linear: float) -> None:
+        room = int(dimension * linear)
         whole, part = (len(MARGINS) + 2 + len(HIGHEST)) * channels, (len(MARGINS_OF_PARTS) + 2) * channels
-        self.parts = PARTS if whole + PARTS * part <= room else 0
+        self.parts = parts if whole + parts * part <= room else 0
         inputs = whole + self.parts * part
         self.linear = min(inputs, room)
         self.triangles = _triangles(seed, inputs, dimension - self.linear)
 
-    def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Features in [-1, 1], float32 of shape (dimension,), of an image of shape (C, T) in [-1, 1]."""
-        statistics = noisy_statistics(image, self.parts).reshape(1, -1)
-        plain = (statistics[0, : self.linear] / (8 * UNIT)).astype(np.float32)
-        return np.concatenate([plain, self.triangles(statistics)[0]])
+    def __call__(self, images: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+        """Features in [-1, 1], float32 of shape (N, dimension), of N ≥ 1 images of shape (C, T) in [-1, 1].
+
+        Together, for the weights of the triangles are the larger part of what is read; the bits do not depend on it.
+        """
+        statistics = np.stack([noisy_statistics(image, self.parts).reshape(-1) for image in images])
+        plain = (statistics[:, : self.linear] / (8 * UNIT)).astype(np.float32)
+        return np.concatenate([plain, self.triangles(statistics)], axis=1)
 
 
 @lru_cache(maxsize=16)
-def noisy_features(seed: int, channels: int, dimension: int) -> NoisyFeatures:
-    """Make the features for touches of `channels` channels; the same arguments give the same features."""
-    return NoisyFeatures(seed, channels, dimension)
+def noisy_features(seed: int, channels: int, dimension: int) -> list[NoisyFeatures]:
+    """Make the sets of features for touches of `channels` channels; the same arguments give the same features."""
+    return [NoisyFeatures(seed + at, channels, dimension, *one) for at, one in enumerate(SETS)]
 
 
 def _triangles(seed: int, inputs: int, count: int) -> TriangleFeatures:

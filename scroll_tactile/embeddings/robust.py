@@ -24,10 +24,10 @@ class Robust:
     The beginning: a touch's first 0.3 s differ from the rest, and are all that there is of a short one. Statistics of
     them alone, and not of all narrow windows, know them better (BioTac: 95 % instead of 87).
 
-    Noise: a touch through noise (`is_noisy`, a function of the touch) is read with features made for it, and judged by
-    readouts of noisy copies alone; so its readouts give nothing up for it on clean touches, and probability and
-    novelty are calibrated on noisy copies. It takes an augmentation with `noisy` copies: without any, noisy touches are
-    judged as others are.
+    Noise: a touch through noise (`is_noisy`, a function of the touch) is read with features made for it, two sets of
+    them, and judged by readouts of noisy copies alone; so its readouts give nothing up for it on clean touches, and
+    probability and novelty are calibrated on noisy copies. It takes an augmentation with `noisy` copies: without any,
+    noisy touches are judged as others are.
 
     inner: the embedding that reads windows, Kernels(dimension=2016) unless given. seed: of the noisy features.
 
@@ -61,9 +61,9 @@ class Robust:
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the inner embedding's fingerprint, the seed and noisy features of two fixed images."""
-        digest = hashlib.sha256(f"robust 1 {self.inner.fingerprint} {self.inner.bound!r} {self.seed}".encode())
+        digest = hashlib.sha256(f"robust 2 {self.inner.fingerprint} {self.inner.bound!r} {self.seed}".encode())
         for channels, readings in ((1, 9), (5, 300)):
-            digest.update(self.embed_noisy(canary(channels, readings)).astype("<f4").tobytes())
+            digest.update(self.embed_noisy([canary(channels, readings)]).astype("<f4").tobytes())
         return digest.hexdigest()
 
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
@@ -80,6 +80,9 @@ class Robust:
         """Whether a touch is to be read by `embed_noisy`; image: (C, T) in [-1, 1]."""
         return is_noisy(image)
 
-    def embed_noisy(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Features in [-1, 1], float32 of shape (d,), of a whole touch felt through noise; image: (C, T) in [-1, 1]."""
-        return noisy_features(self.seed, len(image), self.dimension)(image)
+    def embed_noisy(self, images: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+        """Two sets of features in [-1, 1], float32 of shape (2, N, d), of N ≥ 1 whole touches felt through noise.
+
+        images: each of shape (C, T) in [-1, 1], all of as many channels.
+        """
+        return np.stack([features(images) for features in noisy_features(self.seed, len(images[0]), self.dimension)])

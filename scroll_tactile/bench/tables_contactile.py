@@ -50,11 +50,16 @@ def contactile(read: Callable[[str], Result]) -> str:
     always = [next(iter(where.values()))["always"] for where in (part, whole, held)]
     lines.append(["saying always what is more common", "", _percent(always[0]), "", "", "", *map(_percent, always[1:])])
     table = "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |").replace("|  |", "| |") for line in lines)
-    epochs, tuned, every = small["epochs"], small["biotac_epochs"], small["every"]
+    return f"{table}\n\n{_words(small, part)}"
+
+
+def _words(small: Result, part: Mapping[str, Mapping[str, Any]]) -> str:
+    told = next((cell["accuracy on BioTac"] for cell in part.values() if "accuracy on BioTac" in cell), None)
+    tuned = "" if told is None else f", after which it tells {100 * told:.0f} % of BioTac's touches"
     return (
-        f"{table}\n\n{small['fabrics']} simulated fabrics of {len(small['constituents'])} constituents, learned from a "
-        f"robot's touches and asked about a hand's.\nNetworks: {epochs} epochs where the paper has 50 ({tuned} on "
-        f"BioTac), images averaged over {every} columns."
+        f"{small['fabrics']} simulated fabrics of {len(small['constituents'])} constituents, learned from a robot's "
+        f"touches and asked about a hand's.\nNetworks: {small['epochs']} epochs where the paper has 50 "
+        f"({small['biotac_epochs']} on BioTac{tuned}), images averaged over {small['every']} columns."
     )
 
 

@@ -45,9 +45,15 @@ class Frames:
         machine. Without: by counts of slopes and bumps (see `embeddings.surfaces`), 1164 features, the same bytes on
         any machine.
 
+    cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007) of the counts, without the light, take
+        the place of all: attributes of objects never touched are told better by them, objects that were touched worse.
+        seed: of the cosines. They are rounded, so that another machine's last bits rarely matter.
+    runtime: of the network, as for `Vision`.
+
     The network is shown the relief alone: less its blur, and four times as strong.
 
-    Raises InputError for a resting image that is none, WeightsError for weights that cannot be used.
+    Raises InputError for a resting image that is none, cosines or a seed below 0, and cosines beside weights;
+    WeightsError for weights that cannot be used.
 
     >>> import numpy as np
     >>> Frames().embed(np.zeros((360, 160), dtype=np.float32)).shape
@@ -135,7 +141,7 @@ class Frames:
         return torch.from_numpy(weights), torch.from_numpy(rng.uniform(0, 2 * np.pi, self.cosines))
 
     def _waved(self, counts: FloatArray) -> FloatArray:
-        """Cosines of counts, rounded so coarsely that a machine's own cosine does not matter."""
+        """Cosines of counts, rounded so coarsely that a machine's own last bits rarely matter."""
         weights, phases = self._waves
         with steady():
             waves = torch.cos(weights @ torch.from_numpy(counts).double() + phases)

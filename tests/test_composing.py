@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
 from scroll_tactile.descriptions import checked, targets_of
 from scroll_tactile.errors import DescriptionError, MaterialError, SensorMismatchError
 from scroll_tactile.ridge.attributes import Curve, fit_curve, solve
@@ -105,6 +105,57 @@ class TestCompose:
                 said = learner.compose(stream)
                 assert sum(one.share for one in said.constituents) == pytest.approx(1, abs=1e-12)
                 assert all(0 <= one.share <= 1 and 0 <= one.presence <= 1 for one in said.constituents)
+
+
+class TestSharpness:
+    """Where a touch is one row of the statistics, each can be taken out of the readouts that answer."""
+
+    # Its touches are shorter than a wide window, and read as one.
+    SLOW = SKIN.model_copy(update={"duration": 1.4})
+
+    def taught(self, names):
+        taught = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
+        for at in range(6):
+            for number, name in enumerate(names):
+                taught.observe(name, self.shape(number, at))
+        return taught
+
+    def shape(self, number, seed):
+        rng = np.random.default_rng([number, seed])
+        level = np.array([[number % 2, number // 2, 1.0, -0.5]]) + rng.normal(0, 0.35, (1, 4))
+        return np.clip(np.repeat(level, 50, axis=0), -2, 2)
+
+    def test_probabilities_of_known_materials_are_as_sharp_as_touches_taken_out_deserve(self):
+        taught = self.taught("abcd")
+        for name in "abcd":
+            taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
+        composer = taught._fitted_composer(taught.model())
+        assert composer.stages[0].sharpness == 1  # of many windows a touch
+        sharpness = composer.stages[-1].sharpness
+        assert sharpness > 1.1
+        said = taught.compose(self.shape(3, 50), unfamiliar=0.0)
+        chances = {name: chance**sharpness for name, chance in said.prediction.ranking}
+        assert said["hard"].presence == pytest.approx((chances["b"] + chances["d"]) / sum(chances.values()))
+        assert said["hard"].evidence[0][1] == pytest.approx(max(chances.values()) / sum(chances.values()))
+
+    def test_it_is_the_same_whenever_it_was_described(self):
+        before, after = self.taught([]), self.taught([])
+        for name in "dcba":
+            before.describe(name, {"hard": name in "bd"})
+        for learner, order in ((before, range(4)), (after, reversed(range(4)))):
+            for number in order:
+                for at in range(6):
+                    learner.observe("abcd"[number], self.shape(number, at))
+        for name in "abcd":
+            after.describe(name, {"hard": name in "bd"})
+        for seed in range(50, 54):
+            assert repr(before.compose(self.shape(1, seed))) == repr(after.compose(self.shape(1, seed)))
+
+    def test_of_touches_of_many_windows_nothing_is_sharpened(self):
+        taught = felt(["c", "l", "s"], 4)
+        for name in "cls":
+            taught.describe(name, described(mixtures()[name]))
+        assert [stage.sharpness for stage in taught._fitted_composer(taught.model()).stages] == [1.0, 1.0, 1.0]
 
 
 class TestDescribing:

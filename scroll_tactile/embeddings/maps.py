@@ -90,7 +90,7 @@ class Maps:
         self._seen = math.prod(layout) * (parts if len(layout) == 1 else parts + SUMMARIES)  # by each view
         self._read = 1 if len(layout) == 1 else len(self.views)
         self.dimension = cosines or self._read * self._seen
-        # As many cosines as touches know each touch by heart: with the λ of other features letters fall by four points.
+        # As many cosines as touches know each by heart: with the λ of other features letters fall by three points.
         self.penalties: tuple[float, ...] = PENALTIES if cosines else ()
 
     def __repr__(self) -> str:

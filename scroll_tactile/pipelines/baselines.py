@@ -3,26 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from scroll_tactile.augment import Augmentation
+from scroll_tactile.augment import Augmentation, Change
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.robustness import Make, Progress
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
 from scroll_tactile.pipelines.systems.protocol import System
 
-__all__ = ["BASELINES", "COPIES", "STRONG", "baseline"]
+__all__ = ["BASELINES", "COPIES", "STRONG", "Sometimes", "baseline"]
 
 BASELINES = tuple(key for key in SYSTEMS if key not in OURS and not key.startswith("least-squares"))
 """Keys of the catalogue that can be asked about touches of any length and speed."""
 
-STRONG = Augmentation(flip=0.5, speed=(0.45, 2.2), keep=0.1, noise=0.6, drift=0.1)
+
+@dataclass(frozen=True)
+class Sometimes(Augmentation):
+    """An augmentation that leaves some touches as they were felt: `share` is the probability that one is changed.
+
+    Where every touch of every epoch came strongly changed, RoboSkin's clean touches were told in 28 to 53 % after twenty
+    epochs, in place of 85 to 92.
+    """
+
+    share: float = 0.5
+
+    def draw(self, rng: np.random.Generator) -> Change:
+        """One change of at most these strengths, or none; it takes the same numbers from `rng` whatever they are."""
+        change = super().draw(rng)
+        return change if rng.random() < self.share else Change()
+
+
+STRONG = Sometimes(flip=0.5, speed=(0.45, 2.2), keep=0.1, noise=0.6, drift=0.1)
 """The paper's four, as strong as the studies: to about half and twice the speed, down to a tenth of the touch, and to
-noise of a standard deviation of 0.6 of half the range, as uniform noise of ± 0.52 of the range has."""
+noise of a standard deviation of 0.6 of half the range, as uniform noise of ± 0.52 of the range has. Half of what a
+system sees is as it was felt."""
 
 COPIES = 3
 """Of each touch, for a system that is not trained over epochs, in which it would see others every time."""

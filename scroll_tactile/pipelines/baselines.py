@@ -25,8 +25,8 @@ BASELINES = tuple(key for key in SYSTEMS if key not in OURS and not key.startswi
 class Sometimes(Augmentation):
     """An augmentation that leaves some touches as they were felt: `share` is the probability that one is changed.
 
-    Where every touch of every epoch came strongly changed, RoboSkin's clean touches were told in 28 to 53 % after twenty
-    epochs, in place of 85 to 92.
+    Where every touch of every epoch came strongly changed, networks told 28 to 53 % of RoboSkin's clean touches after
+    twenty epochs, in place of 85 to 92.
     """
 
     share: float = 0.5

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from scroll_tactile.pipelines.contactile import HAND, HELD_OUT, ROWS
+from scroll_tactile.pipelines.contactile import HAND, HELD_OUT
+from scroll_tactile.pipelines.contactile_rows import ROWS
 
 __all__ = ["contactile"]
 

@@ -15,7 +15,8 @@ from scroll_tactile.datasets.fabrics import FabricScene
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.contactile import EPOCHAL, HAND, HELD_OUT, OURS, PAPER, ROWS, Contactile, rows, simulated
+from scroll_tactile.pipelines.contactile import HAND, HELD_OUT, Contactile, rows, simulated
+from scroll_tactile.pipelines.contactile_rows import EPOCHAL, OURS, PAPER, ROWS
 from scroll_tactile.pipelines.systems.constituent_nets import presence_loss
 from scroll_tactile.pipelines.systems.constituents import Heads, Shares
 from scroll_tactile.sensors import BIOTAC

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from scroll_tactile.pipelines.contactile import HAND, HELD_OUT, ROWS
+from scroll_tactile.pipelines.contactile import HAND, HELD_OUT
+from scroll_tactile.pipelines.contactile_rows import ROWS
 
 __all__ = ["contactile"]
 
@@ -30,7 +31,7 @@ def contactile(read: Callable[[str], Result]) -> str:
         f"score, {_learned(whole)} touches",
         f"… robot → robot, {_learned(held)}",
     ]
-    lines = [head, ["---"] * len(head)]
+    lines = [head]
     for key, name in ROWS.items():
         if key not in part and key not in whole:
             continue
@@ -49,8 +50,9 @@ def contactile(read: Callable[[str], Result]) -> str:
         )
     always = [next(iter(where.values()))["always"] for where in (part, whole, held)]
     lines.append(["saying always what is more common", "", _percent(always[0]), "", "", "", *map(_percent, always[1:])])
-    table = "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |").replace("|  |", "| |") for line in lines)
-    return f"{table}\n\n{_words(small, part)}"
+    table = [f"| {' | '.join(line)} |" for line in lines]
+    table.insert(1, "|---" * len(head) + "|")
+    return "\n".join([*table, "", _words(small, part)])
 
 
 def _words(small: Result, part: Mapping[str, Mapping[str, Any]]) -> str:

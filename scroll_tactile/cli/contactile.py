@@ -19,18 +19,8 @@ from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.datasets import contactile as published
 from scroll_tactile.datasets.contactile import Fabrics
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.contactile import (
-    EPOCHAL,
-    HAND,
-    NEED_BIOTAC,
-    NEED_WEIGHTS,
-    PAPER_EPOCHS,
-    PARTS,
-    ROWS,
-    Contactile,
-    rows,
-    simulated,
-)
+from scroll_tactile.pipelines.contactile import HAND, PARTS, Contactile, rows, simulated
+from scroll_tactile.pipelines.contactile_rows import EPOCHAL, NEED_BIOTAC, NEED_WEIGHTS, PAPER_EPOCHS, ROWS
 
 __all__ = ["contactile"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,83 +16,29 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile.augment import Augmentation
-from scroll_tactile.copies import Augmented
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.contactile import Fabrics, load
-from scroll_tactile.datasets.contactile_ratios import ratios
 from scroll_tactile.datasets.fabrics import LIMITS, FabricScene
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
-from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.cached import Cached
 from scroll_tactile.pipelines.cells import Cell, Figures, Split, require_data, run_cells, split
 from scroll_tactile.pipelines.compositions import score
+from scroll_tactile.pipelines.contactile_rows import NEED_BIOTAC, NEED_WEIGHTS, PAPER, PAPER_EPOCHS, ROWS, RowMaker
 from scroll_tactile.pipelines.pretraining import Pretraining
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.studies import weights_digest
 from scroll_tactile.pipelines.systems.constituent_memory import ConstituentMemory, told_of
 from scroll_tactile.pipelines.systems.constituent_nets import ConstituentNet
-from scroll_tactile.pipelines.systems.constituents import ConstituentSquares, Shares, Teller
+from scroll_tactile.pipelines.systems.constituents import ConstituentSquares, Shares
 from scroll_tactile.pipelines.systems.descent import Course
-from scroll_tactile.pipelines.systems.inputs import Image, average_columns
-from scroll_tactile.pipelines.systems.least_squares import LeastSquares
-from scroll_tactile.pipelines.systems.networks import ResNetClassifier
 from scroll_tactile.pipelines.systems.trained import require_device
-from scroll_tactile.streams import Stream
 from scroll_tactile.training import Progress
 
-__all__ = [
-    "EPOCHAL",
-    "HAND",
-    "HELD_OUT",
-    "NEED_BIOTAC",
-    "NEED_WEIGHTS",
-    "PAPER",
-    "PAPER_EPOCHS",
-    "PARTS",
-    "ROWS",
-    "Contactile",
-    "rows",
-    "simulated",
-]
-
-ROWS = {
-    "least-squares": "least squares, vision model",
-    "least-squares-biotac": "least squares, vision model fine-tuned on BioTac",
-    "resnet": "ResNet, a head for each constituent",
-    "resnet-augmented": "… and augmentation",
-    "resnet-biotac": "… and BioTac pre-training",
-    "kernels": "ours, kernels",
-    "kernels-copies": "ours, kernels, and copies at other speeds",
-    "kernels+vision": "ours, kernels+vision",
-    "ratios": "ours, kernels, on ratios of forces",
-    "ratios-copies": "ours, kernels, on ratios of forces, and copies at other speeds",
-}
-"""Key, as on the command line → name, as in tables."""
-
-PAPER = {
-    "least-squares": 0.742,
-    "least-squares-biotac": 0.761,
-    "resnet": 0.763,
-    "resnet-augmented": 0.789,
-    "resnet-biotac": 0.806,
-}
-"""The paper's scores from protocol 1 to 2, on real fabrics, which are not public."""
-PAPER_EPOCHS = 50
-
-OURS = ("kernels", "kernels-copies", "kernels+vision", "ratios", "ratios-copies")
-NEED_WEIGHTS = ("least-squares", "least-squares-biotac", "resnet-biotac", "kernels+vision")
-NEED_BIOTAC = ("least-squares-biotac", "resnet-biotac")
-EPOCHAL = ("least-squares-biotac", "resnet", "resnet-augmented", "resnet-biotac")
+__all__ = ["HAND", "HELD_OUT", "PARTS", "Contactile", "rows", "simulated"]
 
 HAND, HELD_OUT = "protocol 1 → 2", "protocol 1 → 1, held out"
 PARTS = {"hand": HAND, "held-out": HELD_OUT}
 """Key, as on the command line → what is learned and what is asked about: all touches of the robot, and the hand's; or
 four fifths of the robot's, and the fifth that is left."""
-
-COPIES = Augmented(copies=4, speed=2.0)
 
 
 def simulated(seed: int = 0, count: int = 32, robot: int = 40, hand: int = 10) -> Fabrics:
@@ -131,7 +77,6 @@ class Contactile:
     every: int = 1
     take: int = 1
     folder: Path | None = None
-    pretrained: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         strange = [key for key in self.rows if key not in ROWS]
@@ -222,6 +167,15 @@ class Contactile:
         exam = [one for one, known in zip(touches.exam, told, strict=True) if known]
         return replace(touches, exam=exam, touch=[at for at, known in zip(touches.touch, told, strict=True) if known])
 
+    @cached_property
+    def _maker(self) -> RowMaker:
+        file = None if self.folder is None else self.folder / "biotac.npz"
+        tuning = None
+        if self.biotac is not None and self.weights is not None:
+            course = Course(epochs=self.biotac_epochs)
+            tuning = Pretraining(self.biotac, self.weights, course, self.device, self.every, self.seed, file)
+        return RowMaker(self.shares, self.weights, tuning, Course(epochs=self.epochs), self.device, self.every)
+
     def _truth(self, fabrics: Sequence[str]) -> Any:
         return self.shares.presence(fabrics)[:, self._columns]
 
@@ -230,7 +184,7 @@ class Contactile:
         return [self.shares.names.index(name) for name in self.scored]
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
-        touches, system = self.split(cell.dataset), self._teller(cell.system, progress)
+        touches, system = self.split(cell.dataset), self._maker.make(cell.system, progress)
         system.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
         truth, masses = self._truth(touches.truth), self.shares.masses(touches.truth)[:, self._columns]
         told = system.tell(touches.asked, progress)
@@ -243,7 +197,7 @@ class Contactile:
         if isinstance(system, ConstituentNet):
             figures["epochs"] = [[one.loss, one.validation_loss, one.rate] for one in system.epochs]
         if cell.system in NEED_BIOTAC:
-            figures["accuracy on BioTac"] = self.pretrained["accuracy"]
+            figures["accuracy on BioTac"] = self._maker.accuracy
         return figures
 
     def _otherwise(self, system: ConstituentMemory, touches: Split, truth: Any, progress: Progress) -> Figures:
@@ -255,68 +209,6 @@ class Contactile:
         fabrics = [one.prediction.material for one in said]
         found["fabric"] = float(np.mean([one == true for one, true in zip(fabrics, touches.truth, strict=True)]))
         return found
-
-    def _teller(self, key: str, progress: Progress) -> Teller:
-        name = ROWS[key]
-        if key in OURS:
-            read = ratios if key.startswith("ratios") else _as_it_is
-            copies = COPIES if key.endswith("copies") else None
-            return ConstituentMemory(name, self.shares, self._embedding(key), read, copies)
-        if key == "least-squares":
-            return ConstituentSquares(name, self.shares, self._squares)
-        if key == "least-squares-biotac":
-            return ConstituentSquares(name, self.shares, self._tuned_squares(progress))
-        start = self._tuned(progress).state_dict() if key == "resnet-biotac" else None
-
-        def make(shape: tuple[int, ...], outputs: int, seed: int) -> ResNetClassifier:
-            net = ResNet.random(seed) if start is None else load_network(start)
-            return ResNetClassifier(net, outputs, trained=start is not None)
-
-        changes = None if key == "resnet" else Augmentation()
-        return ConstituentNet(name, self.shares, make, self._thinned, Course(epochs=self.epochs), self.device, changes)
-
-    def _thinned(self, image: Image) -> Image:
-        return average_columns(image, self.every)
-
-    @cached_property
-    def _squares(self) -> LeastSquares:
-        assert self.weights is not None
-        return LeastSquares(ROWS["least-squares"], Vision(self.weights, stages=(4,)), self.device, self._thinned)
-
-    def _tuned(self, progress: Progress) -> ResNet:
-        """The network fine-tuned on BioTac, once for the run."""
-        if "net" not in self.pretrained:
-            assert self.biotac is not None and self.weights is not None
-            file = None if self.folder is None else self.folder / "biotac.npz"
-            course = Course(epochs=self.biotac_epochs)
-            made = Pretraining(self.biotac, self.weights, course, self.device, self.every, self.seed, file)
-            self.pretrained["net"], self.pretrained["accuracy"] = made.network(progress)
-        net: ResNet = self.pretrained["net"]
-        return net
-
-    def _tuned_squares(self, progress: Progress) -> LeastSquares:
-        if "squares" not in self.pretrained:
-            vision = Vision(self._tuned(progress).state_dict(), stages=(4,))
-            name = ROWS["least-squares-biotac"]
-            self.pretrained["squares"] = LeastSquares(name, vision, self.device, self._thinned)
-        squares: LeastSquares = self.pretrained["squares"]
-        return squares
-
-    def _embedding(self, key: str) -> Embedding:
-        return self._kernels if key != "kernels+vision" else self._both
-
-    @cached_property
-    def _kernels(self) -> Embedding:
-        return Cached(Kernels())
-
-    @cached_property
-    def _both(self) -> Embedding:
-        assert self.weights is not None
-        return Joined(Cached(Kernels(dimension=1260)), Cached(Vision(self.weights)))
-
-
-def _as_it_is(stream: Stream) -> Stream:
-    return stream
 
 
 def rows(results: Sequence[tuple[Cell, Mapping[str, Any]]]) -> list[dict[str, Any]]:

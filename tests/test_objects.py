@@ -12,6 +12,10 @@ from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.pipelines.objects import Objects, most_often, object_groups, summary
+from scroll_tactile.pipelines.unseen import fit_heads
+from scroll_tactile.ridge.attributes import solve
+from scroll_tactile.ridge.codes import in_units, to_codes
+from scroll_tactile.ridge.statistics import Statistics
 from scroll_tactile.streams import Stream
 
 GEL = Gel()
@@ -56,8 +60,8 @@ def test_attributes_are_told_of_objects_left_out(results):
     assert all(one["attributes"].keys() == {"grain", "depth"} for one in new)
     for one in new:
         for told in one["attributes"].values():
-            assert told.keys() == {"right", "always", "trees"}
-            assert all(0 <= share <= 1 for share in told.values())
+            assert told.keys() == {"right", "composed", "always", "trees", "penalty", "gamma"}
+            assert all(0 <= told[name] <= 1 for name in ("right", "composed", "always", "trees"))
     means = summary(results)
     assert means["known, counts"]["video"]["mean"] == np.mean(
         [one["video"] for one in results if one["part"] == "known, counts"]
@@ -85,7 +89,7 @@ def test_the_table_of_the_readme_holds_the_figures(results):
     assert "6 objects, 2 groups" in table
     hardness = {"hardness": {"mean": 0.61, "sd": 0.1}, "hardness, always": {"mean": 0.4, "sd": 0.0}}
     told = cameras(lambda name: record | {"means": {"never touched": hardness}})
-    assert "| hardness | 61.0 ± 10.0 | | 40.0 ± 0.0 |" in told
+    assert "| hardness | 61.0 ± 10.0 | | | 40.0 ± 0.0 |" in told
 
 
 def test_settings_that_cannot_be_are_refused():
@@ -101,6 +105,32 @@ def test_groups_share_the_names_out():
     assert groups == object_groups([str(at) for at in range(23)], 4, 1)
     assert groups != object_groups([str(at) for at in range(23)], 4, 2)
     assert most_often(["b", "a", "b", "a", "c"]) == "a"
+
+
+def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
+    """An attribute that the first feature shows is told of new objects; an object left out was never there."""
+    rng = np.random.default_rng(0)
+    statistics, shown = Statistics(6, (1,)), {}
+    centres = rng.uniform(-0.5, 0.5, (30, 6))
+    for at, centre in enumerate(centres):
+        rows = centre + 0.05 * rng.standard_normal((5, 6))
+        statistics.add(f"m{at:02}", at % 3, {1: to_codes(rows, 1.0)})
+        shown[f"m{at:02}"] = {"bright": int(centre[0] > 0)}
+    known = {name: value for name, value in shown.items() if name < "m20"}
+    head = fit_heads(statistics, 1, known, ["bright"])["bright"]
+    told = [head(in_units(centre, 1.0)) for centre in centres[20:]]
+    assert np.mean([one == shown[f"m{at + 20}"]["bright"] for at, one in enumerate(told)]) >= 0.8
+    # Leaving one out by the formula is leaving it out of the system.
+    gram = head.readout.gram[np.ix_(head.places, head.places)]
+    inverse = solve(gram, head.gamma).inverse
+    by_formula = head.weights[3] / inverse[3, 3]
+    others = np.delete(np.arange(21), 3)
+    system = np.linalg.inv(inverse)
+    targets = np.array([[known[f"m{at:02}"]["bright"] == value for value in head.values] for at in range(20)], float)
+    left = np.linalg.solve(system[np.ix_(others, others)], np.append(np.delete(targets, 3, axis=0), [[0, 0]], axis=0))
+    assert targets[3] - system[3, others] @ left == pytest.approx(by_formula)
+    with pytest.raises(InputError, match="felt was 1"):
+        fit_heads(statistics, 1, {"m00": known["m00"]}, ["bright"])
 
 
 class TestCommand:
@@ -131,14 +161,14 @@ class TestCommand:
         assert physiclear.read_attributes(folder)["pen"] == {"hardness": 1, "roughness": 1, "texture": 2}
 
     def test_it_runs_from_the_data_to_the_figures(self, folder, tmp_path):
-        words = ("fabric", "gelsight", "--data", folder, "--folds", "0", "--groups", "2", "--trees", "0")
+        words = ("fabric", "gelsight", "--data", folder, "--folds", "0", "--groups", "3", "--trees", "0")
         said = run(*words, "--json", tmp_path / "g.json").output
         assert all(name in said for name in physiclear.ATTRIBUTES)
         result = json.loads((tmp_path / "g.json").read_text())
         assert result["command"].startswith("scroll-tactile fabric gelsight --data")
         assert result["attributes"].keys() == {"apple", "pen", "rug"}
         assert result["means"]["known, counts"]["video"]["mean"] == 1.0
-        assert len(result["parts"]) == 3
+        assert len(result["parts"]) == 4
 
     @pytest.mark.parametrize("told", ["", "{}", '{"hardness": {"apple": 5}, "roughness": {}, "texture": {}}'])
     def test_attributes_that_cannot_be_read_are_named(self, folder, told):

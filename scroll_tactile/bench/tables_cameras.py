@@ -26,17 +26,19 @@ def cameras(read: Callable[[str], Result]) -> str:
     ]
     objects = len({name for one in result["parts"] for name in one.get("objects", ())})
     new = means["never touched"]
-    rows = [(name, *(new.get(name + what) for what in ("", ", trees", ", always"))) for name in ATTRIBUTES]
+    rows = [
+        (name, *(new.get(name + what) for what in ("", ", composed", ", trees", ", always"))) for name in ATTRIBUTES
+    ]
     return (
         _table(("percent right, by video", "`Frames()`", "`Frames(weights)`", "trees on the same counts"), known)
         + f"\n\n{objects} objects, {result['groups']} groups of them left out in turn:\n\n"
-        + _table(("percent right, by video", "`compose`", "trees on the same counts", "always the commonest"), rows)
+        + _table(("percent right, by video", "heads", "`compose`", "trees on the counts", "always the commonest"), rows)
     )
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     lines = [head, ("---",) * len(head), *((name, *map(_cell, figures)) for name, *figures in rows)]
-    return "\n".join(f"| {' | '.join(cells)} |".replace("|  |", "| |") for cells in lines)
+    return "\n".join("|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|" for cells in lines)
 
 
 def _cell(figure: Mapping[str, float] | None) -> str:

@@ -185,9 +185,11 @@ def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Non
     table.add_row("a single frame", *map(told, (counts.get("frame"), network.get("frame"), None)))
     console().print(table)
     new = means.get("never touched", {})
-    table = Table("GelSight, objects never touched", "ours", "trees", "always the commonest", title="right by video")
+    table = Table(
+        "GelSight, objects never touched", "heads", "compose", "trees", "always the commonest", title="right by video"
+    )
     for name in physiclear.ATTRIBUTES:
-        table.add_row(name, *(told(new.get(name + what)) for what in ("", ", trees", ", always")))
+        table.add_row(name, *(told(new.get(name + what)) for what in ("", ", composed", ", trees", ", always")))
     console().print(table)
 
 

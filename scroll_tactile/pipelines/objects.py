@@ -2,7 +2,8 @@
 
 PhysiCLeAR's videos of a GelSight, each a stream of four frames in contact. Objects that were touched are told in folds
 of their videos. Attributes (hardness, roughness, texture, each of three values) are told of objects never touched: they
-are left out in groups, the others are described to the learner, and each value is a constituent that it composes of.
+are left out in groups, and told by heads over the others (`unseen`); beside it, by `compose`, to which each value is a
+constituent that the others were described to have or not.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.replay import Progress
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.studies import weights_digest
+from scroll_tactile.pipelines.unseen import fit_heads
 from scroll_tactile.prediction import Composition
+from scroll_tactile.ridge.codes import in_units
 from scroll_tactile.streams import Stream
 from scroll_tactile.windows import FRAMES
 
@@ -39,7 +42,7 @@ Mask = npt.NDArray[np.bool_]
 
 VALUES = (0, 1, 2)
 """Of every attribute."""
-COSINES = 1500
+COSINES = 700
 """Of the surface's counts, by which attributes are told."""
 TREES = 100
 """Of the baseline, scikit-learn's extremely randomised trees on the counts and the light of each frame."""
@@ -121,11 +124,18 @@ class Objects:
     @cached_property
     def _counts(self) -> FloatArray:
         """Of every frame what the trees read: `Frames` without a network, (videos, frames, d)."""
-        plain, width = self._embeddings["counts"], min(FRAMES, self.recordings.sensor.shape[1])
-        images = (image_of(stream, None) for stream in self.recordings.streams)
-        return np.stack(
-            [embed_windows(plain, one, {width: list(range(0, one.shape[1], width))})[width] for one in images]
-        ).astype(np.float64)
+        plain = self._embeddings["counts"]
+        return np.stack([self._read(plain, at) for at in range(len(self.recordings))]).astype(np.float64)
+
+    @property
+    def _width(self) -> int:
+        """Columns of a frame in its tactile image, the one scale of a camera's memory."""
+        return min(FRAMES, self.recordings.sensor.shape[1])
+
+    def _read(self, embedding: Embedding, at: int) -> npt.NDArray[np.floating]:
+        """Features of each frame of a video, (frames, d)."""
+        image, width = image_of(self.recordings.streams[at], None), self._width
+        return embed_windows(embedding, image, {width: list(range(0, image.shape[1], width))})[width]
 
     def _taught(self, embedding: Embedding, taught: Mask, what: str, progress: Progress) -> TactileLearner:
         learner = TactileLearner(sensor=self.recordings.sensor, embedding=embedding, exemplars=0)
@@ -172,11 +182,21 @@ class Objects:
                 learner.describe(name, {_constituent(key, v): one == v for key, one in values.items() for v in VALUES})
         exam = np.flatnonzero(tested).tolist()
         said = [learner.compose(self.recordings.streams[at], unfamiliar=1.0) for at in exam]
+        keys = list(next(iter(self.attributes.values())))
+        taught = {name: values for name, values in self.attributes.items() if name not in group}
+        heads = fit_heads(learner._memory.statistics, self._width, taught, keys)
+        means = [in_units(self._read(self._waves, at), self._waves.bound).mean(axis=0) for at in exam]
         told: dict[str, dict[str, Any]] = {}
-        for key in next(iter(self.attributes.values())):
+        for key in keys:
             truth = [self.attributes[self.recordings.materials[at]][key] for at in exam]
-            right = [_likeliest(one, key) == value for one, value in zip(said, truth, strict=True)]
-            told[key] = {"right": float(np.mean(right)), **self._baselines(key, truth, tested, progress)}
+            composed = [_likeliest(one, key) for one in said]
+            told[key] = {
+                "right": _share(truth, [heads[key](mean) for mean in means]),
+                "composed": _share(truth, composed),
+                "penalty": heads[key].readout.penalty,
+                "gamma": heads[key].gamma,
+                **self._baselines(key, truth, tested, progress),
+            }
         figures = {"learned": int((~tested).sum()), "tested": len(exam), "attributes": told}
         return figures | {"digest": learner.digest(), "seconds": time.perf_counter() - begun}
 
@@ -185,12 +205,11 @@ class Objects:
         values = np.array([self.attributes.get(name, {}).get(key, -1) for name in self.recordings.materials])
         taught = ~tested & (values >= 0)
         often = most_often(values[taught].tolist())
-        figures = {"always": float(np.mean([one == often for one in truth]))}
+        figures = {"always": _share(truth, [often] * len(truth))}
         if self.trees:
             progress(f"trees of {key}", 0, 1)
             chances, classes = self._grown(taught, tested, values)
-            told = classes[chances.mean(axis=1).argmax(axis=1)]
-            figures["trees"] = float(np.mean(told == np.array(truth)))
+            figures["trees"] = _share(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
         return figures
 
     def _grown(self, taught: Mask, tested: Mask, targets: npt.NDArray[Any]) -> tuple[FloatArray, npt.NDArray[Any]]:
@@ -223,7 +242,7 @@ def most_often(said: Sequence[Any]) -> Any:
 def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
     """Of each kind of part: mean over its videos, and standard deviation over its folds or groups, of each figure.
 
-    Figures of attributes are named as "hardness", "hardness, trees" and "hardness, always".
+    Figures of attributes are named as "hardness", "hardness, composed", "hardness, trees" and "hardness, always".
     """
     means: dict[str, dict[str, dict[str, float]]] = {}
     for kind in dict.fromkeys(result["part"] for result in results):
@@ -239,12 +258,20 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
 def _flat(result: Mapping[str, Any]) -> dict[str, float]:
     figures = {name: result[name] for name in ("video", "vote", "frame", "trees", "trees' vote") if name in result}
     for key, one in result.get("attributes", {}).items():
-        figures |= {key if what == "right" else f"{key}, {what}": value for what, value in one.items()}
+        figures |= {
+            key if what == "right" else f"{key}, {what}": value
+            for what, value in one.items()
+            if what not in ("penalty", "gamma")
+        }
     return figures
 
 
 def _constituent(attribute: str, value: int) -> str:
     return f"{attribute} {value}"
+
+
+def _share(truth: Sequence[int], said: Sequence[int]) -> float:
+    return float(np.mean([one == other for one, other in zip(truth, said, strict=True)]))
 
 
 def _likeliest(said: Composition, attribute: str) -> int:

@@ -100,6 +100,11 @@ class SensorTransfer:
         """All that each figure depends on, beside the data; ways and folds can be added to a run later."""
         return {"run": "transfer sensors", "counts": self.counts, "draws": self.draws, "seed": self.seed}
 
+    @property
+    def chance(self) -> float:
+        """The share that is right of answers given blindly."""
+        return 1 / len(set(self.sets[0].materials))
+
     def cells(self) -> list[Cell]:
         """A direction's name, a fold of the new sensor and a way each; those in which something is asked."""
         return [

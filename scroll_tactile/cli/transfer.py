@@ -20,6 +20,7 @@ from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar
 from scroll_tactile.datasets import Recordings, fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.pipelines.cells import Cell, Figures
 from scroll_tactile.pipelines.few_touches import COUNTS
 from scroll_tactile.pipelines.transfer import TRAINING, TaskTransfer, rows, some_frames
 from scroll_tactile.pipelines.transfer_sensors import WAYS, SensorTransfer
@@ -97,25 +98,15 @@ def tasks(
         )
         results = list(study.run(progress))
     found = rows(results)
-    for one in read:
-        _show(one.name, [row for row in found if row["dataset"] == one.name], study)
-    trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
-    told = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
-    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {told}")
+    _show_tasks(study, results, found)
     if json is not None:
         words = ["scroll-tactile", "transfer", "tasks", "--data", "DATA", "--weights", Path(weights).name]
         words += ["--sets", sets] if sets is not None else []
         words += ["--sources", sources] if sources is not None else []
         words += ["--folds", ",".join(map(str, study.folds)), "--counts", counts, "--draws", str(study.draws)]
         words += ["--frames", str(frames), "--epochs", str(study.epochs), "--device", study.device]
-        words += (
-            ["--precision", study.precision, "--seed", str(seed)]
-            + ["--quick"] * quick
-            + (["--run", "RUN"] if run else [])
-        )
-        cells = {cell.key: figures for cell, figures in results}
-        write_json(json, _made(words, read) | study.plan | {"frames": frames, "rows": found, "cells": cells})
-        say(f"figures: {json}")
+        words += ["--precision", study.precision, "--seed", str(seed)] + ["--quick"] * quick
+        _write(json, words, study, results, {"frames": frames, "rows": found})
     if plot is not None and not plots.available():
         say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
     elif plot is not None:
@@ -153,25 +144,13 @@ def sensors(
         progress("how far the sensors agree", 0, 1)
         agreement = study.agreement()
     found = sensor_rows(results)
-    for direction in dict.fromkeys(row["direction"] for row in found):
-        mine = [row for row in found if row["direction"] == direction]
-        title = f"{direction}: right, after so many touches of each material with the new sensor; {study.draws} draws"
-        table = Table("way", *map(str, study.counts), title=title)
-        for row in mine:
-            points = [row["points"].get(str(count)) for count in study.counts]
-            table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
-        console().print(table)
-    chance = 1 / len(set(pair[0].materials))
-    told = ", ".join(f"{one['correlation']:+.2f} in {kind} ({one['chance']:.2f})" for kind, one in agreement.items())
-    say(f"chance: {percent(chance)}. Which materials feel alike, one sensor against the other: {told} (by chance)")
+    _show_sensors(study, found, agreement)
     if json is not None:
         words = ["scroll-tactile", "transfer", "sensors", "--data", "DATA"]
         words += ["--folds", ",".join(map(str, study.folds)), "--ways", ",".join(study.ways), "--counts", counts]
-        words += ["--draws", str(study.draws), "--seed", str(seed)] + (["--run", "RUN"] if run else [])
-        cells = {cell.key: figures for cell, figures in results}
-        measured = {"folds": study.folds, "chance": chance, "agreement": agreement, "rows": found, "cells": cells}
-        write_json(json, _made(words, pair) | study.plan | measured)
-        say(f"figures: {json}")
+        words += ["--draws", str(study.draws), "--seed", str(seed)]
+        measured = {"folds": study.folds, "chance": study.chance, "agreement": agreement, "rows": found}
+        _write(json, words, study, results, measured)
 
 
 def _counts(asked: str) -> tuple[int, ...]:
@@ -203,21 +182,54 @@ def _read(asked: str | None, data: Path, seed: int, quick: bool) -> dict[str, Re
         raise
 
 
-def _show(name: str, found: Sequence[Mapping[str, Any]], study: TaskTransfer) -> None:
-    title = f"{name}: right, after so many touches of each material; {study.draws} draws, folds {study.folds}"
-    counts = list(found[0]["points"])
-    table = Table("embedding", *counts, title=title)
-    for row in found:
-        mark = " (its own)" if row["tuned on"] == name else ""
-        table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
-    console().print(table)
+def _show_tasks(
+    study: TaskTransfer, results: Sequence[tuple[Cell, Figures]], found: Sequence[Mapping[str, Any]]
+) -> None:
+    for one in study.sets:
+        mine = [row for row in found if row["dataset"] == one.name]
+        counts = list(mine[0]["points"])
+        title = f"{one.name}: right, after so many touches of each material; {study.draws} draws, folds {study.folds}"
+        table = Table("embedding", *counts, title=title)
+        for row in mine:
+            mark = " (its own)" if row["tuned on"] == one.name else ""
+            table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
+        console().print(table)
+    trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
+    told = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
+    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {told}")
+
+
+def _show_sensors(
+    study: SensorTransfer, found: Sequence[Mapping[str, Any]], agreement: Mapping[str, Mapping[str, float]]
+) -> None:
+    for direction in dict.fromkeys(row["direction"] for row in found):
+        title = f"{direction}: right, after so many touches of each material with the new sensor; {study.draws} draws"
+        table = Table("way", *map(str, study.counts), title=title)
+        for row in found:
+            if row["direction"] == direction:
+                points = [row["points"].get(str(count)) for count in study.counts]
+                table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
+        console().print(table)
+    told = ", ".join(f"{one['correlation']:+.2f} in {kind} ({one['chance']:.2f})" for kind, one in agreement.items())
+    say(
+        f"chance: {percent(study.chance)}. Which materials feel alike, one sensor against the other: {told} (by chance)"
+    )
 
 
 def _cell(point: Mapping[str, float]) -> str:
     return f"{percent(point['mean'])} ± {100 * point['sd']:.1f}"
 
 
-def _made(words: Sequence[str], read: Sequence[Recordings]) -> dict[str, Any]:
+def _write(
+    path: Path,
+    words: Sequence[str],
+    study: TaskTransfer | SensorTransfer,
+    results: Sequence[tuple[Cell, Figures]],
+    measured: Mapping[str, Any],
+) -> None:
+    command = shlex.join([*words, *(["--run", "RUN"] if study.folder is not None else [])])
     threads = {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
-    sensors = {one.name: one.sensor.model_dump(mode="json") for one in read}
-    return origin(shlex.join(words)) | threads | {"sensors": sensors}
+    sensors = {one.name: one.sensor.model_dump(mode="json") for one in study.sets}
+    cells = {cell.key: figures for cell, figures in results}
+    write_json(path, origin(command) | threads | study.plan | {"sensors": sensors, **measured, "cells": cells})
+    say(f"figures: {path}")

@@ -53,8 +53,8 @@ WAYS = {
 _BLIND = ("as-they-are", "standardised", "resampled")  # ways that ask no touch of the new sensor to be named
 _IN_KERNELS = ("ridge-map", "procrustes", "prior", "prior-control")
 LIKENESS = 0.3
-"""Of "prior", chosen on one fold: 0.3, 0.6 and 0.9 gain 0 ± 0.1, −0.1 and −0.4 points with one touch of RoboSkin, and
-+0.7 ± 0.4, +1.0 ± 0.5 and 0 with one of BioTac, against 0, the control."""
+"""Of "prior", set with one fold: 0.3, 0.6 and 0.9 gain −0.1, 0 and −0.4 points (± 0.1 to 0.2) with one touch of
+RoboSkin, and 0.7, 1.0 and 0 (± 0.5) with one of BioTac, over 0, the control."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,11 @@ class SensorTransfer:
     def plan(self) -> dict[str, Any]:
         """All that each figure depends on, beside the data; ways and folds can be added to a run later."""
         return {"run": "transfer sensors", "counts": self.counts, "draws": self.draws, "seed": self.seed}
+
+    @property
+    def chance(self) -> float:
+        """The share that is right of answers given blindly."""
+        return 1 / len(set(self.sets[0].materials))
 
     def cells(self) -> list[Cell]:
         """A direction's name, a fold of the new sensor and a way each; those in which something is asked."""

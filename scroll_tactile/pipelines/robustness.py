@@ -33,7 +33,7 @@ SITTING = "sitting"
 NAMES = (*STUDIES, SITTING)
 """The names of the studies."""
 
-AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=64, noise=0.7)
+AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
 """The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
 
 Progress = Callable[[str, int, int], object]

@@ -39,7 +39,7 @@ PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
 """(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
 with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
 
-AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=64, noise=0.7)
+AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
 """The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
 
 Progress = Callable[[str, int, int], object]

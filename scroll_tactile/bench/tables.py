@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile.bench.markdown import Read, Result, spread, table
+from scroll_tactile.bench.tables_cameras import cameras
+from scroll_tactile.bench.tables_composition import attributes, letters
+from scroll_tactile.bench.tables_contactile import contactile
 from scroll_tactile.bench.tables_faults import faults
+from scroll_tactile.bench.tables_paper import efficiency, networks, robust, robustness, tableone
+from scroll_tactile.bench.tables_transfer import sensors, tasks
 from scroll_tactile.errors import InputError
 
 __all__ = ["SECTIONS", "made_from_results"]
-
-Result = dict[str, Any]
-Read = Callable[[str], Result]
 
 SETS = ("biotac-20", "roboskin-20")
 BOTH = ["", "BioTac-20", "RoboSkin-20"]
@@ -61,15 +64,6 @@ def made_from_results(text: str, folder: Path) -> str:
     return text
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(line)} |" for line in [head, *rows]]
-    return "\n".join([lines[0].replace("|  |", "| |"), "|---" * len(head) + "|", *lines[1:]])
-
-
-def _spread(figure: Mapping[str, float], times: float = 100.0, digits: int = 1) -> str:
-    return f"{times * figure['mean']:.{digits}f} ± {times * figure['sd']:.{digits}f}"
-
-
 def _results(read: Read) -> str:
     means = [read(name)["means"] for name in SETS]
     rows = [
@@ -85,13 +79,13 @@ def _results(read: Read) -> str:
         "half": "… from half of the touch",
         "twice": "… learned from half touches, asked about whole ones",
     }
-    rows += [[words, *(_spread(mean[name]) for mean in means)] for name, words in shares.items()]
+    rows += [[words, *(spread(mean[name]) for mean in means)] for name, words in shares.items()]
     parts = {
         "calibration_error": "… expected calibration error (15 bins)",
         "novelty_auroc": "… novelty AUROC, 4 of 20 materials never felt, five rotations",
     }
-    rows += [[words, *(_spread(mean[name], 1.0, 3) for mean in means)] for name, words in parts.items()]
-    return _table(BOTH, rows)
+    rows += [[words, *(spread(mean[name], 1.0, 3) for mean in means)] for name, words in parts.items()]
+    return table(BOTH, rows)
 
 
 def _speed(read: Read) -> str:
@@ -106,7 +100,7 @@ def _speed(read: Read) -> str:
         ]
         for one in read("speed")["records"]
     ]
-    return _table(["", "ms", "beside", "ms", "ratio", "error"], rows)
+    return table(["", "ms", "beside", "ms", "ratio", "error"], rows)
 
 
 def _frontier(read: Read) -> str:
@@ -124,7 +118,7 @@ def _frontier(read: Read) -> str:
         rows.append([f"{bold}{width}{bold}", *cells])
     head = ["features", *(f"{name}, {words}" for name in BOTH[1:] for words in ("wrong, %", "at 0.3 s"))]
     head += [f"{name}, ridge" for name in BOTH[1:]] + ["ms observe", "ms predict"]
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _peers(read: Read) -> str:
@@ -140,7 +134,7 @@ def _peers(read: Read) -> str:
         rows.append([name, *wrong, f"{first['observe_ms']:.2f}", f"{first['fresh_ms']:.2f}"])
     features = peers[0]["features"]
     head = [f"the same {features} features, fold 0", "BioTac-20, wrong, %", "RoboSkin-20, wrong, %"]
-    return _table([*head, "ms observe", "ms predict after it"], rows)
+    return table([*head, "ms observe", "ms predict after it"], rows)
 
 
 def _interleaved(read: Read) -> str:
@@ -157,7 +151,7 @@ def _interleaved(read: Read) -> str:
         f'{drift["largest_relative_difference"]:.0e}; by the paper\'s recursion (`solver="recursive"`) to '
         f"{drift['of_the_recursion']:.0e}."
     )
-    return _table([head, "ms a pair", "times ours", "wrong, %"], rows) + f"\n\n{said}"
+    return table([head, "ms a pair", "times ours", "wrong, %"], rows) + f"\n\n{said}"
 
 
 def _row(result: Result, method: str, size: str | None) -> Mapping[str, Any]:
@@ -178,8 +172,8 @@ def _continual(read: Read) -> str:
         ("experience replay, 400", "experience replay", "400"),
         ("naive fine-tuning, no memory", "naive fine-tuning", None),
     ):
-        rows.append([words, *(_spread(_row(result, method, size)["accuracy"]) for result in results)])
-    return _table(BOTH, rows)
+        rows.append([words, *(spread(_row(result, method, size)["accuracy"]) for result in results)])
+    return table(BOTH, rows)
 
 
 def _buffers(read: Read) -> str:
@@ -195,7 +189,7 @@ def _buffers(read: Read) -> str:
         ):
             means = [_row(result, method, size)["accuracy"]["mean"] for size in SIZES]
             rows.append([f"{words}: {told}", *(f"{100 * mean:.1f}" for mean in means)])
-    return _table(["five folds, percent, exemplars in the buffer", *SIZES], rows)
+    return table(["five folds, percent, exemplars in the buffer", *SIZES], rows)
 
 
 def _vision(read: Read) -> str:
@@ -215,44 +209,7 @@ def _vision(read: Read) -> str:
                 ]
             )
     head = ["4 s of BioTac (19 × 400), two cores", "ms", "of a bare torch forward, 2 threads", "1 thread"]
-    return _table([*head, "error of features", "RoboSkin, fold 0"], rows)
-
-
-def _tableone(read: Read) -> str:
-    rows = []
-    for row in read("table1")["rows"]:
-        cells = []
-        for name in ("BioTac-20", "BioTac-20 blocked", "RoboSkin-20"):
-            one = row["sets"][name]
-            paper = "" if one["paper"] is None else f"{100 * one['paper']:.1f}"
-            here = f"{100 * one['mean']:.1f} ± {100 * one['sd']:.1f}"
-            cells += [here] if "blocked" in name else [paper, here]
-        rows.append([row["system"], *cells])
-    head = ["percent", "BioTac-20, paper", "here", "here, blocked folds", "RoboSkin-20, paper", "here"]
-    return _table(head, rows)
-
-
-def _robustness(read: Read) -> str:
-    results = [read(f"robustness-{name}") for name in SETS]
-    rows = []
-    for words, study, strength in (
-        ("clean", "speed", 1.0),
-        ("the first 0.3 s", "length", 0.3),
-        ("half the speed", "speed", 0.5),
-        ("twice the speed", "speed", 2.0),
-        ("a fifth of the channels dead", "dead", 0.2),
-        ("uniform noise of ± half the range", "noise", 0.5),
-        ("zero and gain drifting by 5 %", "drift", 0.05),
-    ):
-        cells = []
-        for result in results:
-            mine = {
-                one["augmented"]: one for one in result["means"] if (one["study"], one["strength"]) == (study, strength)
-            }
-            cells += [f"{100 * mine[augmented]['mean']:.1f}" for augmented in (False, True)]
-        rows.append([words, *cells])
-    head = [f"{name}, {words}" for name in BOTH[1:] for words in ("default", "`Robust`")]
-    return _table(["percent", *head], rows)
+    return table([*head, "error of features", "RoboSkin, fold 0"], rows)
 
 
 def _slide(read: Read) -> str:
@@ -261,7 +218,7 @@ def _slide(read: Read) -> str:
         for one in read("fabric-slide")["parts"]
         if "→" in one["part"]
     ]
-    return _table(["four fabrics, learned → asked", "touches learned", "asked", "right, %"], rows)
+    return table(["four fabrics, learned → asked", "touches learned", "asked", "right, %"], rows)
 
 
 SECTIONS: dict[str, Callable[[Read], str]] = {
@@ -273,9 +230,18 @@ SECTIONS: dict[str, Callable[[Read], str]] = {
     "continual": _continual,
     "buffers": _buffers,
     "vision": _vision,
-    "tableone": _tableone,
-    "robustness": _robustness,
+    "tableone": tableone,
+    "networks": networks,
+    "efficiency": efficiency,
+    "robustness": robustness,
+    "robust": robust,
+    "letters": letters,
     "slide": _slide,
+    "attributes": attributes,
+    "cameras": cameras,
+    "contactile": contactile,
+    "transfer": tasks,
+    "sensors": sensors,
     "faults": faults,
 }
 """Name → what makes the section from the results that it reads by name."""

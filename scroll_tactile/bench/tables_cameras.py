@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
+
+from scroll_tactile.bench.markdown import Read, spread, table
 
 __all__ = ["cameras"]
 
-Result = dict[str, Any]
 Means = Mapping[str, Mapping[str, float]]
 
 KNOWN = "known, counts", "known, network"
 ATTRIBUTES = ("hardness", "roughness", "texture")
 
 
-def cameras(read: Callable[[str], Result]) -> str:
+def cameras(read: Read) -> str:
     """Two tables: objects that were touched, told by video, and attributes of objects never touched."""
     result = read("gelsight-objects")
     means: Mapping[str, Means] = result["means"]
@@ -26,20 +27,21 @@ def cameras(read: Callable[[str], Result]) -> str:
     ]
     objects = len({name for one in result["parts"] for name in one.get("objects", ())})
     new = means["never touched"]
-    rows = [
-        (name, *(new.get(name + what) for what in ("", ", composed", ", trees", ", always"))) for name in ATTRIBUTES
-    ]
+    ways = ("", ", composed", ", trees", ", always")
+    rows = [(name, *(new.get(name + what) for what in ways)) for name in ATTRIBUTES]
     return (
-        _table(("percent right, by video", "`Frames()`", "`Frames(weights)`", "trees on the same counts"), known)
+        table(("percent right, by video", "`Frames()`", "`Frames(weights)`", "trees on the same counts"), _shown(known))
         + f"\n\n{objects} objects, {result['groups']} groups of them left out in turn:\n\n"
-        + _table(("percent right, by video", "heads", "`compose`", "trees on the counts", "always the commonest"), rows)
+        + table(
+            ("percent right, by video", "heads", "`compose`", "trees on the counts", "always the commonest"),
+            _shown(rows),
+        )
     )
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *((name, *map(_cell, figures)) for name, *figures in rows)]
-    return "\n".join("|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|" for cells in lines)
+def _shown(rows: Iterable[tuple[Any, ...]]) -> list[tuple[str, ...]]:
+    return [(name, *map(_cell, figures)) for name, *figures in rows]
 
 
 def _cell(figure: Mapping[str, float] | None) -> str:
-    return "" if figure is None else f"{100 * figure['mean']:.1f} ± {100 * figure['sd']:.1f}"
+    return "" if figure is None else spread(figure)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
+from scroll_tactile.bench.markdown import Read, Result, table
 from scroll_tactile.pipelines.contactile import HAND, HELD_OUT
 from scroll_tactile.pipelines.contactile_rows import ROWS
 
 __all__ = ["contactile"]
 
-Result = dict[str, Any]
-
 ALL_ROWS, FULL = "contactile-simulated-small", "contactile-simulated"
 """Results: of every row, at a size that networks can be trained at; and of those in closed form, of all touches."""
 
 
-def contactile(read: Callable[[str], Result]) -> str:
+def contactile(read: Read) -> str:
     """A table of all rows, the paper's figures beside, and in words what was learned and what the figures are of."""
     small, full = read(ALL_ROWS), read(FULL)
     part, whole = _figures(small, HAND), _figures(full, HAND)
@@ -31,7 +30,7 @@ def contactile(read: Callable[[str], Result]) -> str:
         f"score, {_learned(whole)} touches",
         f"… robot → robot, {_learned(held)}",
     ]
-    lines = [head]
+    lines = []
     for key, name in ROWS.items():
         if key not in part and key not in whole:
             continue
@@ -50,9 +49,7 @@ def contactile(read: Callable[[str], Result]) -> str:
         )
     always = [next(iter(where.values()))["always"] for where in (part, whole, held)]
     lines.append(["saying always what is more common", "", _percent(always[0]), "", "", "", *map(_percent, always[1:])])
-    table = [f"| {' | '.join(line)} |" for line in lines]
-    table.insert(1, "|---" * len(head) + "|")
-    return "\n".join([*table, "", _words(small, part)])
+    return f"{table(head, lines)}\n\n{_words(small, part)}"
 
 
 def _words(small: Result, part: Mapping[str, Mapping[str, Any]]) -> str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+
+from scroll_tactile.bench.markdown import Read, Result
 
 __all__ = ["faults"]
 
-Result = dict[str, Any]
 HEAD = "| fault | how often | acknowledged and lost | |\n|---|---|---|---|"
 
 
-def faults(read: Callable[[str], Result]) -> str:
+def faults(read: Read) -> str:
     """A table of the faults, and in words what is kept of a touch and what keeping it takes."""
     each, flips = read("faults-each-call"), read("faults-bit-flips")
     rows = [

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+
+from scroll_tactile.bench.markdown import Read, table
 
 __all__ = ["sensors", "tasks"]
 
-Result = dict[str, Any]
 
 _SHOWN = ("1", "5", "20")  # touches of each material, of the table of tasks
 
 
-def tasks(read: Callable[[str], Result]) -> str:
+def tasks(read: Read) -> str:
     """A row for each embedding, a column for each data set; of its own training in brackets. Then how it was made."""
     result = read("transfer-tasks")
     found = {(row["system"], row["dataset"]): row for row in result["rows"]}
@@ -39,7 +39,7 @@ def tasks(read: Callable[[str], Result]) -> str:
     worse = sum(gain < -1 for gain in gains)
     epochs = result["epochs"]
     return (
-        f"{_table([_head(_SHOWN), *names], lines)}\n\n"
+        f"{table([_head(_SHOWN), *names], lines)}\n\n"
         f"Percent right on the test fold, mean of {result['draws']} draws of the touches. In brackets: fine-tuned on "
         f"all touches of that very task. Fine-tuned for {epochs} epoch{'s' * (epochs > 1)}, after which the networks "
         f"themselves have, on their own tests: {own}.\n"
@@ -48,7 +48,7 @@ def tasks(read: Callable[[str], Result]) -> str:
     )
 
 
-def sensors(read: Callable[[str], Result]) -> str:
+def sensors(read: Read) -> str:
     """A row for each way, a column for each direction, with what the few touches alone have; and how far they agree."""
     result = read("transfer-sensors")
     directions = list(dict.fromkeys(row["direction"] for row in result["rows"]))
@@ -64,7 +64,7 @@ def sensors(read: Callable[[str], Result]) -> str:
         for kind, one in result["agreement"].items()
     )
     return (
-        f"{_table([_head(counts), *directions], lines)}\n\n"
+        f"{table([_head(counts), *directions], lines)}\n\n"
         f"Percent right, mean of {result['draws']} draws on each of {len(result['folds'])} folds; chance is "
         f"{100 * result['chance']:.0f}. Which materials feel alike to one sensor and which to the other, as a "
         f"correlation over pairs of materials: {agreement}."
@@ -73,11 +73,6 @@ def sensors(read: Callable[[str], Result]) -> str:
 
 def _percent(point: Mapping[str, float] | None) -> str:
     return "–" if point is None else f"{100 * point['mean']:.0f}"
-
-
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rows = [f"| {' | '.join(line)} |" for line in (head, *lines)]
-    return "\n".join([rows[0], "|---" * len(head) + "|", *rows[1:]])
 
 
 def _head(counts: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ task: a constituent shows only through the yarn that it is a part of, under two 
 >>> from scroll_tactile.datasets.fabrics import FabricScene
 >>> scene = FabricScene(seed=0, count=4)
 >>> scene.compositions["fabric03"]
-{'linen': 0.45, 'viscose': 0.55}
+{'cotton': 0.25, 'polyester': 0.75}
 >>> scene.touch("fabric03", protocol=2, repetition=7)
 Stream(contactile, (599, 27), 5.99 s, clipped=0)
 

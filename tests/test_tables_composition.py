@@ -15,7 +15,7 @@ def test_letters_known_and_never_touched():
     told = letters({"fabric-letters": {"means": {"known": known, "never touched": new}}}.__getitem__).splitlines()
     assert told[0] == "| Braille letters, percent | known letters | letters never touched |"
     assert told[2] == "| mean score per dot | 94.0 ± 1.1 | 77.1 ± 3.0 |"
-    assert told[4] == "| letter right, of 27 | 84.3 ± 2.0 |  |"
+    assert told[4] == "| letter right, of 27 | 84.3 ± 2.0 | |"
     assert {line.count("|") for line in told} == {4}
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Joined, Kernels, Vision, check_embedding
+from scroll_tactile.embeddings import Joined, Kernels, Maps, Vision, check_embedding
 from scroll_tactile.errors import InputError
 
 KERNELS = Kernels(dimension=64)
@@ -82,3 +82,10 @@ def test_fewer_than_two_are_refused(parts):
 def test_what_is_no_embedding_is_refused():
     with pytest.raises(InputError, match="expected embeddings"):
         Joined(KERNELS, "vision")
+
+
+def test_penalties_are_named_only_where_every_part_names_some():
+    cosines = Maps(layout=(3,), cosines=64)
+    both = Joined(cosines, Maps(layout=(3,), cosines=64, seed=2))
+    assert both.penalties == cosines.penalties
+    assert Joined(cosines, Kernels(dimension=64)).penalties == ()

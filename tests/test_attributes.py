@@ -8,8 +8,8 @@ from commands import refused, run
 
 from scroll_tactile import Sensor
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.biotac_slide import GRADES, MATERIALS
-from scroll_tactile.errors import InputError
+from scroll_tactile.datasets.grades import read_grades
+from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.pipelines.attributes import Attributes, summary
 from scroll_tactile.streams import validate
 
@@ -64,14 +64,40 @@ def test_grades_that_are_missing_or_all_one_are_refused(recordings):
             Attributes(recordings, grades)
 
 
-def test_the_published_grades_are_of_all_twenty():
-    counts = {name: [list(of.values()).count(grade) for grade in range(3)] for name, of in GRADES.items()}
-    assert counts == {"stiffness": [3, 6, 11], "roughness": [8, 6, 6]}
-    assert all(tuple(of) == MATERIALS for of in GRADES.values())
+def test_a_table_of_grades_is_read(tmp_path):
+    table = tmp_path / "grades.csv"
+    table.write_text("\ufeffmaterial, stiffness,foam\nmat1,2,0\n\nmat2, 0 ,1\n", encoding="utf-8")
+    assert read_grades(table) == {"stiffness": {"mat1": 2, "mat2": 0}, "foam": {"mat1": 0, "mat2": 1}}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "cannot be read"),
+        ("", "a line for each material"),
+        ("material\nmat1\n", "two or more"),
+        ("material,foam,foam\nmat1,1,1\n", "different names"),
+        ("material,foam\nmat1,1\nmat1,0\n", "line 3"),
+        ("material,foam\n,1\n", "came ''"),
+        ("material,foam\nmat1,soft\n", "'soft'"),
+        ("material,foam\nmat1,-1\n", "'-1'"),
+        ("material,foam,wood\nmat1,1\n", "expected 2 grades"),
+    ],
+)
+def test_a_table_that_says_no_grades_is_named(text, said, tmp_path):
+    table = tmp_path / "grades.csv"
+    if text is not None:
+        table.write_text(text)
+    with pytest.raises(DatasetError, match="grades.csv") as raised:
+        read_grades(table)
+    assert said in str(raised.value)
 
 
 def test_a_folder_without_the_data_is_one_red_line(tmp_path):
-    assert "Get it from github.com" in refused("fabric", "attributes", "--data", tmp_path, "--sets", "biotac-20")
+    grades = tmp_path / "grades.csv"
+    grades.write_text("material,foam\nmat1,1\nmat2,0\n")
+    words = ("fabric", "attributes", "--data", tmp_path, "--grades", grades, "--sets", "biotac-20")
+    assert "Get it from github.com" in refused(*words)
 
 
 def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
@@ -87,8 +113,20 @@ def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
         ordered=True,
     )
     monkeypatch.setattr("scroll_tactile.cli.results.load", lambda data, sensor, seed: few)
-    monkeypatch.setattr("scroll_tactile.datasets.biotac_slide.GRADES", {"shaking": GRADE})
-    words = ["fabric", "attributes", "--data", tmp_path, "--json", tmp_path / "out.json", "--dimension", "64"]
+    grades = tmp_path / "grades.csv"
+    grades.write_text("\n".join(["material,shaking", *(f"{name},{grade}" for name, grade in GRADE.items())]))
+    words = [
+        "fabric",
+        "attributes",
+        "--data",
+        tmp_path,
+        "--grades",
+        grades,
+        "--json",
+        tmp_path / "out.json",
+        "--dimension",
+        "64",
+    ]
     told = run(*words, "--sets", "roboskin-20", "--run", tmp_path / "run")
     assert told.exit_code == 0, told.output
     assert "shaking" in told.output

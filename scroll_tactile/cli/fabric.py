@@ -13,7 +13,8 @@ from rich.table import Table
 from scroll_tactile.cli.contactile import contactile
 from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
-from scroll_tactile.datasets import biotac_slide, fabric_slide, letter_spike, physiclear
+from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
+from scroll_tactile.datasets.grades import read_grades
 from scroll_tactile.datasets.letter_spike import DOTS
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines import objects
@@ -103,22 +104,26 @@ def slide(
 @fabric.command()
 def attributes(
     data: Annotated[Path, typer.Option(help="Folder of BioTac_slide_20_50, or the one it lies in.")],
+    grades: Annotated[
+        Path, typer.Option(help="A .csv file: material (mat1 to mat20), then a column of grades for each attribute.")
+    ],
     sets: Annotated[str, typer.Option(help="Which sensors touch: biotac-20, roboskin-20.")] = "biotac-20,roboskin-20",
     dimension: Annotated[int, typer.Option(min=64, help="Of the kernels.")] = 504,
     seed: Annotated[int, typer.Option(min=0, help="Of the trees.")] = 0,
     json: JsonFile = None,
     run: RunFolder = None,
 ) -> None:
-    """Tell the stiffness and roughness of materials never touched before."""
+    """Tell attributes, such as stiffness and roughness, of materials never touched before."""
     require_folders(json)
     asked = list(dict.fromkeys(part.strip() for part in sets.split(",")))
     if strange := [name for name in asked if name not in list(Dataset)]:
         raise InputError(f"expected --sets out of {', '.join(Dataset)}; came {strange[0]!r}")
     found: dict[str, Any] = {}
     with progress_bar() as progress:
+        listed = read_grades(grades)
         for name in asked:
             recordings = read(Dataset(name), data, seed)
-            task = Attributes(recordings, biotac_slide.GRADES, dimension, seed, run)
+            task = Attributes(recordings, listed, dimension, seed, run)
             results = list(task.run(progress))
             found[name] = task.plan | {"means": summary_of_attributes(results), "parts": results}
     table = Table(
@@ -130,7 +135,20 @@ def attributes(
             table.add_row(name, attribute, *cells)
     console().print(table)
     if json is not None:
-        words = ["fabric", "attributes", "--data", data, "--sets", sets, "--dimension", dimension, "--seed", seed]
+        words = [
+            "fabric",
+            "attributes",
+            "--data",
+            data,
+            "--grades",
+            grades,
+            "--sets",
+            sets,
+            "--dimension",
+            dimension,
+            "--seed",
+            seed,
+        ]
         command = shlex.join(["scroll-tactile", *map(str, words)])
         write_json(json, origin(command) | {"seed": seed, "sets": found})
         say(f"figures: {json}")

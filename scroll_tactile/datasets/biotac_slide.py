@@ -31,27 +31,11 @@ from scroll_tactile.errors import DatasetError, InputError, StreamError
 from scroll_tactile.sensors import BIOTAC, ROBOSKIN, Sensor
 from scroll_tactile.streams import Stream, validate
 
-__all__ = ["GRADES", "MATERIALS", "load"]
+__all__ = ["MATERIALS", "load"]
 
 FOLDER = "biotac_slide_20_50"
 MATERIALS = tuple(f"mat{number}" for number in range(1, 21))
 """The twenty materials, named as their publisher does, for both sensors."""
-
-
-def _graded(low: tuple[int, ...], middle: tuple[int, ...]) -> dict[str, int]:
-    """Grades 0, 1 and 2 of the materials, of the labels (from 0) that are low and middle."""
-    return {name: 0 if label in low else 1 if label in middle else 2 for label, name in enumerate(MATERIALS)}
-
-
-GRADES = {
-    "stiffness": _graded((2, 10, 17), (1, 3, 4, 5, 6, 12)),
-    "roughness": _graded((3, 4, 7, 9, 12, 13, 14, 19), (5, 8, 11, 15, 16, 17)),
-}
-"""Attribute → material → grade, 0 (soft, smooth) to 2 (stiff, rough), as the publisher's later work labels the same
-twenty (R. Gao et al., On Explainability and Sensor-Adaptability of a Robot Tactile Texture Representation, IROS 2021;
-`property_label` in code/preprocess_data.py of github.com/dexrob/ExSARN). What else the publisher says of them, such as
-their thickness and what they are made of, is in Material_properties.docx of github.com/dexrob/BioTac_slide_20_50, which
-is no part of the copies that these figures were made from: nothing is claimed of it here."""
 
 _REPETITIONS = 50
 _FOLDS = 5

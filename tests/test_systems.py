@@ -258,6 +258,16 @@ class TestTraining:
         assert state(trained(augmentation=Augmentation())) == state(trained(augmentation=Augmentation()))
         assert state(trained(augmentation=Augmentation())) != state(trained())
 
+    def test_with_augmentation_a_short_touch_goes_on_as_those_learned_did(self):
+        plain, tough = trained(), trained(augmentation=Augmentation())
+        widths: list[int] = []
+        for system in (plain, tough):
+            system.network.register_forward_hook(lambda module, inputs, output: widths.append(inputs[0].shape[-1]))
+            whole = TAUGHT[0][1]
+            system.predict([whole, whole.first(whole.seconds / 2)])
+        assert widths[0] == 2 * widths[1] == widths[2]
+        assert len(widths) == 3  # of one width, and asked together
+
     def test_the_rate_falls_on_a_plateau_and_the_best_epoch_stays(self):
         images = torch.randn(12, 2, generator=torch.Generator().manual_seed(0))
         taught = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())

@@ -60,6 +60,7 @@ class Trained:
         self._augmentation = augmentation
         self._names: list[str] = []
         self._net: nn.Module | None = None
+        self._columns = 0
 
     def fit(
         self,
@@ -76,7 +77,7 @@ class Trained:
         """
         self._names = require_touches(streams, materials, validation)
         images = [self._view(stream) for stream in streams]
-        columns = usual_columns(images)
+        columns = self._columns = usual_columns(images)
         random = np.random.default_rng([seed, 0])
         taught = self._batches(images, materials, columns, random if self._augmentation is not None else None)
         held = None

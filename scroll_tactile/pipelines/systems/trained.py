@@ -105,12 +105,17 @@ class Trained:
     def outputs(self, streams: Sequence[Stream], of: nn.Module | None = None) -> torch.Tensor:
         """What the network, or a part `of` it, gives for N streams of any length, (N, outputs), on the processor.
 
+        With augmentation a shorter touch goes on as its mirror image, as those did that were learned: a residual network
+        that never met a narrow image is at chance on one.
+
         Raises InputError before `fit`.
         """
         network = self.network if of is None else of
         given: list[torch.Tensor] = [torch.empty(0)] * len(streams)
         sizes: dict[tuple[int, ...], list[int]] = {}
         images = [self._view(stream) for stream in streams]
+        if self._augmentation is not None:
+            images = [one_width(image, max(self._columns, image.shape[-1])) for image in images]
         for at, image in enumerate(images):
             sizes.setdefault(image.shape, []).append(at)
         for members in sizes.values():

@@ -105,8 +105,8 @@ class Trained:
     def outputs(self, streams: Sequence[Stream], of: nn.Module | None = None) -> torch.Tensor:
         """What the network, or a part `of` it, gives for N streams of any length, (N, outputs), on the processor.
 
-        With augmentation a shorter touch goes on as its mirror image, as those did that were learned: a residual network
-        that never met a narrow image is at chance on one.
+        With augmentation a shorter touch goes on as its mirror image, as those did that were learned: a residual
+        network that never met a narrow image is at chance on one.
 
         Raises InputError before `fit`.
         """

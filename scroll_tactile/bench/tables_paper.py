@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from scroll_tactile.bench.markdown import Read, table
+from scroll_tactile.pipelines.systems.catalogue import SYSTEMS
 
 __all__ = ["efficiency", "networks", "robust", "robustness", "tableone"]
 
@@ -19,6 +20,7 @@ PERTURBED = (
     ("a fifth of the channels dead", "dead", 0.2),
     ("uniform noise of ± half the range", "noise", 0.5),
     ("zero and gain drifting by 5 %", "drift", 0.05),
+    ("another sitting: ten successive touches of fifty left out", "sitting", 0.0),
 )
 EPOCHS = (1, 2, 5, 10, 20)
 STREAMS = (1, 2, 5, 10, 20, 40)
@@ -78,26 +80,30 @@ def robustness(read: Read) -> str:
         cells = []
         for result in results:
             mine = _means(result, study, strength)
-            cells += [_shown(mine["ours", augmented]) for augmented in (False, True)]
+            cells += [_shown(mine.get(("ours", augmented))) for augmented in (False, True)]
         rows.append([words, *cells])
     head = [f"{name}, {words}" for name in NAMES for words in ("default", "`Robust`")]
     return table(["percent", *head], rows)
 
 
 def robust(read: Read) -> str:
-    """The paper's systems with their augmentation (and without), beside the robust learner."""
+    """The paper's systems with their augmentation, and in brackets without, beside the robust learner."""
+    peers = {name: read(f"robustness-peers-{name}") for name in SETS}
+    systems = list(dict.fromkeys(row["system"] for result in peers.values() for row in result["means"]))
     rows = []
-    head: list[str] = []
-    for name, label in zip(SETS, NAMES, strict=True):
-        peers = read(f"robustness-peers-{name}")
+    for (name, result), label in zip(peers.items(), NAMES, strict=True):
         ours = read(f"robustness-{name}")
-        systems: Sequence[str] = list(dict.fromkeys(row["system"] for row in peers["means"]))
-        head = ["percent", "ours, `Robust`", *systems]
         for words, study, strength in PERTURBED:
-            theirs = _means(peers, study, strength)
-            pairs = (f"{_shown(theirs[one, True])} ({_shown(theirs[one, False])})" for one in systems)
-            rows.append([f"{label}: {words}", _shown(_means(ours, study, strength)["ours", True]), *pairs])
-    return table(head, rows)
+            theirs = _means(result, study, strength)
+            if not theirs:
+                continue
+            pairs = (_pair(theirs.get((one, True)), theirs.get((one, False))) for one in systems)
+            rows.append([f"{label}: {words}", _shown(_means(ours, study, strength).get(("ours", True))), *pairs])
+    return table(["percent", "ours, `Robust`", *(SYSTEMS[one] for one in systems)], rows)
+
+
+def _pair(augmented: Mapping[str, Any] | None, plain: Mapping[str, Any] | None) -> str:
+    return "" if augmented is None else f"{_shown(augmented)} ({_shown(plain)})"
 
 
 def _means(result: Mapping[str, Any], study: str, strength: float) -> dict[tuple[str, bool], Mapping[str, float]]:
@@ -113,7 +119,9 @@ def _here(one: Mapping[str, Any]) -> str:
     return _shown(one) + (" (1 fold)" if one["folds"] == 1 else "")
 
 
-def _shown(one: Mapping[str, Any]) -> str:
-    """A mean, and the standard deviation where there is more than a fold."""
+def _shown(one: Mapping[str, Any] | None) -> str:
+    """A mean, and the standard deviation where there is more than a fold; nothing where nothing was measured."""
+    if one is None:
+        return ""
     share = f"{100 * one['mean']:.1f}"
     return share if one["folds"] == 1 else f"{share} ± {100 * one['sd']:.1f}"

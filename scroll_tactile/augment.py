@@ -4,8 +4,9 @@ The paper (Zandonati et al. 2023) flips tactile images along the data axis, resi
 jitters them. Here all four act along time: the slide went the other way, faster or slower, for less long, over a
 noisier, drifting sensor. The channels keep their places: a sensor's electrodes do not move.
 
-Each takes an image (C, T) or a batch of images of one width, (…, C, T), and does the same to all of it; `changed` puts
-any of them on a stream, and `Augmentation.streams` draws all four for each of several streams.
+Each takes an image (C, T) or a batch of images of one width, (…, C, T), and does the same to all of it; noise and drift
+are drawn for each image of a batch apart. `changed` puts any of them on a stream, and `Augmentation.streams` draws all
+four for each of several streams.
 """
 
 from __future__ import annotations

@@ -80,8 +80,17 @@ class Composer:
         made_of = {one.name: one for one in _summing_to_one(whole, self.targets)}
         return tuple(made_of[name] for name in wanted), unfamiliar
 
+    def through_noise(self, wanted: Sequence[str], feels_like: Mapping[str, float]) -> tuple[Constituent, ...]:
+        """Each constituent that is wanted, of a touch felt through noise: by the described materials it feels like.
+
+        The heads read what noise hides, so they are not asked.
+        """
+        whole = [self._constituent(name, self.stages[-1], feels_like, None, 0.0) for name in self.targets]
+        made_of = {one.name: one for one in _summing_to_one(whole, self.targets)}
+        return tuple(made_of[name] for name in wanted)
+
     def _constituent(
-        self, name: str, stage: Stage, feels_like: Mapping[str, float], z: FloatArray, unfamiliar: float
+        self, name: str, stage: Stage, feels_like: Mapping[str, float], z: FloatArray | None, unfamiliar: float
     ) -> Constituent:
         target = self.targets[name]
 
@@ -91,6 +100,8 @@ class Composer:
             felt = {material: feels_like[material] for material in known if material in feels_like}
             believed = (1 - unfamiliar) * sum(felt.values())
             told = (1 - unfamiliar) * sum(chance * known[material] for material, chance in felt.items())
+            if z is None:
+                return min(told / believed, 1.0) if believed else None
             return min(max(told + (1 - believed) * head(z), 0.0), 1.0)
 
         having = [(material, feels_like.get(material, 0.0)) for material, has in target.presence.items() if has]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+from scroll_tactile.contact import require_rest
 from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
@@ -62,8 +63,14 @@ def kept_augmentation(store: Store, asked: Augmented | None) -> Augmented | None
 def identity_of(
     sensor: Sensor, embedding: Embedding, capacity: Capacity, augmentation: Augmented | None = None
 ) -> dict[str, Any]:
-    """What is written into a new memory for good, in JSON's types."""
+    """What is written into a new memory for good, in JSON's types.
+
+    Raises InputError for an embedding that cannot read the sensor: before anything is written.
+    """
+    require_rest(embedding, sensor)
     reading = Reading.of(sensor, embedding)
+    # Memories of cameras that lack it had windows across two frames: another grid, and refused.
+    frames = {"frames": True} if reading.frames else {}
     # Left out where there is none: such a memory can be opened by the versions before it.
     copies = {} if augmentation is None else {"augmentation": augmentation.to_json()}
     return copies | {
@@ -76,7 +83,7 @@ def identity_of(
             "bound": embedding.bound,
             "fingerprint": embedding.fingerprint,
         },
-        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(reading.widths)},
+        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(reading.widths)} | frames,
     }
 
 

@@ -333,8 +333,9 @@ class TactileLearner:
 
         A touch of a material that was felt is told by what it feels like and what that is made of, one of a material
         never felt by heads over all that were (see `scroll_tactile.composing`); the two are weighed by the touch's
-        novelty. A constituent that all or none of the
-        materials have that were felt and of which it is known is named, in `Constituent.unlearned`, and not guessed.
+        novelty. A touch through noise, where noisy copies were observed, is told by what it feels like alone. A
+        constituent that all or none of the materials have that were felt and of which it is known is named, in
+        `Constituent.unlearned`, and not guessed.
 
         Raises StreamError, DescriptionError where nothing was described, or for a constituent that nothing names, and
         InputError for an unfamiliar that is no probability.
@@ -355,7 +356,12 @@ class TactileLearner:
             nothing = tuple(Constituent(name, None, None, (), "nothing was felt yet") for name in wanted)
             return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
         felt = self._perception.as_far_as(felt, longest)
-        image = self._mended(self._perception.image(felt))
+        image = self._perception.image(felt)
+        if model.noisy is not None and self._perception.is_noisy(image):
+            judgement = model.judge_noisy(model.names, self._perception.noisy_means(image))
+            prediction = self._prediction(model.names, judgement, felt)
+            return Composition(composer.through_noise(wanted, dict(prediction.ranking)), unfamiliar, prediction)
+        image = self._mended(image)
         columns = image.shape[1]
         means = self._perception.means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
         prediction = self._told(model, model.names, means, felt, columns, None)

@@ -1,6 +1,7 @@
 """Grades of materials never touched are told by those that were."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,15 @@ def test_grades_that_are_missing_or_all_one_are_refused(recordings):
     ):
         with pytest.raises(InputError, match=said):
             Attributes(recordings, grades)
+
+
+def test_a_run_is_not_gone_on_with_other_touches(recordings, tmp_path):
+    pytest.importorskip("sklearn")
+    next(Attributes(recordings, {"shaking": GRADE}, 64, folder=tmp_path).run())
+    streams = [*recordings.streams[1:], recordings.streams[0]]
+    other = replace(recordings, streams=streams)
+    with pytest.raises(InputError, match="begun on other recordings"):
+        next(Attributes(other, {"shaking": GRADE}, 64, folder=tmp_path).run())
 
 
 def test_a_table_of_grades_is_read(tmp_path):

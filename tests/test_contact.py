@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import Frames, Kernels, sensors
+from scroll_tactile import Frames, Kernels, TactileLearner, sensors
 from scroll_tactile.contact import MOST_FRAMES, image_of, in_contact, pressed, require_rest
 from scroll_tactile.datasets.gel import SMALL, Gel
-from scroll_tactile.errors import InputError, NoContactError, StreamError
+from scroll_tactile.errors import InputError, MismatchError, NoContactError, StreamError
+from scroll_tactile.identity import identity_of
 from scroll_tactile.images import tactile_image
+from scroll_tactile.memory import Capacity
 from scroll_tactile.streams import validate
+from store import Store
 
 SHAPE = SMALL.shape
 REST = np.full(SHAPE, 100, np.float32)
@@ -80,3 +83,19 @@ def test_the_resting_image_and_the_embedding_have_to_be_the_sensors():
         require_rest(Frames(rest=REST), sensors.GELSIGHT)
     with pytest.raises(InputError, match="reads a camera's frames, and sensor 'biotac' has 19 channels"):
         require_rest(Frames(), sensors.BIOTAC)
+
+
+def test_an_embedding_that_cannot_read_the_sensor_leaves_no_memory_behind(tmp_path):
+    for sensor, embedding in ((sensors.BIOTAC, Frames()), (sensors.GELSIGHT, Frames(rest=REST))):
+        with pytest.raises(InputError):
+            TactileLearner.open(tmp_path / sensor.name, sensor=sensor, embedding=embedding)
+        assert not (tmp_path / sensor.name).exists()
+
+
+def test_a_cameras_memory_says_that_its_windows_are_frames_and_one_that_does_not_is_refused(tmp_path):
+    identity = identity_of(SMALL, Kernels(dimension=64), Capacity(0))
+    assert identity["grid"].pop("frames") is True
+    assert "frames" not in identity_of(sensors.BIOTAC, Kernels(dimension=64), Capacity(0))["grid"]
+    Store.open(tmp_path / "old", identity=identity).close()
+    with pytest.raises(MismatchError, match="was made with"):
+        TactileLearner.open(tmp_path / "old", sensor=SMALL, embedding=Kernels(dimension=64))

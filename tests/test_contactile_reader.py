@@ -244,3 +244,12 @@ class TestRatios:
 
 def test_every_layout_says_the_same_two_things():
     assert all("(?P<fabric>" in one and "(?P<protocol>" in one for one in contactile.LAYOUTS)
+
+
+def test_pandas_names_of_nameless_columns_are_no_reading(tmp_path):
+    folder = folder_of(tmp_path, USUAL)
+    first = sorted(folder.rglob("00.npy"))[0]
+    head = ",".join(map(str, range(27)))
+    np.savetxt(first.with_suffix(".csv"), np.load(first), delimiter=",", header=head, comments="")
+    first.unlink()
+    assert {len(stream) for stream in load(folder).recordings.streams} == {30}

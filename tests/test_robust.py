@@ -167,6 +167,21 @@ class TestAnswers:
         assert sorted(name for name, _ in answer.ranking) == ["cork", "oak"]
         assert sum(chance for _, chance in answer.ranking) == pytest.approx(1)
 
+    def test_what_a_noisy_touch_is_made_of_is_told_by_what_it_feels_like(self, robust, scene):
+        for name in NAMES:
+            robust.describe(name, {f"{name}'s": 1.0})
+        try:
+            for name in NAMES:
+                touch = noise(scene.touch(name, 50, seconds=2), 0.3)
+                answer, made_of = robust.predict(touch), robust.compose(touch)
+                assert made_of.prediction.ranking == answer.ranking
+                chances = dict(answer.ranking)
+                for other in NAMES:
+                    assert made_of[f"{other}'s"].presence == pytest.approx(chances.get(other, 0))
+        finally:
+            for name in NAMES:
+                robust.describe(name, None)
+
     def test_with_broken_wires(self, robust, scene):
         assert share(robust, scene, lambda touch: dead(touch, 0.2)) >= 0.9
 

@@ -10,6 +10,7 @@ from test_perturbations import PAD
 from scroll_tactile import Kernels, plots
 from scroll_tactile.copies import Augmented
 from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.embeddings import Robust
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.pipelines.robustness import Robustness, ours, summary, worst
@@ -89,6 +90,23 @@ def test_an_interrupted_run_goes_on(tmp_path):
     assert Loudest.made == 0  # all was read back
     with pytest.raises(InputError, match="another run"):
         list(study(tmp_path / "run", seed=1).run([0]))
+
+
+def test_a_run_is_not_gone_on_with_other_touches(tmp_path):
+    list(study(tmp_path / "run", studies=["dead"]).run([0]))
+    other = recordings()
+    other.streams[0] = other.streams[1]
+    with pytest.raises(InputError, match="begun on other recordings"):
+        list(Robustness(other, {"loudest": Loudest}, studies=["dead"], quick=True, folder=tmp_path / "run").run([0]))
+
+
+def test_a_cameras_frames_are_refused():
+    gel = Gel()
+    streams = [gel.touch(name, at) for name in gel.materials[:2] for at in range(4)]
+    within = np.tile(np.arange(4), 2)
+    frames = Recordings("gel", streams[0].sensor, streams, [*"aaaabbbb"], within, within % 2, ordered=False)
+    with pytest.raises(InputError, match="of camera 'gelsight'"):
+        Robustness(frames, {"loudest": Loudest}, studies=["noise"])
 
 
 def test_what_cannot_be_is_refused():

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -188,6 +189,20 @@ class TestTasks:
     def test_what_cannot_be_is_refused(self, study, change, words):
         with pytest.raises(InputError, match=words):
             replace(study, **change)
+
+    def test_a_network_that_is_not_the_one_noted_is_refused(self, study, results, tmp_path):
+        copied = tmp_path / "run"
+        shutil.copytree(study.folder, copied)
+        notes = json.loads((copied / "transfer-tasks.json").read_text())
+        tuned = next(key for key in notes["notes"] if "tuned" in key and "patch" in key.partition("tuned")[2])
+        del notes["notes"][tuned]
+        (copied / "transfer-tasks.json").write_text(json.dumps(notes))
+        (file,) = copied.glob("tuned-on-patch*.safetensors")
+        damaged = bytearray(file.read_bytes())
+        damaged[-100] ^= 1
+        file.write_bytes(damaged)
+        with pytest.raises(WeightsError, match="not the network that was fine-tuned on patch"):
+            list(replace(study, folder=copied).run())
 
     def test_some_frames_of_each_video(self):
         frames = np.random.default_rng(0).integers(0, 255, (12, 1, 120, 160, 3))

@@ -32,7 +32,8 @@ fabric = typer.Typer(
 fabric.command()(contactile)
 
 RunFolder = Annotated[
-    Path | None, typer.Option(help="Note finished parts in this folder; an interrupted run goes on from it.")
+    Path | None,
+    typer.Option("--run", "--resume", help="Note finished parts in this folder; an interrupted run goes on from it."),
 ]
 JsonFile = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
 
@@ -154,6 +155,7 @@ def attributes(
         say(f"figures: {json}")
 
 
+@fabric.command()
 def gelsight(
     data: Annotated[Path, typer.Option(help="Folder of physiclear, or the one it lies in.")],
     weights: Annotated[

@@ -131,6 +131,8 @@ def tell(asked: Asked, found: Found) -> None:
         _show(name, [row for row in found.means if row["dataset"] == name])
     if any(key in EPOCHAL for key in asked.systems):
         say(f"networks: {asked.epochs} epochs, on {asked.device}, ResNets in {asked.precision}")
+    if asked.quick:
+        say("[yellow]quick:[/] one fold, few strengths; the ResNets' images averaged to about 50 columns")
     if asked.json is not None:
         about = {"seed": asked.seed, "quick": asked.quick, "sets": found.sets}
         write_json(asked.json, origin(asked.words()) | about | {"means": found.means, "records": found.records})

@@ -21,10 +21,8 @@ from scroll_tactile.cli.studies import (
     Json,
     Plot,
     PrecisionChoice,
-    Quick,
     Run,
     Seed,
-    Sets,
     Weights,
     Where,
     read_sets,
@@ -54,6 +52,11 @@ class StudyChoice(StrEnum):
     ALL = "all"
 
 
+QuickStudy = Annotated[
+    bool,
+    typer.Option("--quick", help="The first of these folds, few strengths, networks of 6 epochs on small images."),
+]
+SensorSets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(QUICK_SETS)}.")]
 Systems = Annotated[
     str | None, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; without and with augmentation.")
 ]
@@ -69,7 +72,7 @@ def robustness(
     epochs: Epochs = None,
     device: Where = Device.CPU,
     precision: InPrecision = PrecisionChoice.FLOAT32,
-    quick: Annotated[bool, typer.Option("--quick", help="The first of these folds, and few strengths.")] = False,
+    quick: QuickStudy = False,
     seed: Seed = 0,
     run: Run = None,
     json: Json = None,
@@ -113,14 +116,14 @@ def study_command(study: str) -> Callable[..., None]:
     def command(
         data: Data,
         weights: Weights = None,
-        sets: Sets = None,
+        sets: SensorSets = None,
         systems: Systems = None,
         folds: Folds = None,
         epochs: Epochs = None,
         device: Where = Device.CPU,
         precision: InPrecision = PrecisionChoice.FLOAT32,
         seed: Seed = 0,
-        quick: Quick = False,
+        quick: QuickStudy = False,
         run: Run = None,
         json: Json = None,
         plot: Plot = None,

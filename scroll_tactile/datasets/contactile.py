@@ -165,7 +165,7 @@ def _named(
             continue
         below = path.relative_to(folder).with_suffix("").as_posix()
         found = next((match for one in patterns if (match := one.fullmatch(below))), None)
-        if found is None:
+        if found is None or not found["fabric"] or not found["protocol"]:
             raise DatasetError(
                 f"expected the path of {path} to say fabric and protocol, such as protocol1/FABRIC/00.npy, "
                 "FABRIC/protocol1/00.npy or FABRIC_protocol1_00.npy. Move it, or give a pattern of your own"
@@ -231,7 +231,8 @@ def _cells(path: Path) -> npt.NDArray[np.float64]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row]
         timed = bool(rows) and rows[0][0].strip().lower() in ("t", "time", "timestamp")
-        if rows and not _number(rows[0][-1]):
+        # A line of names, or of pandas' names for columns without any: 0, 1, 2 …
+        if rows and (not _number(rows[0][-1]) or rows[0][timed:] == [str(at) for at in range(len(rows[0]) - timed)]):
             rows = rows[1:]
         return np.array([row[timed:] for row in rows], dtype=np.float64)
     except (OSError, ValueError, UnicodeDecodeError, csv.Error) as error:

@@ -73,11 +73,14 @@ class Frames:
         seed: int = 1,
         runtime: RuntimeName = "torch",
     ) -> None:
-        if cosines < 0 or seed < 0 or (cosines and weights is not None):
+        whole = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in (cosines, seed))
+        if not whole or (cosines and weights is not None):
             raise InputError(
-                f"expected cosines and a seed of 0 or more, and no weights beside cosines; came {cosines} and {seed}"
-                + (" with weights" if weights is not None else "")
+                "expected cosines and a seed as whole numbers of 0 or more, and no weights beside cosines; came "
+                f"{cosines!r} and {seed!r}" + (" with weights" if weights is not None else "")
             )
+        if weights is None and runtime != "torch":
+            raise InputError(f"expected a runtime with weights, which it is to run; came {runtime!r} without")
         self.rest: Rest = _checked(rest)
         self.cosines = cosines
         self.seed = seed

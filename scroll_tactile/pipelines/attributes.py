@@ -23,6 +23,7 @@ from scroll_tactile.embeddings import Embedding, Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.cached import Cached
+from scroll_tactile.pipelines.cells import require_data
 from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.replay import Progress
 from scroll_tactile.pipelines.runfile import RunFile
@@ -80,6 +81,7 @@ class Attributes:
         """The figures of each material left out, as they are finished. Raises InputError without scikit-learn."""
         name = f"attributes-{self.recordings.name}.json".lower()
         notes = RunFile(None if self.folder is None else self.folder / self.recordings.name.lower() / name, self.plan)
+        require_data(notes, self.recordings)
         embedding = Cached(Kernels(dimension=self.dimension))
         plain = np.stack([_simple(stream.readings) for stream in self.recordings.streams])
         for material in dict.fromkeys(self.recordings.materials):

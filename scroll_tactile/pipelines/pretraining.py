@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -78,7 +79,7 @@ class Pretraining:
                 right = float(kept["accuracy"])
             net = load_network(self.weights)
             net.load_state_dict(tensors)
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
+        except (OSError, ValueError, KeyError, RuntimeError, EOFError, BadZipFile) as error:
             raise InputError(
                 f"expected in {file} the network of this run, fine-tuned on {self.recordings.name}; it cannot be read "
                 f"({error}). Remove the file, and it is trained again"

@@ -22,6 +22,7 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Robust
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.cells import require_data
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.passes import Labelled, hold_out, observe_all
 from scroll_tactile.pipelines.perturbations import STUDIES
@@ -98,8 +99,8 @@ class Robustness:
     studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
     quick: fewer strengths. folder: where finished cells are kept, or None.
 
-    Raises InputError for studies that there are not, and DatasetError for "sitting" where the order of recording is
-    not known.
+    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "sitting" where the
+    order of recording is not known.
     """
 
     recordings: Recordings
@@ -119,6 +120,11 @@ class Robustness:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
         if SITTING in self.studies:
             self.recordings.blocked()
+        if self.recordings.sensor.camera:
+            raise InputError(
+                f"expected touches of channels, which are cut, resampled and made noisy along time; "
+                f"{self.recordings.name} is of camera {self.recordings.sensor.name!r}"
+            )
 
     @property
     def plan(self) -> dict[str, Any]:
@@ -140,6 +146,7 @@ class Robustness:
         if not folds or set(folds) - set(there):
             raise InputError(f"expected folds out of {there}; came {list(folds)}")
         notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
+        require_data(notes, self.recordings)
         for name in self.systems:
             self._require_settings(notes, name)
         for fold in folds:

@@ -18,7 +18,7 @@ import torch
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Kernels, Vision
 from scroll_tactile.embeddings.weights import load_network, read_tensors
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.images import tactile_image
 from scroll_tactile.pipelines.cached import Cached
 from scroll_tactile.pipelines.cells import Cell, Figures, require_data, run_cells, split
@@ -118,6 +118,9 @@ class TaskTransfer:
         that is damaged, and what learning and training raise.
         """
         notes = RunFile(None if self.folder is None else self.folder / "transfer-tasks.json", self.plan)
+        for source, fold in ((one.name, fold) for one in self.sets for fold in self.folds):
+            if (figures := notes.notes.get(Cell(source, fold, TRAINING).key)) is not None:
+                self._noted[source, fold] = figures["digest"]
         for one in self.sets:
             require_data(notes, one)
             for fold in self.folds:
@@ -169,7 +172,17 @@ class TaskTransfer:
                 self._networks[source, fold] = read_tensors(path)
             else:
                 self._train(self._by_name[source], fold, progress)
+            self._require_noted(source, fold)
         return self._networks[source, fold]
+
+    def _require_noted(self, source: str, fold: int) -> None:
+        """Compare the network in hand with what was noted of it when it was trained."""
+        noted = self._noted.get((source, fold))
+        if noted is not None and noted != _digest(self._networks[source, fold]):
+            raise WeightsError(
+                f"{self._path(source, fold)} is not the network that was fine-tuned on {source} in this run: it is "
+                "damaged, or was trained again elsewhere. Take another folder"
+            )
 
     def _keep(self, source: str, fold: int, tensors: Tensors) -> None:
         self._networks.clear()  # one at a time: the cells of a source follow one another
@@ -177,14 +190,15 @@ class TaskTransfer:
         path = self._path(source, fold)
         if path is None:
             return
+        from safetensors import SafetensorError
         from safetensors.torch import save_file
 
         draft = path.with_name(path.name + ".new")
         try:
             save_file(dict(tensors), draft)
             draft.replace(path)
-        except OSError as error:
-            raise InputError(f"{path} cannot be written: {error.strerror}: make room or take another folder") from error
+        except (OSError, SafetensorError) as error:  # the latter is no OSError, also where the disk is what failed
+            raise InputError(f"{path} cannot be written: {error}. Make room or take another folder") from error
 
     def _path(self, source: str, fold: int) -> Path | None:
         slug = "-".join(source.lower().split())
@@ -193,6 +207,11 @@ class TaskTransfer:
     @cached_property
     def _by_name(self) -> dict[str, Recordings]:
         return {one.name: one for one in self.sets}
+
+    @cached_property
+    def _noted(self) -> dict[tuple[str, int], str]:
+        """(set, fold) → digest of the network that an earlier start of this run fine-tuned."""
+        return {}
 
     @cached_property
     def _networks(self) -> dict[tuple[str, int], Tensors]:

@@ -99,9 +99,20 @@ def test_cosines_approximate_a_kernel_of_the_surface_alone():
     assert np.array_equal(embedding.embed(images[0] + np.float32(0.25)), embedding.embed(images[0]))
 
 
-@pytest.mark.parametrize("bad", [{"cosines": -1}, {"seed": -1}, {"cosines": 9, "weights": NETWORK}])
-def test_settings_that_cannot_be_are_refused(bad):
-    with pytest.raises(InputError, match="expected cosines and a seed of 0 or more"):
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ({"cosines": -1}, "cosines and a seed as whole numbers"),
+        ({"cosines": 1.5}, "came 1.5 and 1"),
+        ({"cosines": "a"}, "came 'a'"),
+        ({"seed": -1}, "came 0 and -1"),
+        ({"seed": np.nan}, "came 0 and nan"),
+        ({"cosines": 9, "weights": NETWORK}, "with weights"),
+        ({"runtime": "onnxruntime"}, "expected a runtime with weights"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(bad, said):
+    with pytest.raises(InputError, match=said):
         Frames(**bad)
 
 

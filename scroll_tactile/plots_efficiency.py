@@ -34,6 +34,7 @@ def draw_efficiency(path: Path, curves: Sequence[Mapping[str, Any]]) -> None:
         mine = [curve for curve in curves if curve["dataset"] == dataset]
         _draw(left, [curve for curve in mine if curve["by"] == "epochs"])
         _draw(right, [curve for curve in mine if curve["by"] == "streams"])
+        left.xaxis.get_major_locator().set_params(integer=True)
         left.set(xlabel="epochs over all touches", ylabel="accuracy on the test, %", title=f"{dataset}: trained")
         right.set(xlabel="touches of each material, each met once", title=f"{dataset}: one pass", xscale="log")
         seen = sorted({point[0] for curve in mine if curve["by"] == "streams" for point in curve["points"]})

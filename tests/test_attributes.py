@@ -91,7 +91,8 @@ def test_a_table_of_grades_is_read(tmp_path):
         ("material,foam\n,1\n", "came ''"),
         ("material,foam\nmat1,soft\n", "'soft'"),
         ("material,foam\nmat1,-1\n", "'-1'"),
-        ("material,foam,wood\nmat1,1\n", "expected 2 grades"),
+        ("material,thickness\nmat1,1200\n", "from 0 to 20"),
+        ("material,foam,wood\nmat1,1\n", "each of 2 columns"),
     ],
 )
 def test_a_table_that_says_no_grades_is_named(text, said, tmp_path):

@@ -17,12 +17,14 @@ from scroll_tactile.errors import DatasetError
 
 __all__ = ["read_grades"]
 
+MOST = 20  # grades are told step by step, each by a head of its own: they are no measures
+
 
 def read_grades(path: Path) -> dict[str, dict[str, int]]:
     """Attribute → material → grade, of a file whose first line names the columns, the first that of the materials.
 
     Raises DatasetError, which names file and line, for a file that cannot be read, no attributes or materials, columns
-    or materials that come twice, and cells that are not whole numbers from 0.
+    or materials that come twice, and cells that are not whole numbers from 0 to MOST.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -42,9 +44,10 @@ def read_grades(path: Path) -> dict[str, dict[str, int]]:
     for line, (material, *cells) in rows[1:]:
         if not material or material in found[head[1]]:
             raise DatasetError(f"expected a new material's name in line {line} of {path}; came {material!r}")
-        if len(cells) != len(found) or not all(cell.isascii() and cell.isdigit() for cell in cells):
+        sound = all(cell.isascii() and cell.isdigit() and len(cell) < 3 and int(cell) <= MOST for cell in cells)
+        if len(cells) != len(found) or not sound:
             raise DatasetError(
-                f"expected {len(found)} grades, whole numbers from 0, in line {line} of {path}; came {cells}"
+                f"expected a grade for each of {len(found)} columns, whole numbers from 0 to {MOST}, in line {line} of {path}; came {cells}"
             )
         for name, cell in zip(found, cells, strict=True):
             found[name][material] = int(cell)

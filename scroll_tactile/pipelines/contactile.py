@@ -114,7 +114,7 @@ class Contactile:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """All that each figure depends on, beside the touches; rows can be added to a run later."""
+        """All that each figure depends on, beside the touches; rows can be added later, not weights."""
         made_of = json.dumps(self.fabrics.compositions, sort_keys=True).encode()
         options = {name: getattr(self, name) for name in ("epochs", "biotac_epochs", "device", "seed", "every", "take")}
         return {

@@ -77,7 +77,7 @@ class Study:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """All that each figure depends on, beside the data; sets, systems and folds can be added to a run later."""
+        """All that each figure depends on, beside the data; sets, systems and folds can be added, not weights."""
         options = {name: getattr(self, name) for name in ("epochs", "device", "seed", "quick", "precision")}
         return {"run": self.name, **options, "weights": None if self.weights is None else weights_digest(self.weights)}
 

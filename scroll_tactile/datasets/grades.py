@@ -47,7 +47,8 @@ def read_grades(path: Path) -> dict[str, dict[str, int]]:
         sound = all(cell.isascii() and cell.isdigit() and len(cell) < 3 and int(cell) <= MOST for cell in cells)
         if len(cells) != len(found) or not sound:
             raise DatasetError(
-                f"expected a grade for each of {len(found)} columns, whole numbers from 0 to {MOST}, in line {line} of {path}; came {cells}"
+                f"expected a grade for each of {len(found)} columns, whole numbers from 0 to {MOST}, in line {line} of "
+                f"{path}; came {cells}"
             )
         for name, cell in zip(found, cells, strict=True):
             found[name][material] = int(cell)

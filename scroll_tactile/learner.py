@@ -308,9 +308,8 @@ class TactileLearner:
         felt = self._perception.as_far_as(felt, longest)
         image = self._perception.image(felt)
         columns = image.shape[1]
-        if model.noisy is not None and self._perception.is_noisy(image):
-            judgement = model.judge_noisy(candidates, self._perception.noisy_means(image))
-            return self._prediction(candidates, judgement, felt)
+        if (through_noise := self._through_noise(model, candidates, image, felt)) is not None:
+            return through_noise
         image = self._mended(image)
         means = self._perception.means(image, model.needed(candidates, columns))
         logits = None
@@ -357,10 +356,9 @@ class TactileLearner:
             return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, felt.seconds))
         felt = self._perception.as_far_as(felt, longest)
         image = self._perception.image(felt)
-        if model.noisy is not None and self._perception.is_noisy(image):
-            judgement = model.judge_noisy(model.names, self._perception.noisy_means(image))
-            prediction = self._prediction(model.names, judgement, felt)
-            return Composition(composer.through_noise(wanted, dict(prediction.ranking)), unfamiliar, prediction)
+        if (through_noise := self._through_noise(model, model.names, image, felt)) is not None:
+            made_of = composer.through_noise(wanted, dict(through_noise.ranking))
+            return Composition(made_of, unfamiliar, through_noise)
         image = self._mended(image)
         columns = image.shape[1]
         means = self._perception.means(image, sorted({*model.needed(model.names, columns), *composer.needed(columns)}))
@@ -378,6 +376,14 @@ class TactileLearner:
         """The image with silent channels filled from the others, where the embedding asks for that."""
         filling = self._filling() if self._reading.filled else None
         return image if filling is None else filling.fill(image)
+
+    def _through_noise(
+        self, model: Model, candidates: Sequence[str], image: npt.NDArray[np.float32], felt: Stream
+    ) -> Prediction | None:
+        """What a touch is taken for that was felt through noise; None of any other, and where none were learned."""
+        if model.noisy is None or not self._perception.is_noisy(image):
+            return None
+        return self._prediction(candidates, model.judge_noisy(candidates, self._perception.noisy_means(image)), felt)
 
     def _told(
         self,

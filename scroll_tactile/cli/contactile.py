@@ -12,7 +12,7 @@ import torch
 import typer
 from rich.table import Table
 
-from scroll_tactile.cli.results import origin, require_folders
+from scroll_tactile.cli.results import leave_out, named, origin, require_folders
 from scroll_tactile.cli.studies import Device, Json, Run, Seed, Where
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import biotac_slide
@@ -106,19 +106,14 @@ def contactile(
 
 def _choose(asked: str | None, weights: str | None, biotac: Path | None) -> tuple[str, ...]:
     """The rows of --rows; without it all that can be made, and a word on the others."""
-    if asked is not None:
-        keys = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
-        if strange := [key for key in keys if key not in ROWS]:
-            raise InputError(f"expected --rows out of {', '.join(ROWS)}; came {', '.join(map(repr, strange))}")
-    else:
-        keys = tuple(ROWS)
+    keys = tuple(ROWS) if asked is None else named("--rows", asked, ROWS)
     for option, given, needing in (("--weights", weights, NEED_WEIGHTS), ("--biotac", biotac, NEED_BIOTAC)):
-        without = [key for key in keys if key in needing and given is None]
-        if without and asked is not None:
+        if given is not None:
+            continue
+        if asked is None:
+            keys = leave_out(keys, needing, option)
+        elif without := [key for key in keys if key in needing]:
             raise InputError(f"{', '.join(without)} need {option}")
-        if without:
-            say(f"[yellow]Left out without {option}:[/] {', '.join(without)}")
-            keys = tuple(key for key in keys if key not in without)
     return keys
 
 

@@ -12,8 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scroll_tactile import plots
-from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
+from scroll_tactile.cli.results import Dataset, draw_into, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
@@ -216,8 +215,4 @@ def _command(
 
 
 def _plot(plot: Path, title: str, results: Sequence[Mapping[str, Any]], published: tuple[float, float] | None) -> None:
-    if not plots.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
-        return
-    draw_continual(plot, summary(results), title=title, lines=_lines(published))
-    say(f"plot: {plot}")
+    draw_into(plot, lambda file: draw_continual(file, summary(results), title=title, lines=_lines(published)))

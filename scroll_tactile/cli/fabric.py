@@ -11,12 +11,11 @@ import typer
 from rich.table import Table
 
 from scroll_tactile.cli.contactile import contactile
-from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
+from scroll_tactile.cli.results import Dataset, named, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.grades import read_grades
 from scroll_tactile.datasets.letter_spike import DOTS
-from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines import objects
 from scroll_tactile.pipelines.attributes import Attributes
 from scroll_tactile.pipelines.attributes import summary as summary_of_attributes
@@ -116,9 +115,7 @@ def attributes(
 ) -> None:
     """Tell attributes, such as stiffness and roughness, of materials never touched before."""
     require_folders(json)
-    asked = list(dict.fromkeys(part.strip() for part in sets.split(",")))
-    if strange := [name for name in asked if name not in list(Dataset)]:
-        raise InputError(f"expected --sets out of {', '.join(Dataset)}; came {strange[0]!r}")
+    asked = named("--sets", sets, list(Dataset))
     found: dict[str, Any] = {}
     with progress_bar() as progress:
         listed = read_grades(grades)

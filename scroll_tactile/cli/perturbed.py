@@ -5,19 +5,19 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
-from scroll_tactile import plots
-from scroll_tactile.cli.results import origin, parse_folds
+from scroll_tactile.cli.results import draw_into, leave_out, named, origin, parse_folds
 from scroll_tactile.cli.terminal import console, percent, say, write_json
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.baselines import BASELINES, baseline
 from scroll_tactile.pipelines.robustness import NAMES, PAPER, SITTING, Make, Progress, Robustness, ours, summary
-from scroll_tactile.pipelines.studies import QUICK_COLUMNS, weights_digest
+from scroll_tactile.pipelines.studies import columns_averaged, weights_digest
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, NEED_WEIGHTS, Catalogue
 from scroll_tactile.pipelines.systems.descent import Course, Precision
 from scroll_tactile.pipelines.systems.trained import require_device
@@ -58,7 +58,7 @@ class Asked:
 
     def catalogue(self, recordings: Recordings) -> Catalogue:
         """What the paper's systems are made with."""
-        every = max(1, round(recordings.sensor.readings / QUICK_COLUMNS)) if self.quick else 1
+        every = columns_averaged(recordings.sensor) if self.quick else 1
         course = Course.in_proportion(self.epochs, self.precision)
         return Catalogue(self.weights, course, self.device, every, self.seed)
 
@@ -82,20 +82,17 @@ class Found:
     records: list[dict[str, Any]] = field(default_factory=list)
 
 
-def choose(given: str | None, weights: str | None) -> list[str]:
+def choose(given: str | None, weights: str | None) -> tuple[str, ...]:
     """The systems of --systems; without it all that can be made, and a word on the others.
 
     Raises InputError for systems that there are not, and those that need weights which are not given.
     """
-    keys = list(CHOICES) if given is None else list(dict.fromkeys(part.strip() for part in given.split(",")))
-    if strange := [key for key in keys if key not in CHOICES]:
-        raise InputError(f"expected --systems out of {', '.join(CHOICES)}; came {', '.join(map(repr, strange))}")
-    lacking = [key for key in keys if key in NEED_WEIGHTS and weights is None]
-    if lacking and given is not None:
+    if given is None:
+        return CHOICES if weights is not None else leave_out(CHOICES, NEED_WEIGHTS, "--weights")
+    keys = named("--systems", given, CHOICES)
+    if weights is None and (lacking := [key for key in keys if key in NEED_WEIGHTS]):
         raise InputError(f"{', '.join(lacking)} need the weights of a trained ResNet: give --weights")
-    if lacking:
-        say(f"[yellow]Left out without --weights:[/] {', '.join(lacking)}")
-    return [key for key in keys if key not in lacking]
+    return keys
 
 
 def measure(asked: Asked, sets: Sequence[Recordings], studies: Sequence[str], progress: Progress) -> Found:
@@ -139,15 +136,12 @@ def tell(asked: Asked, found: Found) -> None:
         say(f"figures: {asked.json}")
     if asked.plot is None:
         return
-    if not plots.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
-        return
     for name in found.sets:
         # One picture a set: lines of two sensors in one panel cannot be told apart.
         file = asked.plot if len(found.sets) == 1 else asked.plot.with_stem(f"{asked.plot.stem}-{name.lower()}")
         rows = [row for row in found.means if row["dataset"] == name]
-        draw_robustness(file, rows, title=f"{name}, learned from clean touches")
-        say(f"plot: {file}")
+        if not draw_into(file, partial(draw_robustness, rows=rows, title=f"{name}, learned from clean touches")):
+            return
 
 
 def _show(dataset: str, rows: Sequence[Mapping[str, Any]]) -> None:

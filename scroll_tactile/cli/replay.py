@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from scroll_tactile import plots
-from scroll_tactile.cli.results import Dataset, origin, parse_folds, read, require_folders
+from scroll_tactile.cli.results import Dataset, draw_into, origin, parse_folds, read, require_folders
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.pipelines.replay import FIGURES, PUBLISHED, Replay, subset, summary
@@ -152,12 +152,9 @@ def _result(command: str, task: Replay, results: Sequence[Mapping[str, Any]]) ->
 
 
 def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any]]) -> None:
-    if not plots.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
-        return
     names = list(dict.fromkeys(recordings.materials))
     confusions = [(truth, said, count) for (truth, said), count in _confusions(results).items()]
     tested = [sum(result["tested_of"].get(name, 0) for result in results) for name in names]
     counts = plots.confusion_counts(names, tested, confusions)
-    plots.draw(plot, names, counts, title=recordings.name, curves=[result["curve"] for result in results])
-    say(f"plot: {plot}")
+    curves = [result["curve"] for result in results]
+    draw_into(plot, lambda file: plots.draw(file, names, counts, title=recordings.name, curves=curves))

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from scroll_tactile import plots
-from scroll_tactile.cli.results import require_folders
+from scroll_tactile.cli.results import draw_into, require_folders
 from scroll_tactile.cli.robustness import IN_THE_PAPER, study_command
 from scroll_tactile.cli.studies import (
     QUICK_EPOCHS,
@@ -144,11 +143,7 @@ def efficiency(
         title = f"{recordings.name}: one pass, after so many touches of each material"
         _show_curves(title, [one for one in mine if one["by"] == "streams"])
     close(study, results, json, {"curves": found}, sets, folds)
-    if plot is not None and not plots.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
-    elif plot is not None:
-        draw_efficiency(plot, found)
-        say(f"plot: {plot}")
+    draw_into(plot, lambda file: draw_efficiency(file, found))
 
 
 @reproduce.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.metadata import version
@@ -10,11 +11,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+from scroll_tactile import plots
+from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
 
-__all__ = ["Dataset", "origin", "parse_folds", "read", "require_folders"]
+__all__ = ["Dataset", "draw_into", "leave_out", "named", "origin", "parse_folds", "read", "require_folders"]
 
 
 _OPTIONAL = {"scikit-learn": "sklearn", "snntorch": "snntorch"}  # what made some results; distribution → module
@@ -42,6 +45,33 @@ def parse_folds(folds: str, recordings: Recordings) -> list[int]:
         return list(dict.fromkeys(int(part) for part in folds.split(",")))
     except ValueError:
         raise InputError(f"expected --folds all, or numbers such as 0 or 0,1; came {folds!r}") from None
+
+
+def named(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
+    """The names that an option asks for, with commas between; each once. Raises InputError for unknown ones."""
+    names = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
+    if strange := [name for name in names if name not in known]:
+        raise InputError(f"expected {option} out of {', '.join(known)}; came {', '.join(map(repr, strange))}")
+    return names
+
+
+def leave_out(keys: Sequence[str], needing: Collection[str], option: str) -> tuple[str, ...]:
+    """The keys without those that need an option which was not given; a word on these."""
+    if out := [key for key in keys if key in needing]:
+        say(f"[yellow]Left out without {option}:[/] {', '.join(out)}")
+    return tuple(key for key in keys if key not in out)
+
+
+def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:
+    """Draw a picture into the file that was asked for, and say so; whether it could be: not without matplotlib."""
+    if plot is None:
+        return True
+    if not plots.available():
+        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+        return False
+    draw(plot)
+    say(f"plot: {plot}")
+    return True
 
 
 def require_folders(*files: Path | None) -> None:

@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from scroll_tactile.cli.results import origin, parse_folds
+from scroll_tactile.cli.results import leave_out, named, origin, parse_folds
 from scroll_tactile.cli.terminal import say, write_json
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.errors import DatasetError
 from scroll_tactile.pipelines.cells import Cell, Figures
 from scroll_tactile.pipelines.studies import Study
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
@@ -87,16 +87,8 @@ Plot = Annotated[Path | None, typer.Option(help="Draw the curves into this file.
 def choose_systems(asked: str | None, usual: Sequence[str], weights: str | None) -> tuple[str, ...]:
     """The systems of --systems; without it all that can be made, and a word on the others."""
     if asked is not None:
-        keys = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
-        if strange := [key for key in keys if key not in SYSTEMS]:  # before anything is read
-            raise InputError(f"expected --systems out of {', '.join(SYSTEMS)}; came {', '.join(map(repr, strange))}")
-        return keys
-    if weights is not None:
-        return tuple(usual)
-    out = [key for key in usual if key in NEED_WEIGHTS]
-    if out:
-        say(f"[yellow]Left out without --weights:[/] {', '.join(out)}")
-    return tuple(key for key in usual if key not in out)
+        return named("--systems", asked, SYSTEMS)  # before anything is read
+    return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
 
 
 def read_sets(asked: str | None, usual: Sequence[str], data: Path, seed: int, quick: bool) -> list[Recordings]:
@@ -104,11 +96,10 @@ def read_sets(asked: str | None, usual: Sequence[str], data: Path, seed: int, qu
 
     Raises InputError for other names, DatasetError for a set that is not there.
     """
-    names = list(dict.fromkeys(part.strip() for part in asked.split(","))) if asked is not None else list(usual)
-    if asked is None and quick:
-        names = [name for name in names if name in QUICK_SETS]
-    if strange := [name for name in names if name not in SETS]:
-        raise InputError(f"expected --sets out of {', '.join(SETS)}; came {', '.join(map(repr, strange))}")
+    if asked is not None:
+        names = named("--sets", asked, SETS)
+    else:
+        names = tuple(name for name in usual if name in QUICK_SETS or not quick)
     try:
         return [SETS[name](data, seed) for name in names]
     except DatasetError as error:

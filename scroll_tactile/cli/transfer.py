@@ -13,8 +13,7 @@ import torch
 import typer
 from rich.table import Table
 
-from scroll_tactile import plots
-from scroll_tactile.cli.results import origin, parse_folds, require_folders
+from scroll_tactile.cli.results import draw_into, named, origin, parse_folds, require_folders
 from scroll_tactile.cli.studies import Device, Epochs, Folds, InPrecision, Json, Plot, PrecisionChoice, Run, Seed, Where
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings, fabric_slide, letter_spike, physiclear
@@ -107,11 +106,7 @@ def tasks(
         words += ["--frames", str(frames), "--epochs", str(study.epochs), "--device", study.device]
         words += ["--precision", study.precision, "--seed", str(seed)] + ["--quick"] * quick
         _write(json, words, study, results, {"frames": frames, "rows": found})
-    if plot is not None and not plots.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
-    elif plot is not None:
-        draw_transfer(plot, found)
-        say(f"plot: {plot}")
+    draw_into(plot, lambda file: draw_transfer(file, found))
 
 
 @transfer.command()
@@ -163,18 +158,11 @@ def _counts(asked: str) -> tuple[int, ...]:
 
 def _named(asked: str, read: Mapping[str, Recordings]) -> tuple[str, ...]:
     """What the data sets call themselves that are asked for by their names on the command line."""
-    names = list(dict.fromkeys(part.strip() for part in asked.split(",")))
-    if strange := [name for name in names if name not in read]:
-        raise InputError(f"expected --sources out of {', '.join(read)}; came {', '.join(map(repr, strange))}")
-    return tuple(read[name].name for name in names)
+    return tuple(read[name].name for name in named("--sources", asked, read))
 
 
 def _read(asked: str | None, data: Path, seed: int, quick: bool) -> dict[str, Recordings]:
-    names = list(dict.fromkeys(part.strip() for part in asked.split(","))) if asked is not None else [*SETS]
-    if asked is None and quick:
-        names = [*QUICK_SETS]
-    if strange := [name for name in names if name not in SETS]:
-        raise InputError(f"expected --sets out of {', '.join(SETS)}; came {', '.join(map(repr, strange))}")
+    names = named("--sets", asked, SETS) if asked is not None else tuple(QUICK_SETS if quick else SETS)
     try:
         return {name: SETS[name](data, seed) for name in names}
     except DatasetError as error:

@@ -10,6 +10,7 @@ import numpy as np
 
 from scroll_tactile.augment import Augmentation, Change
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.cells import held_back
 from scroll_tactile.pipelines.passes import Labelled
 from scroll_tactile.pipelines.robustness import Make, Progress
 from scroll_tactile.pipelines.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
@@ -45,8 +46,6 @@ system sees is as it was felt."""
 COPIES = 3
 """Of each touch, for a system that is not trained over epochs, in which it would see others every time."""
 
-HELD = 0.1  # of a material's touches go to the validation
-
 
 def baseline(
     key: str, catalogue: Catalogue, seed: int = 0, augmentation: Augmentation = STRONG
@@ -75,12 +74,12 @@ def baseline(
 
 
 def _part(lessons: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[Labelled]]:
-    """What is learned, and a tenth of each material's touches, at least one where there are three, to choose on."""
+    """What is learned, and a tenth of each material's touches to choose on (see `held_back`)."""
     random = np.random.default_rng([seed, 3])
     held: set[int] = set()
     for name in sorted({name for name, _ in lessons}):
         own = random.permutation([at for at, (one, _) in enumerate(lessons) if one == name])
-        held.update(own[: max(len(own) >= 3, round(HELD * len(own)))].tolist())
+        held.update(own[: held_back(len(own))].tolist())
     learned = [touch for at, touch in enumerate(lessons) if at not in held]
     return learned, [lessons[at] for at in sorted(held)]
 

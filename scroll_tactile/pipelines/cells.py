@@ -17,7 +17,7 @@ from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.streams import Stream
 from scroll_tactile.training import Progress
 
-__all__ = ["Cell", "Split", "data_digest", "pooled", "require_data", "run_cells", "split", "time_left"]
+__all__ = ["Cell", "Split", "data_digest", "held_back", "pooled", "require_data", "run_cells", "split", "time_left"]
 
 Figures = dict[str, Any]
 
@@ -89,7 +89,7 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
         own = random.permutation(np.unique(groups[(materials == name) & ~tested]))
         left_out.update(own[np.arange(len(own)) % every != 0].tolist())
         own = own[::every]
-        held.update(own[: max(len(own) >= 3, round(share * len(own)))].tolist())
+        held.update(own[: held_back(len(own), share)].tolist())
     pick = [at for at in np.flatnonzero(~tested) if groups[at] not in held | left_out]
     validation = [at for at in np.flatnonzero(~tested) if groups[at] in held]
     exam = np.flatnonzero(tested)
@@ -101,6 +101,11 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
         exam=[labelled[at] for at in exam],
         touch=groups[exam].tolist(),
     )
+
+
+def held_back(count: int, share: float = 0.1) -> int:
+    """How many of so many recordings of a material go to the validation: at least one where there are three."""
+    return max(int(count >= 3), round(share * count))
 
 
 def run_cells(

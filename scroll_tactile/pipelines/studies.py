@@ -18,9 +18,10 @@ from scroll_tactile.pipelines.systems.catalogue import NEED_WEIGHTS, SYSTEMS, Ca
 from scroll_tactile.pipelines.systems.descent import Course, Precision
 from scroll_tactile.pipelines.systems.protocol import System
 from scroll_tactile.pipelines.systems.trained import require_device
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.training import Progress
 
-__all__ = ["NOT_OF_FRAMES", "Study", "weights_digest"]
+__all__ = ["NOT_OF_FRAMES", "Study", "columns_averaged", "weights_digest"]
 
 NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda")
 """What is not run on a camera's frames: systems of streams, for which the paper has no figure there, and ours of two
@@ -125,10 +126,15 @@ class Study:
         return {one.sensor.name: self._catalogue(one) for one in self.sets}
 
     def _catalogue(self, recordings: Recordings) -> Catalogue:
-        columns = recordings.sensor.shape[1] if recordings.sensor.camera else recordings.sensor.readings
-        every = max(1, round(columns / QUICK_COLUMNS)) if self.quick else 1
+        every = columns_averaged(recordings.sensor) if self.quick else 1
         camera = recordings.sensor.camera
         return Catalogue(self.weights, self.course, self.device, every, self.seed, camera=camera)
+
+
+def columns_averaged(sensor: Sensor) -> int:
+    """How many columns of a sensor's images are averaged in a quick run, so that about QUICK_COLUMNS are left."""
+    columns = sensor.shape[1] if sensor.camera else sensor.readings
+    return max(1, round(columns / QUICK_COLUMNS))
 
 
 def weights_digest(weights: str) -> str:

@@ -6,7 +6,6 @@ learner.predict(stream).material         # "felt"; or known=False: never felt th
 """
 
 from scroll_tactile import errors, sensors
-from scroll_tactile.copies import Augmented
 from scroll_tactile.embeddings import (
     Embedding,
     Frames,
@@ -19,9 +18,10 @@ from scroll_tactile.embeddings import (
     check_embedding,
 )
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.prediction import Composition, Constituent, Prediction, Receipt
+from scroll_tactile.results import Composition, Constituent, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream
+from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.stream import Stream
 
 __all__ = [
     "Augmented",

@@ -13,29 +13,29 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.composing import Composer
-from scroll_tactile.copies import Augmented
-from scroll_tactile.descriptions import Description, checked, require_constituents
 from scroll_tactile.embeddings import Embedding, Frames, Kernels
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
-from scroll_tactile.exemplars import Exemplar, mean_code, rank
-from scroll_tactile.filling import Filling
-from scroll_tactile.finetune import fine_tune
-from scroll_tactile.following import Following, SolverName
-from scroll_tactile.history import Choice
-from scroll_tactile.identity import capacity_of, identity_of, kept_augmentation, kept_capacity, require_same
-from scroll_tactile.ledger import Ledger
-from scroll_tactile.memory import Memory
-from scroll_tactile.model import Judgement, Model
-from scroll_tactile.perception import Perception, Readings
-from scroll_tactile.prediction import Compacted, Composition, Constituent, Merged, Prediction, Receipt
-from scroll_tactile.requests import candidates_of, require_augmentable, require_name, require_settings
-from scroll_tactile.ridge.readouts import ReadoutName
+from scroll_tactile.finetune.fine_tune import fine_tune
+from scroll_tactile.finetune.network import TunedReader
+from scroll_tactile.memory.descriptions import Description, checked, require_constituents
+from scroll_tactile.memory.exemplars import Exemplar, mean_code, rank
+from scroll_tactile.memory.identity import capacity_of, identity_of, kept_augmentation, kept_capacity, require_same
+from scroll_tactile.memory.ledger import Ledger
+from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.tuned import TuneReport
+from scroll_tactile.prediction.composition import Composer
+from scroll_tactile.prediction.features import Perception, Readings
+from scroll_tactile.prediction.filling import Filling
+from scroll_tactile.prediction.following import Following, SolverName
+from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.readouts.readout import ReadoutName
+from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream
-from scroll_tactile.tuned import TuneReport
-from scroll_tactile.tuning import TunedReader
-from scroll_tactile.windows import Reading
+from scroll_tactile.settings import candidates_of, require_augmentable, require_name, require_settings
+from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Reading
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -55,7 +55,7 @@ class TactileLearner:
     True
 
     sensor: whose streams it reads. embedding: the frozen features; unless given `Kernels()`, and `Frames()` for a
-    camera, of whose frames those count in which the gel is pressed (see `scroll_tactile.contact`).
+    camera, of whose frames those count in which the gel is pressed (see `scroll_tactile.signals.contact`).
     readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
     false_alarms: the share of touches of known materials that may be called unknown.
     refit: the share by which the memory may grow before λ and the calibration are chosen again. 0: they are at each
@@ -331,7 +331,7 @@ class TactileLearner:
         it is beforehand that the touch is of a material never felt: 1 where that is known, 0 where it cannot be.
 
         A touch of a material that was felt is told by what it feels like and what that is made of, one of a material
-        never felt by heads over all that were (see `scroll_tactile.composing`); the two are weighed by the touch's
+        never felt by heads over all that were (see `prediction.composition`); the two are weighed by the touch's
         novelty. A touch through noise, where noisy copies were observed, is told by what it feels like alone. A
         constituent that all or none of the materials have that were felt and of which it is known is named, in
         `Constituent.unlearned`, and not guessed.

@@ -4,11 +4,20 @@ from typing import Any
 
 from typer.testing import CliRunner
 
+from examples.benchmarks.__main__ import app as benchmarks
+from examples.paper.__main__ import app as paper
 from scroll_tactile.cli import app
+
+PAPER = ("reproduce", "replay", "continual", "robustness", "schedules", "fabric", "transfer")
 
 
 def run(*words: object) -> Any:
-    return CliRunner().invoke(app, [str(word) for word in words])
+    first, *rest = [str(word) for word in words]
+    if first == "bench":
+        return CliRunner().invoke(benchmarks, rest)
+    if first in PAPER:
+        return CliRunner().invoke(paper, rest if first == "reproduce" else [first, *rest])
+    return CliRunner().invoke(app, [first, *rest])
 
 
 def refused(*words: object) -> str:

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 from commands import run
 
-from scroll_tactile.bench.tables import SECTIONS, made_from_results
+from examples.paper.tables.tables import SECTIONS, made_from_results
 from scroll_tactile.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-RESULTS = ROOT / "examples" / "results"
+RESULTS = ROOT / "examples" / "paper" / "results"
 
 
 def test_the_session_gives_what_it_shows(tmp_path, monkeypatch):

@@ -30,8 +30,8 @@ from scroll_tactile.errors import (
     StreamTooShortError,
     UnknownMaterialError,
 )
-from scroll_tactile.ridge.moments import MOST_ROWS, SecondMoment
-from scroll_tactile.streams import validate
+from scroll_tactile.signals.stream import validate
+from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
 from store import LockedError, NotAStoreError, ReadOnlyError, Store, StoreError
 
 SMALL = Kernels(seed=0, dimension=64)
@@ -549,7 +549,7 @@ def test_what_was_not_closed_is_replayed(tmp_path):
 
 
 def test_a_generation_is_written_while_observing(tmp_path, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.ledger.SNAPSHOT_EVERY", 3)
+    monkeypatch.setattr("scroll_tactile.memory.ledger.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
     learner._ledger.store.flush()
@@ -576,7 +576,8 @@ def test_closing_twice_and_an_untouched_memory(tmp_path):
 CHILD = """
 import sys
 import numpy as np
-from scroll_tactile import Kernels, Sensor, TactileLearner, ledger
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.memory import ledger
 
 ledger.SNAPSHOT_EVERY = 7
 pad = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=1.0, unit="N", duration=1.0)
@@ -645,7 +646,7 @@ def test_a_memory_of_another_sensor_or_embedding_is_refused_and_named(tmp_path):
 def test_a_memory_of_another_grid_is_refused(tmp_path, monkeypatch):
     with opened(tmp_path / "m") as learner:
         feel(learner, 1)
-    monkeypatch.setattr("scroll_tactile.identity.FOLDS", 5)
+    monkeypatch.setattr("scroll_tactile.memory.identity.FOLDS", 5)
     with pytest.raises(MismatchError, match="folds"):
         opened(tmp_path / "m")
 

@@ -16,8 +16,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError, ObservationError, StreamError, UnknownMaterialError
-from scroll_tactile.ridge.pool import Pool
-from scroll_tactile.ridge.statistics import Statistics
+from scroll_tactile.statistics.sample import Pool
+from scroll_tactile.statistics.statistics import Statistics
 
 SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
@@ -92,7 +92,7 @@ class History(RuleBasedStateMachine):
         self.felt: list[Felt] = []
         self.described: dict[str, dict] = {}
         self.last = 0
-        self.pools = mock.patch("scroll_tactile.memory.Pool", SmallPool)
+        self.pools = mock.patch("scroll_tactile.memory.state.Pool", SmallPool)
         self.pools.start()
 
     def open(self, path, readout="lda", mode="write"):

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typer.core import TyperGroup
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.prediction import Prediction
+from scroll_tactile.results import Prediction
 from store import StoreError
 
 __all__ = ["Commands", "confusion_text", "console", "percent", "progress_bar", "say", "verdict", "write_json"]

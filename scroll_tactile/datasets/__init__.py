@@ -1,5 +1,5 @@
 """Readers of published data sets in their publishers' layouts, and a minimal simulator; no data."""
 
-from scroll_tactile.datasets.recordings import Recordings
+from scroll_tactile.datasets.labelled import Recordings
 
 __all__ = ["Recordings"]

@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.datasets.recordings import Recordings
+from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream, validate
+from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["BALANCED", "CPM_FINGER", "CPM_RATIOS", "FABRICS", "Slides", "load", "protocol_of", "ratios"]
 

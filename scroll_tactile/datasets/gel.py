@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.sensors import GELSIGHT, Sensor
-from scroll_tactile.streams import Stream, validate
+from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["SMALL", "Gel"]
 

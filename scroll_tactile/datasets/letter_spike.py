@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.datasets.recordings import Recordings
+from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream, validate
+from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["DOTS", "GRID", "LETTERS", "NUSKIN", "dots_of", "letter_folds", "load", "read_events", "stream_of"]
 

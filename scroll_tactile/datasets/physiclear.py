@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.datasets.recordings import Recordings
+from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError, StreamError
 from scroll_tactile.sensors import GELSIGHT, Sensor
-from scroll_tactile.streams import Stream, validate
+from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["ATTRIBUTES", "FRAMES", "HALF_SIZE", "load", "read_attributes", "videos"]
 

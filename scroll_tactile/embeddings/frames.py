@@ -12,7 +12,6 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from scroll_tactile.contact import Rest
 from scroll_tactile.embeddings.banks import LEVELS, to_levels
 from scroll_tactile.embeddings.protocol import canary
 from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
@@ -20,6 +19,7 @@ from scroll_tactile.embeddings.surfaces import COLOURS, LIGHT, SURFACE, light, s
 from scroll_tactile.embeddings.vision import to_planes
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
+from scroll_tactile.signals.contact import Rest
 
 __all__ = ["Frames"]
 

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.contact import rest_of
 from scroll_tactile.embeddings.protocol import Embedding, embed_windows
 from scroll_tactile.errors import InputError
+from scroll_tactile.signals.contact import rest_of
 
 __all__ = ["Joined"]
 

@@ -15,7 +15,7 @@ import torch
 from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
 from scroll_tactile.embeddings.levels import triangle_features, window_statistics
 from scroll_tactile.embeddings.protocol import canary
-from scroll_tactile.windows import ENOUGH
+from scroll_tactile.signals.windows import ENOUGH
 
 __all__ = ["Kernels"]
 

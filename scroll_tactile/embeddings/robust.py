@@ -32,7 +32,7 @@ class Robust:
     inner: the embedding that reads windows, Kernels(dimension=2016) unless given. seed: of the noisy features.
 
     Broken wires: a channel that reads the low end of the range throughout is filled in from the others before anything
-    is embedded, see `scroll_tactile.filling`.
+    is embedded, see `scroll_tactile.prediction.filling`.
 
     Raises InputError for an embedding of a camera's frames.
 

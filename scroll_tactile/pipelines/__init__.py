@@ -1,1 +1,1 @@
-"""Clients of the learner: a demonstration, replays of recorded sets, and the proof that schedules do not matter."""
+"""Pipelines: thin clients of the learner."""

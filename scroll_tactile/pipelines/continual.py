@@ -1,290 +1,128 @@
-"""Continual learning as the paper measures it: `f` and `f*` after every material, for every size of the buffer.
+"""How accuracy went during a pass, material by material, and what was forgotten by its end.
 
-Beside them, under the same folds and the same order, the ridge floor and the peers on the same features.
+>>> forgetting([{"felt": 1.0}, {"felt": 0.75, "silk": 1.0}, {"felt": 0.5, "silk": 1.0, "wool": 1.0}])
+0.25
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
-from hashlib import sha256
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-import numpy as np
-
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding
+from examples.paper.studies.schedules import ScheduleName
 from scroll_tactile.errors import InputError
-from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.cached import Cached
-from scroll_tactile.pipelines.passes import Labelled, hold_out
-from scroll_tactile.pipelines.peers import NearestMean, Peer, RanPAC, StreamingLDA, touch_features
-from scroll_tactile.pipelines.peers_replay import GDumb, Replaying
-from scroll_tactile.pipelines.replay import Progress
-from scroll_tactile.pipelines.runfile import RunFile
-from scroll_tactile.pipelines.schedules import ScheduleName, arrange
-from scroll_tactile.pipelines.traces import Points, accuracy_of, curve, forgetting_of, part_ends, tally
-from scroll_tactile.ridge.readouts import ReadoutName
+from scroll_tactile.pipelines.metrics import mean_and_spread
 
-__all__ = ["SIZES", "Continual", "Size"]
+__all__ = ["Point", "Points", "accuracy_of", "curve", "forgetting", "forgetting_of", "part_ends", "summary", "tally"]
 
-Size = int | Literal["all"]
-"""Of the buffer: exemplars in all, or every touch learned."""
+Point = dict[str, list[int]]
+"""At one moment: material → [right answers, answers]."""
 
-SIZES: tuple[Size, ...] = (0, 20, 50, 100, 200, 400, "all")
-
-_REPORTED = ("kept", "reason", "mode", "exemplars", "epochs", "held_out", "seconds")
+Points = dict[str, Point]
+"""Touches learned so far (a string: JSON has no other keys) → what was answered then."""
 
 
-@dataclass(frozen=True)
-class Continual:
-    """What to learn, and what to measure.
+def forgetting(shares: Sequence[Mapping[str, float]]) -> float | None:
+    """Mean over materials of the best earlier accuracy less the final one (Chaudhry et al. 2018, arXiv 1801.10112).
 
-    recordings: the streams. embedding: frozen, of `f`, `f*` and the peers; each touch is embedded once.
-    schedule, seed: see `arrange`; the seed draws the order, and what fine-tuning and the peers draw.
-    sizes: of the buffer. epochs: of a fine-tune; the learner's own choice where it is None. device: of fine-tunes.
-    curve: measure after every so many parts of the pass, as many as materials (see `part_ends`); 0: at its end only,
-    and no forgetting. tuned_curve: measure `f*` there too, each time from a fine-tune of its own.
-    peers: whether to run them. folder: where finished parts are noted, so that an interrupted run goes on; or None.
+    F = mean_j (max_{l < k} a_{l,j} − a_{k,j}), over all materials j that were asked about before the last moment k:
+    class by class all but the last. Below 0 where what was learned later helped.
 
-    Raises InputError for sizes that cannot be, such as fewer exemplars than materials, or a negative curve.
+    shares: material → accuracy on it, from 0 to 1, at successive moments. None where no material was asked about
+    earlier. Raises InputError where a material is no longer asked about at the last moment, or there is no moment.
     """
+    if not shares:
+        raise InputError("expected accuracies at one moment at least; came none")
+    *earlier, final = shares
+    best: dict[str, float] = {}
+    for moment in earlier:
+        for material, share in moment.items():
+            best[material] = max(best.get(material, share), share)
+    if best.keys() - final.keys():
+        raise InputError(f"expected final accuracies of all materials; missing: {sorted(best.keys() - final.keys())}")
+    if not best:
+        return None
+    return sum(share - final[material] for material, share in best.items()) / len(best)
 
-    recordings: Recordings
-    embedding: Embedding
-    schedule: ScheduleName = "class-by-class"
-    seed: int = 0
-    sizes: tuple[Size, ...] = SIZES
-    curve: int = 1
-    tuned_curve: bool = False
-    epochs: int | None = None
-    peers: bool = True
-    device: str = "cpu"
-    folder: Path | None = None
 
-    def __post_init__(self) -> None:
-        kinds = len(set(self.recordings.materials))
-        if self.curve < 0:
-            raise InputError(
-                f"expected a curve measured after every 1 or more parts of the pass, or 0; came {self.curve}"
-            )
-        if not self.sizes:
-            raise InputError("expected at least one size of the buffer; came none")
-        for size in self.sizes:
-            if size != "all" and (size < 0 or 0 < size < kinds):
-                raise InputError(
-                    f"expected a buffer of 0, or of an exemplar of each of the {kinds} materials at least; came {size}"
-                )
+def tally(truth: Sequence[str], said: Sequence[str | None]) -> Point:
+    """Count right answers by material. Raises InputError where there are not as many answers as truths."""
+    if len(truth) != len(said):
+        raise InputError(f"expected as many answers as truths; came {len(said)} and {len(truth)}")
+    point: Point = {}
+    for name, answer in zip(truth, said, strict=True):
+        counts = point.setdefault(name, [0, 0])
+        counts[0] += answer == name
+        counts[1] += 1
+    return point
 
-    @property
-    def plan(self) -> dict[str, Any]:
-        """All that each figure depends on, in JSON's types; sizes, folds and peers can be added to a run later."""
-        options = ("schedule", "seed", "curve", "tuned_curve", "epochs", "device")
-        made = {name: getattr(self.embedding, name) for name in ("name", "dimension", "fingerprint")}
-        size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        return {"run": "continual", "dataset": self.recordings.name, **size, "embedding": made} | {
-            name: getattr(self, name) for name in options
+
+def accuracy_of(point: Point) -> float:
+    """The share of right answers at one moment."""
+    return sum(right for right, _ in point.values()) / sum(asked for _, asked in point.values())
+
+
+def curve(points: Points) -> list[list[float]]:
+    """[materials met, accuracy over them] at each moment, in the order of learning."""
+    return [[len(points[key]), accuracy_of(points[key])] for key in sorted(points, key=int)]
+
+
+def forgetting_of(points: Points) -> float | None:
+    """`forgetting` of counts."""
+    ordered = [points[key] for key in sorted(points, key=int)]
+    return forgetting([{name: right / asked for name, (right, asked) in point.items()} for point in ordered])
+
+
+def part_ends(schedule: ScheduleName, materials: Sequence[str]) -> list[int]:
+    """After how many touches each part of a pass ends; a pass has as many parts as materials.
+
+    materials: of each touch, in the order in which they are learned. Where they come one by one a part is a
+    material; else the parts are equally long: of twenty materials, twentieths.
+    """
+    total, kinds = len(materials), len(set(materials))
+    if schedule in ("class-by-class", "reversed"):
+        return [at for at in range(1, total + 1) if at == total or materials[at] != materials[at - 1]]
+    return [round(total * part / kinds) for part in range(1, kinds + 1)]
+
+
+def summary(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row for each method and size of the buffer: means and standard deviations over the folds.
+
+    folds: what `Continual.run` yields. A row has the method, its size (None: it has no buffer), accuracy and forgetting
+    as {"mean", "sd"} (None: not measured), and the mean curve. Rows of `f*` also tell how many folds kept theirs, and
+    the mean seconds of a fine-tune, exemplars, and bytes of one.
+    """
+    if not folds:
+        return []
+    rows = [_row("f", None, [fold["f"] for fold in folds])]
+    for size in folds[0]["tuned"]:
+        parts = [fold["tuned"][size] for fold in folds]
+        measured = {
+            name: _spread([part.get(name) for part in parts]) for name in ("seconds", "exemplars", "bytes_per_exemplar")
         }
-
-    def run(self, folds: Sequence[int], progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
-        """The figures of each fold in turn, as they are finished; those finished before are read back.
-
-        Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
-        """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
-        notes = RunFile(None if self.folder is None else self.folder / "continual.json", self.plan)
-        embedding = Cached(self.embedding)
-        for fold in folds:
-            yield _Fold(self, embedding, fold, notes, progress).run()
+        rows.append(_row("f*", size, parts) | measured | {"kept": sum(part["kept"] for part in parts)})
+    floor = [{"accuracy": fold["ridge"], "forgetting": None, "curve": []} for fold in folds]
+    rows.append(_row("ridge", None, floor))
+    for peer in zip(*(fold["peers"] for fold in folds), strict=True):
+        rows.append(_row(peer[0]["peer"], peer[0]["size"], peer))
+    return rows
 
 
-class _Fold:
-    """One fold: what is learned, what is tested, and the parts whose figures are noted one by one."""
-
-    def __init__(self, task: Continual, embedding: Embedding, number: int, notes: RunFile, progress: Progress) -> None:
-        self.task = task
-        self.embedding = embedding
-        self.number = number
-        self.notes = notes
-        self.progress = progress
-        recordings = task.recordings
-        taught, self.exam = hold_out(recordings, recordings.fold == number)
-        self.lessons = [taught[at] for at in arrange(task.schedule, [name for name, _ in taught], task.seed)]
-        self.total = len(self.lessons)
-        self.ends = part_ends(task.schedule, [name for name, _ in self.lessons])
-        every = task.curve
-        self.stops = sorted({self.total, *(self.ends[every - 1 :: every] if every else ())})
-
-    def run(self) -> dict[str, Any]:
-        f = self._part("f", self._closed_form)
-        offline = self._part("offline", self._offline)
-        tuned = {str(size): self._part(f"f* {size}", partial(self._tuned, size, f)) for size in self.task.sizes}
-        peers = [
-            self._part(f"{name} {size or ''}".strip(), partial(self._peer, name, size, make))
-            for name, size, make in (self._peers() if self.task.peers else ())
-        ]
-        return {
-            "fold": self.number,
-            "learned": self.total,
-            "tested": len(self.exam),
-            "digest": f["digest"],
-            "equals_offline": all(part["digest"] == f["digest"] for part in (offline, *tuned.values())),
-            "f": f,
-            "ridge": offline["ridge"],
-            "tuned": tuned,
-            "peers": peers,
-        }
-
-    def _part(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """The figures of a part: read back where it was finished, else made and noted."""
-        key = f"fold {self.number}, {name}"
-        if key not in self.notes.notes:
-            begun = time.perf_counter()
-            figures = make()
-            self.notes.notes.pop(f"{key}, so far", None)
-            self.notes.note(key, figures | {"part_seconds": time.perf_counter() - begun})
-        figures = self.notes.notes[key]
-        assert isinstance(figures, dict)
-        return figures
-
-    def _learner(self, exemplars: int, readout: ReadoutName = "lda") -> TactileLearner:
-        sensor = self.task.recordings.sensor
-        return TactileLearner(sensor=sensor, embedding=self.embedding, readout=readout, exemplars=exemplars)
-
-    def _closed_form(self) -> dict[str, Any]:
-        learner = self._learner(0)
-        points = self._learn(learner, "f", self.stops, lambda exam: _said(learner, exam))
-        return {"digest": learner.digest(), **_figures(points)}
-
-    def _offline(self) -> dict[str, Any]:
-        """The same touches in another order, all at random, as offline training has them; and the ridge floor."""
-        learner = self._learner(0, "ridge")
-        self._teach_offline(learner, "offline")
-        point = tally([name for name, _ in self.exam], _said(learner, self.exam))
-        return {"digest": learner.digest(), "ridge": accuracy_of(point)}
-
-    def _tuned(self, size: Size, f: dict[str, Any]) -> dict[str, Any]:
-        if size == 0:
-            same = {name: f[name] for name in ("digest", "accuracy", "forgetting", "curve")}
-            return {"exemplars": 0, "kept": False, "reason": "no exemplars: f answers", **same}
-        name, capacity = f"f* {size}", self._capacity(size)
-        learner = self._learner(capacity)
-
-        def tune() -> Any:
-            what = f"{name}: fine-tuning"
-            return learner.fine_tune(
-                epochs=self.task.epochs,
-                seed=self.task.seed,
-                device=self.task.device,
-                progress=lambda step, done, of: self.progress(f"{what} ({step})", done, of),
-            )
-
-        def answer(exam: Sequence[Labelled]) -> list[str | None]:
-            if len(learner.materials) > 1:  # with one there is nothing to be told apart
-                tune()
-            return _said(learner, exam, tuned=True)
-
-        points = self._learn(learner, name, self.stops[:-1] if self.task.tuned_curve else [], answer)
-        report = tune()
-        exam = tally([material for material, _ in self.exam], _said(learner, self.exam, tuned=True))
-        other = self._learner(capacity)
-        self._teach_offline(other, f"{name}: another order")
-        return {
-            "digest": learner.digest(),
-            "tuned_digest": learner.tuned_digest(),
-            "buffer_digest": _buffer_digest(learner),
-            "buffer_of_another_order": _buffer_digest(other) == _buffer_digest(learner),
-            "bytes_per_exemplar": self._bytes(learner),
-            **{name: getattr(report, name) for name in _REPORTED},
-            **_figures(points | {str(self.total): exam}),
-        }
-
-    def _bytes(self, learner: TactileLearner) -> float:
-        """Bytes of an exemplar's readings, as they are felt: float32 of shape (T, n)."""
-        sizes = {stream.key: stream.readings.nbytes for _, stream in self.lessons}
-        kept = [sizes[key] for keys in learner.exemplars.values() for key in keys]
-        return sum(kept) / max(1, len(kept))
-
-    def _learn(
-        self,
-        learner: TactileLearner,
-        name: str,
-        stops: Sequence[int],
-        answer: Callable[[Sequence[Labelled]], list[str | None]],
-    ) -> Points:
-        """Teach all lessons, and measure after so many of them; what an interrupted run measured is read back."""
-        key = f"fold {self.number}, {name}, so far"
-        points: Points = dict(self.notes.notes.get(key, {}))
-        for done, (material, stream) in enumerate(self.lessons, start=1):
-            learner.observe(material, stream)
-            self.progress(f"{name}: learning", done, self.total)
-            if done in stops and str(done) not in points:
-                asked = [touch for touch in self.exam if touch[0] in learner.materials]
-                points[str(done)] = tally([truth for truth, _ in asked], answer(asked))
-                self.notes.note(key, points)
-        return points
-
-    def _teach_offline(self, learner: TactileLearner, name: str) -> None:
-        order = np.random.default_rng([self.task.seed, 1]).permutation(self.total)
-        for done, at in enumerate(order, start=1):
-            learner.observe(*self.lessons[at])
-            self.progress(f"{name}: learning", done, self.total)
-
-    @cached_property
-    def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Features of the lessons and of the exam."""
-        self.progress("peers: embedding", 0, 1)
-        taught = touch_features(self.embedding, [stream for _, stream in self.lessons])
-        return taught, touch_features(self.embedding, [stream for _, stream in self.exam])
-
-    def _peers(self) -> Iterator[tuple[str, Size | None, Callable[[], Peer]]]:
-        seed = self.task.seed
-        yield "nearest mean", None, NearestMean
-        yield "streaming LDA", None, StreamingLDA
-        yield "RanPAC", None, partial(RanPAC, seed)
-        yield "naive fine-tuning", None, partial(Replaying, 0, seed)
-        for size in self.task.sizes:
-            if size:
-                yield "GDumb", size, partial(GDumb, self._capacity(size), seed)
-                yield "experience replay", size, partial(Replaying, self._capacity(size), seed)
-
-    def _capacity(self, size: Size) -> int:
-        return self.total if size == "all" else size
-
-    def _peer(self, name: str, size: Size | None, make: Callable[[], Peer]) -> dict[str, Any]:
-        peer = make()
-        taught, tested = self._vectors
-        truth = [material for material, _ in self.exam]
-        points: Points = {}
-        for done, ((material, _), features) in enumerate(zip(self.lessons, taught, strict=True), start=1):
-            peer.observe(features, material)
-            if done in self.ends:
-                peer.boundary()
-                self.progress(name, done, self.total)
-            if done in self.stops:
-                met = [at for at, material in enumerate(truth) if material in peer.materials]
-                points[str(done)] = tally([truth[at] for at in met], peer.predict(tested[met]))
-        return {"peer": name, "size": None if size is None else str(size), **_figures(points)}
+def _row(method: str, size: str | None, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    moments = zip(*(part["curve"] for part in parts), strict=True)
+    return {
+        "method": method,
+        "size": size,
+        "accuracy": _spread([part["accuracy"] for part in parts]),
+        "forgetting": _spread([part["forgetting"] for part in parts]),
+        # Folds of a set that is not balanced may have met other numbers of materials by then: the mean of these too.
+        "curve": [[sum(column) / len(parts) for column in zip(*moment, strict=True)] for moment in moments],
+    }
 
 
-def _said(learner: TactileLearner, touches: Sequence[Labelled], *, tuned: bool = False) -> list[str | None]:
-    return [learner.predict(stream, tuned=tuned).material for _, stream in touches]
-
-
-def _figures(points: Points) -> dict[str, Any]:
-    last = max(points, key=int)
-    return {"accuracy": accuracy_of(points[last]), "forgetting": forgetting_of(points), "curve": curve(points)}
-
-
-def _buffer_digest(learner: TactileLearner) -> str:
-    """Hex, equal for two buffers if and only if they hold the same exemplars in the same ranks."""
-    digest = sha256()
-    for material, keys in sorted(learner.exemplars.items()):
-        digest.update(f"{material}\0{len(keys)}\0".encode())
-        digest.update(b"".join(keys))
-    return digest.hexdigest()
+def _spread(values: Sequence[float | None]) -> dict[str, float] | None:
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return None
+    mean, spread = mean_and_spread(known)
+    return {"mean": mean, "sd": spread}

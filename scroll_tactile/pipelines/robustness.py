@@ -1,242 +1,123 @@
-"""Robustness: systems that learned from clean touches, asked about touches that were made or felt otherwise.
+"""Touches as they would have been felt otherwise: shorter, faster, through noise, broken wires or a drifting sensor.
 
-A study is a grid of strengths, systems, with and without augmentation, and folds. A system learns a fold once, for
-all of its studies; only "sitting" (folds of successive repetitions: tomorrow's touches) has lessons of its own. Each
-cell is written down when it is finished, and an interrupted run goes on with the next.
+Each perturbation makes a stream of a stream. What is drawn is drawn from a seed and the stream's content hash, so
+that it does not depend on which other streams are tested, or in what order. With no strength a stream is returned as
+it is. Test streams only are perturbed: what a system learns from is its own affair.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import count
-from pathlib import Path
-from typing import Any, Protocol
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from scroll_tactile.copies import Augmented
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Robust
 from scroll_tactile.errors import InputError
-from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.cells import require_data
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
-from scroll_tactile.pipelines.passes import Labelled, hold_out, observe_all
-from scroll_tactile.pipelines.perturbations import STUDIES
-from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.streams import Stream
+from scroll_tactile.signals.augmentation import Image, changed, resize
+from scroll_tactile.signals.copies import hiss, silence, wander
+from scroll_tactile.signals.stream import Stream, fewest_readings
 
-__all__ = ["NAMES", "PAPER", "SITTING", "Learned", "Make", "Robustness", "System", "ours", "summary", "worst"]
+__all__ = ["STUDIES", "Study", "dead", "drift", "length", "noise", "speed"]
 
-SITTING = "sitting"
-NAMES = (*STUDIES, SITTING)
-"""The names of the studies."""
-
-PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
-"""(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
-with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
-
-AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
-"""The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
-
-Progress = Callable[[str, int, int], object]
+_KINDS = {"noise": 0, "dead": 1, "drift": 2}
 
 
-class System(Protocol):
-    """Whatever names the materials of touches."""
+def length(stream: Stream, seconds: float, seed: int = 0) -> Stream:
+    """The touch broken off after so many seconds, or whole where it is shorter; nothing is drawn.
 
-    def predict(self, streams: Sequence[Stream]) -> Sequence[str | None]:
-        """The material of each of N streams."""
-        ...
-
-
-Make = Callable[[Sequence[Labelled], bool, Progress], System]
-"""Makes a system that has learned these touches, with its augmentation (True) or without; told how far it is."""
-
-
-class Learned:
-    """A learner as a system: the material of the most probable answer, known or not."""
-
-    def __init__(self, learner: TactileLearner) -> None:
-        self.learner = learner
-
-    def predict(self, streams: Sequence[Stream]) -> list[str | None]:
-        """The material of each of N streams."""
-        return [self.learner.predict(stream).material for stream in streams]
-
-
-def ours(
-    sensor: Sensor, augmentation: Augmented = AUGMENTED, embedding: Embedding | None = None
-) -> tuple[Make, dict[str, Any]]:
-    """The one-pass learner of a sensor, and what it depends on; one setting for every sensor and every study.
-
-    Without augmentation it is the default learner. With it the embedding is `Robust()`, unless given.
+    Raises StreamTooShortError for less than 0.1 s.
     """
-    robust = Robust() if embedding is None else embedding
+    return stream.first(seconds)
 
-    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
-        if augmented:
-            learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
-        else:
-            learner = TactileLearner(sensor=sensor, exemplars=0)
-        done = count()
-        observe_all(learner, lessons, lambda: progress("learning", next(done) + 1, len(lessons)))
-        return Learned(learner)
 
-    return make, {"embedding": repr(robust), "augmentation": augmentation.to_json()}
+def speed(stream: Stream, factor: float, seed: int = 0) -> Stream:
+    """The finger moved `factor` times as fast: the readings resampled along time, T / factor of them.
+
+    The sensor's rate stays, so a slow slide is a longer stream. Linear interpolation, without a filter before it: a
+    sensor has none either. What a slide's speed changes beside its time scale (force, friction) is not modelled, and
+    nothing is drawn. A stream is made no shorter than 0.1 s.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise InputError(f"expected a finite speed above 0; came {factor}")
+    if factor == 1:
+        return stream
+    least = fewest_readings(stream.sensor) / len(stream)
+    return changed(stream, lambda image: resize(image, max(1 / factor, min(1.0, least))))
+
+
+def noise(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
+    """A noisy converter or a bad cable: every value has noise of its own added, uniform in ± amplitude · range.
+
+    amplitude: a share of the sensor's range [low, high], so that 0.5 is a standard deviation of 0.29 of the range. What
+    leaves the range is clipped to it, as a converter does.
+    """
+    return _drawn(stream, "noise", amplitude, seed, lambda image, rng: hiss(image, amplitude, rng))
+
+
+def dead(stream: Stream, share: float, seed: int = 0) -> Stream:
+    """Broken wires: a share of the channels, rounded, reads the low end of the sensor's range from beginning to end.
+
+    Which channels is drawn anew for each touch. Raises InputError for a share above 1.
+    """
+    if share > 1:
+        raise InputError(f"expected a share of channels from 0 to 1; came {share}")
+    return _drawn(stream, "dead", share, seed, lambda image, rng: silence(image, share, rng))
+
+
+def drift(stream: Stream, strength: float, seed: int = 0) -> Stream:
+    """A sensor that warms up: each channel's zero and gain change along a straight line until the touch ends.
+
+    strength: the zero by at most this share of the range, and the gain by at most this share of itself, at the end;
+    drawn evenly between ± these for each channel. Clipped to the range.
+    """
+    return _drawn(stream, "drift", strength, seed, lambda image, rng: wander(image, strength, strength, rng))
 
 
 @dataclass(frozen=True)
-class Robustness:
-    """What to study.
+class Study:
+    """A way in which test touches are perturbed, and how strongly.
 
-    recordings: the touches. systems: by name, what makes and teaches each. settings: by name, all that a system's
-    answers depend on beside its name, in JSON's types, so that what other settings gave is not gone on with.
-    studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
-    quick: fewer strengths. folder: where finished cells are kept, or None.
-
-    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "sitting" where the
-    order of recording is not known.
+    perturb: the perturbation. strengths: those of a full study. quick: those of a quick one. unit: what they are.
     """
 
-    recordings: Recordings
-    systems: Mapping[str, Make]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    studies: Sequence[str] = NAMES
-    augmented: Sequence[bool] = (False, True)
-    seed: int = 0
-    quick: bool = False
-    folder: Path | None = None
+    name: str
+    perturb: Callable[[Stream, float, int], Stream]
+    strengths: tuple[float, ...]
+    quick: tuple[float, ...]
+    unit: str
 
-    def __post_init__(self) -> None:
-        strange = [name for name in self.studies if name not in NAMES]
-        if strange or not self.studies:
-            raise InputError(f"expected studies out of {', '.join(NAMES)}; came {strange or 'none'}")
-        if self.seed < 0:
-            raise InputError(f"expected a seed of 0 or more; came {self.seed}")
-        if SITTING in self.studies:
-            self.recordings.blocked()
-        if self.recordings.sensor.camera:
-            raise InputError(
-                f"expected touches of channels, which are cut, resampled and made noisy along time; "
-                f"{self.recordings.name} is of camera {self.recordings.sensor.name!r}"
-            )
-
-    @property
-    def plan(self) -> dict[str, Any]:
-        """What all figures depend on, in JSON's types; studies, folds and systems can be added to a run later."""
-        size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        return {"run": "robustness", "dataset": self.recordings.name, **size, "seed": self.seed}
-
-    def run(
-        self, folds: Sequence[int], progress: Progress = lambda what, done, of: None
-    ) -> Iterator[list[dict[str, Any]]]:
-        """The records of each fold in turn, as they are finished; cells finished before are read back.
-
-        A record holds study, strength, system, augmented, fold, accuracy (a share) and tested (touches).
-
-        Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
-        under other settings.
-        """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
-        notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
-        require_data(notes, self.recordings)
-        for name in self.systems:
-            self._require_settings(notes, name)
-        for fold in folds:
-            cells = self.cells(fold)
-            yield [
-                record
-                for system in self.systems
-                for augmented in self.augmented
-                for record in self._taught(system, augmented, cells, notes, progress)
-            ]
-
-    def cells(self, fold: int) -> list[tuple[str, float, int]]:
-        """(study, strength, fold) of all that is asked of a system in a fold."""
-        sensor = self.recordings.sensor
-        return [
-            (study, strength, fold)
-            for study in self.studies
-            for strength in ((0.0,) if study == SITTING else STUDIES[study].of(sensor, quick=self.quick))
-        ]
-
-    def _require_settings(self, notes: RunFile, name: str) -> None:
-        given = json.loads(json.dumps(self.settings.get(name)))
-        kept = notes.notes.setdefault(f"settings of {name}", given)
-        if kept != given:
-            raise InputError(
-                f"the run in {notes.path} was begun with other settings of {name}: {kept} there, {given} here. Ask for "
-                "the same, or take another folder"
-            )
-
-    def _taught(
-        self,
-        name: str,
-        augmented: bool,
-        cells: Sequence[tuple[str, float, int]],
-        notes: RunFile,
-        progress: Progress,
-    ) -> Iterator[dict[str, Any]]:
-        systems: dict[bool, System] = {}  # by whether it has learned for "sitting"
-        what = f"{name}{', augmented' if augmented else ''}"
-        for done, (study, strength, fold) in enumerate(cells):
-            where = f"fold {fold}: {what}: {study} {strength:g}"
-            progress(where, done, len(cells))
-            key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
-            if key not in notes.notes:
-                sitting = study == SITTING
-                lessons, exam = self._split(fold, sitting)
-                if sitting not in systems:
-
-                    def told(step: str, at: int, of: int, where: str = where) -> None:
-                        progress(f"{where}: {step}", at, of)
-
-                    systems[sitting] = self.systems[name](lessons, augmented, told)
-                asked = exam if sitting else self._perturbed(exam, study, strength)
-                said = systems[sitting].predict([stream for _, stream in asked])
-                share = accuracy([material for material, _ in asked], list(said))
-                notes.note(key, {"accuracy": share, "tested": len(asked)})
-            about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
-            yield about | notes.notes[key]
-
-    def _perturbed(self, exam: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
-        perturb = STUDIES[study].perturb
-        return [(material, perturb(stream, strength, self.seed)) for material, stream in exam]
-
-    def _split(self, fold: int, sitting: bool) -> tuple[list[Labelled], list[Labelled]]:
-        places: npt.NDArray[np.int64] = self.recordings.blocked() if sitting else self.recordings.fold
-        return hold_out(self.recordings, places == fold)
+    def of(self, sensor: Sensor, *, quick: bool = False) -> tuple[float, ...]:
+        """The strengths for a sensor: of lengths those below the usual one, and then it."""
+        chosen = self.quick if quick else self.strengths
+        if self.name != "length":
+            return chosen
+        return (*(one for one in chosen if one < sensor.duration), sensor.duration)
 
 
-def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Mean and standard deviation over folds of each (study, strength, system, augmented), in the records' order."""
-    groups: dict[tuple[Any, ...], list[float]] = {}
-    for record in records:
-        cell = tuple(record[name] for name in ("study", "strength", "system", "augmented"))
-        groups.setdefault(cell, []).append(record["accuracy"])
-    rows = []
-    for (study, strength, system, augmented), values in groups.items():
-        mean, spread = mean_and_spread(values)
-        about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
-        rows.append(about | {"mean": mean, "sd": spread, "folds": len(values)})
-    return rows
+STUDIES = {
+    study.name: study
+    for study in (
+        Study("length", length, (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0), (0.3,), "seconds"),
+        Study("speed", speed, (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0), (0.5, 1.0, 2.0), "× the usual speed"),
+        Study("noise", noise, (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0), (0.0, 0.5), "share of the range"),
+        Study("dead", dead, (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5), (0.0, 0.2), "share of the channels"),
+        Study("drift", drift, (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, 0.05), "share of the range, and of the gain"),
+    )
+}
+"""The studies on folds as published; `robustness` adds "sitting", which perturbs nothing."""
 
 
-def worst(
-    rows: Sequence[Mapping[str, Any]], study: str, system: str, augmented: bool, least: float, most: float
-) -> Any:
-    """The lowest mean of `summary`'s rows among strengths from least to most; None where none was measured."""
-    among = [
-        row["mean"]
-        for row in rows
-        if (row["study"], row["system"], row["augmented"]) == (study, system, augmented)
-        and least <= row["strength"] <= most
-    ]
-    return min(among, default=None)
+def _drawn(
+    stream: Stream, kind: str, strength: float, seed: int, change: Callable[[Image, np.random.Generator], Image]
+) -> Stream:
+    if not (math.isfinite(strength) and strength >= 0):
+        raise InputError(f"expected a finite strength of {kind}, 0 or more; came {strength}")
+    if seed < 0:
+        raise InputError(f"expected a seed of 0 or more; came {seed}")
+    if strength == 0:
+        return stream
+    # With 2 in front, where copies that are learned from have 1: never the same draw.
+    rng = np.random.default_rng([2, seed, _KINDS[kind], int.from_bytes(stream.key, "little")])
+    return changed(stream, lambda image: change(image, rng))

@@ -23,7 +23,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.ledger
+import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
 from faults.model import Operation, State, after, expected, opened, perform, seen, warm
@@ -89,7 +89,7 @@ class Bench:
         self.others = prepare(home)
         self.failures: list[str] = []
         self.outcomes: dict[str, Counter[str]] = {}
-        scroll_tactile.ledger.SNAPSHOT_EVERY = NEVER
+        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
         self.ground, _ = after(State(), GROUND, self.others)
         with opened(home / "ground") as learner:
             perform(learner, GROUND, home)

@@ -29,7 +29,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.ledger
+import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
 from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, warm
@@ -143,7 +143,7 @@ class Attempt:
             return
         copied(step.start, path)
         path.parent.mkdir(exist_ok=True)
-        scroll_tactile.ledger.SNAPSHOT_EVERY = NEVER
+        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
         if step.operation[0] != "open":
             self.learner = opened(path)
         if step.operation[0] == "close":
@@ -152,7 +152,7 @@ class Attempt:
 
     def do(self) -> Any:
         """Do the step, and wait for what goes on behind it."""
-        scroll_tactile.ledger.SNAPSHOT_EVERY = self.step.every
+        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = self.step.every
         try:
             if self.step.operation[0] == "open":
                 self.learner = opened(self.path)
@@ -163,7 +163,7 @@ class Attempt:
             self.learner._ledger.store._background.wait()
             return result
         finally:
-            scroll_tactile.ledger.SNAPSHOT_EVERY = NEVER
+            scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
 
 
 def crash(channel: Connection, step: Step, path: Path, home: Path, how: str, number: int) -> None:

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.images import tactile_image
-from scroll_tactile.prediction import Receipt
-from scroll_tactile.ridge.codes import to_codes
-from scroll_tactile.streams import Stream
+from scroll_tactile.results import Receipt
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.statistics.grid import to_codes
 
 BIOTAC: dict[str, Any] = {"sensor": sensors.BIOTAC, "embedding": Kernels()}
 TINY_PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.3)

@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-import scroll_tactile.memory
+import scroll_tactile.memory.state
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError
-from scroll_tactile.ridge.pool import Pool
+from scroll_tactile.statistics.sample import Pool
 
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 MATERIALS = ("a", "b", "c", "ü")
@@ -43,7 +43,7 @@ class SmallPool(Pool):
 def warm() -> None:
     """Have everything imported and set, so that a process forked from here begins at once, with no thread running."""
     torch.set_num_threads(1)
-    scroll_tactile.memory.Pool = SmallPool  # type: ignore[misc]  # for good: this process does nothing else
+    scroll_tactile.memory.state.Pool = SmallPool  # type: ignore[misc]  # for good: this process does nothing else
     learner = TactileLearner(**settings())
     for at in range(4):
         for name in MATERIALS[:2]:

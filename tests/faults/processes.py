@@ -26,7 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.ledger
+import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, State, after, expected, opened, perform, seen, stream, warm
 from faults.plans import draw
@@ -117,7 +117,7 @@ def _taken_over(path: Path, children: list[Any], told: Counter[str], failures: l
 
 def write(channel: Connection, path: Path, seed: int, seconds: float) -> None:
     """The writer: random operations; tells each, the instants of its beginning and its end, and what it returned."""
-    scroll_tactile.ledger.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.memory.ledger.SNAPSHOT_EVERY = SNAPSHOT_EVERY
     rng, state = random.Random(seed), State()
     with opened(path) as learner:
         channel.send("ready")

@@ -1,0 +1,162 @@
+"""How well a buffer stands for its classes, and how much of it depends on the schedule: four ways of choosing.
+
+`full` herds from all touches (what a memory of everything could do), `pooled` from candidates chosen by their hash
+(ours), `live` again at every observation (SCROLL's own, Wang et al.), `random` picks by chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool, herd, mean_code, quotas, rank
+
+__all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap"]
+
+IntArray = npt.NDArray[np.int64]
+Codes = npt.NDArray[np.int32]
+Buffer = dict[str, list[bytes]]
+
+
+class Chooser(Protocol):
+    """A buffer that is chosen while touches come in."""
+
+    def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
+        """Feel a touch; mean: of the material's codes so far, this one's among them, rounded."""
+
+    def buffer(self) -> Buffer:
+        """Material → keys of its exemplars."""
+
+
+class LiveHerding:
+    """SCROLL's buffer: a material's exemplars and its new touch are herded against the mean so far, at every touch."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._kept: dict[str, list[tuple[bytes, Codes]]] = {}
+
+    def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
+        """Feel a touch: herd its material again, and cut the others to their quotas."""
+        candidates = [*self._kept.get(material, []), (key, code)]
+        order = herd(np.stack([code for _, code in candidates]), [key for key, _ in candidates], mean, len(candidates))
+        self._kept[material] = [candidates[at] for at in order]
+        places = quotas({name: len(those) for name, those in self._kept.items()}, self.capacity)
+        self._kept = {name: those[: places[name]] for name, those in self._kept.items()}
+
+    def buffer(self) -> Buffer:
+        """Material → keys of its exemplars, in herding order."""
+        return {name: [key for key, _ in those] for name, those in sorted(self._kept.items())}
+
+
+class UniformRandom:
+    """A uniformly random choice of each material's touches: those with the smallest numbers drawn from `seed`."""
+
+    def __init__(self, capacity: int, seed: int) -> None:
+        self.capacity = capacity
+        self._rng = np.random.default_rng(seed)
+        self._kept: dict[str, list[tuple[float, bytes]]] = {}
+
+    def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
+        """Feel a touch: draw its number, and cut all materials to their quotas."""
+        self._kept[material] = sorted([*self._kept.get(material, []), (self._rng.random(), key)])
+        places = quotas({name: len(those) for name, those in self._kept.items()}, self.capacity)
+        self._kept = {name: those[: places[name]] for name, those in self._kept.items()}
+
+    def buffer(self) -> Buffer:
+        """Material → keys of its exemplars."""
+        return {name: [key for _, key in those] for name, those in sorted(self._kept.items())}
+
+
+class _Pooled:
+    def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
+        self._pool, self._means = ExemplarPool(capacity, ratio=ratio), means
+
+    def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
+        self._pool.add(Exemplar(material, key, np.zeros((0, 0), np.float32), code, 1))
+
+    def buffer(self) -> Buffer:
+        ranked = rank(self._pool, lambda material, _: self._means[material])
+        return {name: [one.key for one in those] for name, those in ranked.items()}
+
+
+def _pooled(capacity: int, ratio: int, means: Mapping[str, IntArray], _: int) -> Chooser:
+    return _Pooled(capacity, ratio, means)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What one way of choosing gave.
+
+    gap: ‖mean of the exemplars − class mean‖, averaged over the materials and two schedules, in units of the grid.
+    to_full: the gap divided by that of `full`. shared: part of the exemplars that two schedules have in common.
+    buffer: material → keys of its exemplars, under the first order.
+    """
+
+    gap: float
+    to_full: float
+    shared: float
+    buffer: Buffer
+
+
+def mean_gap(buffer: Mapping[str, npt.NDArray[np.integer]], means: Mapping[str, IntArray]) -> float:
+    """‖mean of the exemplars − class mean‖, averaged over the materials that have any.
+
+    buffer: material → codes of its exemplars, shape (m, d). means: material → mean code, shape (d,).
+    """
+    gaps = [np.linalg.norm(codes.mean(axis=0) - means[name]) for name, codes in buffer.items() if len(codes)]
+    return float(np.mean(gaps))
+
+
+def compare(
+    codes: Codes,
+    keys: Sequence[bytes],
+    materials: Sequence[str],
+    capacity: int,
+    seed: int,
+    ratios: Sequence[int] = (2, 3, 4),
+) -> dict[str, Choice]:
+    """Choose a buffer of so many touches in every way, under two orders drawn from `seed`.
+
+    codes: of the touches, shape (N, d). Returns `full`, `pooled-2` and so on, `live`, `random`.
+    """
+    names = np.array(materials)
+    felt = {name: codes[names == name] for name in sorted(set(materials))}
+    means = {name: mean_code(rows.sum(axis=0, dtype=np.int64), len(rows)) for name, rows in felt.items()}
+    ways: dict[str, Callable[[int], Chooser]] = {"full": partial(_pooled, len(keys), 1, means)}
+    for ratio in ratios:
+        ways[f"pooled-{ratio}"] = partial(_pooled, capacity, ratio, means)
+    ways |= {"live": lambda _: LiveHerding(capacity), "random": lambda number: UniformRandom(capacity, number)}
+    orders = [np.random.default_rng([seed, number]).permutation(len(keys)) for number in range(2)]
+    code_of = dict(zip(keys, codes, strict=True))
+    places = quotas({name: len(rows) for name, rows in felt.items()}, capacity)
+    choices: dict[str, Choice] = {}
+    for way, make in ways.items():
+        buffers = [
+            _chosen(make(2 * seed + number), order, codes, keys, materials) for number, order in enumerate(orders)
+        ]
+        buffers = [{name: those[: places[name]] for name, those in buffer.items()} for buffer in buffers]
+        gaps = [mean_gap({n: np.stack([code_of[k] for k in b[n]]) for n in b}, means) for b in buffers]
+        kept = [{key for those in buffer.values() for key in those} for buffer in buffers]
+        gap = float(np.mean(gaps))
+        full = choices["full"].gap if choices else gap
+        overlap = len(kept[0] & kept[1]) / max(len(kept[0]), 1)
+        choices[way] = Choice(gap, gap / full if full else 1.0, overlap, buffers[0])
+    return choices
+
+
+def _chosen(
+    chooser: Chooser, order: npt.NDArray[np.int64], codes: Codes, keys: Sequence[bytes], materials: Sequence[str]
+) -> Buffer:
+    sums: dict[str, IntArray] = {}
+    counts: dict[str, int] = {}
+    for at in order:
+        name = materials[at]
+        sums[name] = sums.get(name, np.zeros(codes.shape[1], np.int64)) + codes[at]
+        counts[name] = counts.get(name, 0) + 1
+        chooser.add(name, keys[at], codes[at], mean_code(sums[name], counts[name]))
+    return chooser.buffer()

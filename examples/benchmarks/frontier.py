@@ -1,0 +1,220 @@
+"""The frontier of `scroll-tactile bench speed`: error against milliseconds, on recorded touches.
+
+Width of the embedding × readout × length of the touch asked about, learned from one pass over the other folds; and
+beside it other libraries' learners on the same feature vectors, one for each touch. Times are of the processor, on one
+thread, and medians over the touches of one fold: what others do on a shared machine must not count. Errors are of all
+folds asked for.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from examples.benchmarks.ours import Ours
+from examples.benchmarks.vector_peers import (
+    GradientSteps,
+    OneVsRest,
+    Peer,
+    PseudoInverse,
+    RecursiveFilters,
+    Refitted,
+    lacking,
+)
+from examples.paper.studies.peers import touch_features
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Kernels
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.classification import Labelled, hold_out
+from scroll_tactile.readouts.readout import ReadoutName
+
+__all__ = ["WIDTHS", "knee", "measure_frontier", "run_frontier", "run_peers"]
+
+Record = dict[str, Any]
+Note = Callable[[str], object]
+FloatArray = npt.NDArray[np.float64]
+
+WIDTHS = (126, 252, 504, 1008, 2016)
+LENGTHS = (0.3, 1.0, None)  # seconds; None: all of a touch
+PEERS_WIDTH = 252  # features: padasip's filters carry a P each, and at 1008 a touch takes them a second
+SLOW = 20  # predictions that are timed where each follows an observation
+
+
+def measure_frontier(
+    sets: Sequence[Recordings], *, seed: int = 0, quick: bool = False, note: Note = lambda what: None
+) -> Record:
+    """The records of `run_frontier` and `run_peers` on some sets, and the `knee`; quick: one fold, two widths."""
+    widths = WIDTHS[:2] if quick else WIDTHS
+    frontier, peers = [], []
+    for recordings in sets:
+        folds = [0] if quick else sorted(set(recordings.fold.tolist()))
+        frontier += run_frontier(recordings, folds, widths, note=note)
+        peers += run_peers(recordings, 0, seed, note=note)
+    return {"frontier": frontier, "peers": peers, "knee": knee(frontier)}
+
+
+def run_frontier(
+    recordings: Recordings, folds: Sequence[int], widths: Sequence[int] = WIDTHS, *, note: Note = lambda what: None
+) -> list[Record]:
+    """Records of every width × readout × length: wrong share over the folds, milliseconds of the first of them."""
+    records = []
+    for width in widths:
+        tried: dict[tuple[str, str], list[float]] = {}
+        times: dict[tuple[str, str], Record] = {}
+        for fold in folds:
+            note(f"{recordings.name}: {width} features, fold {fold}")
+            for key, share, taken in _one_fold(recordings, fold, width):
+                tried.setdefault(key, []).append(share)
+                times.setdefault(key, taken)
+        for (readout, length), wrong in tried.items():
+            told = {"dataset": recordings.name, "width": width, "readout": readout, "length": length}
+            touches = int(np.isin(recordings.fold, folds).sum())
+            records.append(told | {"wrong": float(np.mean(wrong)), "touches": touches} | times[readout, length])
+    return records
+
+
+def _one_fold(recordings: Recordings, fold: int, width: int) -> list[tuple[tuple[str, str], float, Record]]:
+    learned, asked = hold_out(recordings, recordings.fold == fold)
+    found = []
+    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
+        path, embedding = Path(folder, "memory"), Kernels(dimension=width)
+        with TactileLearner.open(path, sensor=recordings.sensor, embedding=embedding, exemplars=0) as learner:
+            observing = [_timed(partial(learner.observe, *one)) for one in learned]
+        for readout in get_args(ReadoutName):
+            with TactileLearner.open(path, embedding=embedding, readout=readout, mode="read") as learner:
+                first = _timed(partial(learner.predict, asked[0][1]))
+                for seconds in LENGTHS:
+                    wrong, predicting = _answered(learner, asked, seconds)
+                    times = {
+                        "observe_ms": _milliseconds(observing),
+                        "predict_ms": _milliseconds(predicting),
+                        "first_predict_ms": _milliseconds([first]),
+                    }
+                    found.append(((readout, "all" if seconds is None else f"{seconds:g} s"), wrong, times))
+    return found
+
+
+def _answered(learner: TactileLearner, asked: Sequence[Labelled], seconds: float | None) -> tuple[float, list[float]]:
+    """The share of touches that were taken for something else, and the seconds that each answer took."""
+    wrong, taken = 0, []
+    for name, stream in asked:
+        cut = stream if seconds is None else stream.first(seconds)
+        begun = time.process_time()
+        said = learner.predict(cut).material
+        taken.append(time.process_time() - begun)
+        wrong += said != name
+    return wrong / len(asked), taken
+
+
+def _milliseconds(seconds: Sequence[float]) -> float:
+    return 1e3 * float(np.median(seconds))
+
+
+def _timed(call: Callable[[], object]) -> float:
+    begun = time.process_time()
+    call()
+    return time.process_time() - begun
+
+
+def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lambda what: None) -> list[Record]:
+    """Ours and others on the same vectors, the mean of a touch's windows: wrong share of a fold, and milliseconds.
+
+    In a random order, which gradient steps need. `predict_ms` is of a prediction that follows others, `fresh_ms` of
+    one that follows an observation.
+    """
+    learned, asked = hold_out(recordings, recordings.fold == fold)
+    embedding = Kernels(dimension=PEERS_WIDTH)
+    note(f"{recordings.name}: {PEERS_WIDTH} features of {len(learned) + len(asked)} touches")
+    names = sorted(set(recordings.materials))
+    rows = touch_features(embedding, [stream for _, stream in learned])
+    questions = touch_features(embedding, [stream for _, stream in asked])
+    places = [names.index(name) for name, _ in learned]
+    truth = [names.index(name) for name, _ in asked]
+    order = np.random.default_rng(seed).permutation(len(rows)).tolist()
+    records = []
+    for name, package, make in _peers(len(names), seed):
+        told = {"dataset": recordings.name, "learner": name, "features": PEERS_WIDTH}
+        if why := lacking(package):
+            records.append(told | {"measured": False, "why": why})
+            continue
+        note(f"{recordings.name}: {name}")
+        with threadpool_limits(1):
+            records.append(told | {"measured": True} | _measured(make(), rows, places, order, questions, truth))
+    return records
+
+
+def _peers(classes: int, seed: int) -> list[tuple[str, str, Callable[[], Peer]]]:
+    """Name, the package that it needs, how it is made."""
+    return [
+        ("ours, refit=0: λ at every change", "torch", lambda: Ours(PEERS_WIDTH, 0.0)),
+        ("ours, refit=0.1: λ where it has grown by a tenth", "torch", lambda: Ours(PEERS_WIDTH, 0.1)),
+        ("streaming LDA, pseudo-inverse on predict", "torch", lambda: PseudoInverse(classes, PEERS_WIDTH)),
+        ("scikit-learn RidgeClassifier, fitted again", "sklearn", Refitted),
+        ("scikit-learn SGDClassifier.partial_fit", "sklearn", lambda: GradientSteps(classes, seed)),
+        ("river one-vs-rest LogisticRegression", "river", OneVsRest),
+        ("padasip FilterRLS, one a class", "padasip", lambda: RecursiveFilters(classes, PEERS_WIDTH)),
+    ]
+
+
+def _measured(
+    peer: Peer,
+    rows: FloatArray,
+    places: Sequence[int],
+    order: Sequence[int],
+    questions: FloatArray,
+    truth: Sequence[int],
+) -> Record:
+    observing, fresh = [], []
+    for step, at in enumerate(order):
+        observing.append(_timed(partial(peer.observe, places[at], rows[at])))
+        if step >= len(order) - SLOW:
+            fresh.append(_timed(partial(peer.predict, questions[0])))
+    taken, wrong = [], 0
+    for row, place in zip(questions, truth, strict=True):
+        begun = time.process_time()
+        said = peer.predict(row)
+        taken.append(time.process_time() - begun)
+        wrong += said != place
+    return {
+        "wrong": wrong / len(truth),
+        "observe_ms": _milliseconds(observing),
+        "predict_ms": _milliseconds(taken),
+        "fresh_ms": _milliseconds(fresh),
+    }
+
+
+def knee(records: Sequence[Record], readout: ReadoutName = "lda") -> Record:
+    """Where along the widths more time stops paying: the default's reason, of whole touches.
+
+    The mean over the data sets of wrong shares and of milliseconds, by width; for each width the points of error that
+    the next wider takes away, and how much longer it predicts. The knee is the first width from which no wider takes
+    away more than a standard error, √(e (1 − e) / n) with n touches a data set.
+    """
+    mine = [one for one in records if one["readout"] == readout and one["length"] == "all"]
+    widths = sorted({one["width"] for one in mine})
+    steps = []
+    for width in widths:
+        of = [one for one in mine if one["width"] == width]
+        steps.append(
+            {
+                "width": width,
+                "wrong": float(np.mean([one["wrong"] for one in of])),
+                "predict_ms": float(np.mean([one["predict_ms"] for one in of])),
+                "observe_ms": float(np.mean([one["observe_ms"] for one in of])),
+                "touches": sum(one["touches"] for one in of),
+            }
+        )
+    for at, step in enumerate(steps):
+        spread = float(np.sqrt(max(step["wrong"] * (1 - step["wrong"]), 1e-6) / step["touches"]))
+        gained = max((step["wrong"] - wider["wrong"] for wider in steps[at + 1 :]), default=0.0)
+        step |= {"standard_error": spread, "gained_by_wider": gained}
+    chosen = next(step["width"] for step in steps if step["gained_by_wider"] <= step["standard_error"])
+    return {"readout": readout, "width": chosen, "default": Kernels().dimension, "steps": steps}

@@ -1,0 +1,73 @@
+"""The picture of `bench speed` on recorded touches: error against milliseconds, ours by width, others as points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from examples.paper.plots.drawing import available
+from scroll_tactile.errors import InputError
+
+__all__ = ["draw_frontier"]
+
+Records = Sequence[Mapping[str, Any]]
+STYLES = {"lda": "-", "ridge": "--"}
+
+
+def draw_frontier(path: Path, records: Records, peers: Records, *, default: int) -> None:
+    """Draw the records of `run_frontier` and `run_peers` into a picture; `default` is the width to be marked.
+
+    Raises InputError where matplotlib is missing or the file cannot be written.
+    """
+    if not available():
+        raise InputError('pictures need matplotlib: pip install "scroll-tactile[plots]"')
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    ours, others = figure.subplots(1, 2)
+    _draw_widths(ours, records, default)
+    _draw_peers(others, [one for one in peers if one["measured"]])
+    for panel in (ours, others):
+        panel.set(xscale="log", yscale="log", ylabel="touches taken for something else, %")
+        panel.grid(alpha=0.25, which="both")
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize=8)
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
+        raise InputError(f"the plot cannot be written to {path}: {error}") from error
+
+
+def _draw_widths(panel: Any, records: Records, default: int) -> None:
+    lines = dict.fromkeys((one["dataset"], one["length"], one["readout"]) for one in records)
+    colours = {key: f"C{at}" for at, key in enumerate(dict.fromkeys((dataset, length) for dataset, length, _ in lines))}
+    for dataset, length, readout in lines:
+        mine = [one for one in records if (one["dataset"], one["length"], one["readout"]) == (dataset, length, readout)]
+        mine.sort(key=lambda one: one["width"])
+        at, errors = [one["predict_ms"] for one in mine], [_percent(one) for one in mine]
+        colour = colours[dataset, length]
+        label = f"{dataset}, {'whole touches' if length == 'all' else length}, {readout}"
+        panel.plot(at, errors, STYLES[readout], color=colour, marker=".", label=label)
+        marked = [place for place, one in enumerate(mine) if one["width"] == default]
+        panel.scatter([at[place] for place in marked], [errors[place] for place in marked], s=90, color=colour)
+    panel.set(xlabel="ms a prediction, embedding included", title=f"widths of the embedding; large: {default}, default")
+
+
+def _draw_peers(panel: Any, peers: Records) -> None:
+    names = list(dict.fromkeys(one["learner"] for one in peers))
+    markers = dict(zip(dict.fromkeys(one["dataset"] for one in peers), "os^D", strict=False))
+    for at, name in enumerate(names):
+        for one in (one for one in peers if one["learner"] == name):
+            label = f"{name}, {one['dataset']}"
+            pair = one["observe_ms"] + one["fresh_ms"]
+            panel.scatter(pair, _percent(one), s=70, color=f"C{at % 10}", marker=markers[one["dataset"]], label=label)
+    features = peers[0]["features"] if peers else ""
+    panel.set(xlabel="ms an observation and the prediction that follows", title=f"the same {features} features for all")
+
+
+def _percent(one: Mapping[str, Any]) -> float:
+    # None wrong has no place on a logarithmic axis: it stands where a tenth of a percent is.
+    return max(100.0 * float(one["wrong"]), 0.1)

@@ -1,0 +1,114 @@
+"""The picture of `bench numerics`: speed against error, one point for each method and family of cases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from examples.paper.plots.drawing import available
+from scroll_tactile.errors import InputError
+
+__all__ = ["draw_numerics", "points"]
+
+Records = Sequence[Mapping[str, Any]]
+
+MARKERS = ("o", "s", "D", "^", "v", "<", ">", "p", "P", "X", "*", "d", "h", "8", "$a$", "$b$", "$c$")
+LETTERS = {"nist": "$N$", "updates": "$u$"}  # families that shapes would not tell from others
+NO_ANSWER = 1e3  # where families begin to be drawn that a method has no answer to, each method in a line of its own
+BETWEEN = 4.0  # these lines
+LEAST = 1e-17  # an error of 0 has no place on a logarithmic axis
+COLOURS = {
+    "covariance": "#d62728",
+    "covariance-symmetric": "#ff9896",
+    "qr": "#2ca02c",
+    "gram64": "#1f77b4",
+    "gram32": "#aec7e8",
+    "exact": "#000000",
+    "exact24": "#7f7f7f",
+    "exact20": "#c49c94",
+}
+
+
+def points(records: Records) -> list[tuple[str, str, float, float]]:
+    """(method, family, seconds a row, error) with the median time and the worst error over a family's cases.
+
+    A refusal, or weights that are not numbers, count as the error NO_ANSWER; a method that is not defined for a
+    case, and records without a time, are left out.
+    """
+    found = []
+    for method in dict.fromkeys(one["method"] for one in records):
+        for family in dict.fromkeys(one["family"] for one in records):
+            mine = [
+                one
+                for one in records
+                if (one["method"], one["family"]) == (method, family)
+                and one["seconds_per_row"] is not None
+                and family != "schedules"
+            ]
+            if mine:
+                errors = [NO_ANSWER if one["relative_error"] is None else one["relative_error"] for one in mine]
+                seconds = float(np.median([one["seconds_per_row"] for one in mine]))
+                found.append((method, family, seconds, min(NO_ANSWER, max(LEAST, *errors))))
+    return found
+
+
+def draw_numerics(path: Path, records: Records, *, title: str) -> None:
+    """Draw the records of `bench numerics` into a picture.
+
+    Raises InputError where matplotlib is missing or the file cannot be written.
+    """
+    if not available():
+        raise InputError('pictures need matplotlib: pip install "scroll-tactile[plots]"')
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = points(records)
+    families = list(dict.fromkeys(family for _, family, _, _ in drawn))
+    methods = list(dict.fromkeys(method for method, _, _, _ in drawn))
+    colours = {method: COLOURS.get(method, f"C{at % 10}") for at, method in enumerate(methods)}
+    markers = {family: LETTERS.get(family, MARKERS[at % len(MARKERS)]) for at, family in enumerate(families)}
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panel = figure.add_subplot()
+    for method, family, seconds, error in drawn:
+        mark = markers[family]
+        height = error if error < NO_ANSWER else NO_ANSWER * BETWEEN ** (1 + methods.index(method))
+        panel.scatter(seconds * 1e6, height, s=70, alpha=0.85, color=colours[method], marker=mark, linewidths=0)
+    panel.set(xscale="log", yscale="log", title=title)
+    panel.set(xlabel="processor time for each row, µs (median of the family's cases)")
+    panel.set(ylabel="relative error of the weights (worst of the family's cases)")
+    top = NO_ANSWER * BETWEEN ** (len(methods) + 1)
+    panel.set_ylim(LEAST / 3, top)
+    panel.set_yticks([10.0**power for power in range(-15, 3, 3)])
+    panel.axhline(1.0, color="grey", linewidth=0.8, linestyle=":")
+    panel.axhline(2.0**-53, color="grey", linewidth=0.8, linestyle=":")
+    panel.axhspan(NO_ANSWER, top, color="grey", alpha=0.12, linewidth=0)
+    for height, words in ((1.0, "nothing is right"), (2.0**-53, "rounding of a double")):
+        panel.annotate(
+            words, (0.004, height), xycoords=("axes fraction", "data"), va="bottom", fontsize=8, color="grey"
+        )
+    panel.annotate(
+        "no answer, or an error of 1000 and more",
+        (0.004, NO_ANSWER * 1.3),
+        xycoords=("axes fraction", "data"),
+        fontsize=8,
+        color="grey",
+    )
+    panel.grid(alpha=0.25)
+    _legends(figure, panel, colours, markers)
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
+        raise InputError(f"the plot cannot be written to {path}: {error}") from error
+
+
+def _legends(figure: Any, panel: Any, colours: Mapping[str, str], markers: Mapping[str, str]) -> None:
+    from matplotlib.lines import Line2D
+
+    by_colour = [Line2D([], [], color=colour, marker="o", linestyle="", label=name) for name, colour in colours.items()]
+    by_shape = [Line2D([], [], color="black", marker=mark, linestyle="", label=name) for name, mark in markers.items()]
+    figure.legend(handles=by_colour, title="method", loc="outside right upper", fontsize=9)
+    figure.legend(handles=by_shape, title="family of cases", loc="outside right lower", fontsize=9)

@@ -1,0 +1,72 @@
+"""Cases of `bench numerics` that are read from files: NIST's certified regressions, and features of real touches."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from examples.benchmarks.cases import Case
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import DatasetError
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.statistics.grid import BITS, to_codes
+
+__all__ = ["NIST", "digits", "nist_cases", "real_case"]
+
+NIST = "nist_strd.json"
+REAL_PENALTY = 1e-3
+
+
+def nist_cases(path: Path) -> Iterator[Case]:
+    """The linear sets of NIST's StRD in a file of decimal strings, with certified coefficients; λ = 0.
+
+    Powers are taken of the decimals and rounded once: no double holds more of the problem.
+    """
+    try:
+        sets = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"expected NIST's regressions in {path}; it cannot be read: {error}") from error
+    for name, one in sets.items():
+        if not isinstance(one, dict):
+            continue  # the note
+        if "degree" in one:
+            first = 1 if one.get("intercept") is False else 0
+            rows = [[float(Fraction(x) ** power) for power in range(first, one["degree"] + 1)] for x in one["x"]]
+        else:
+            rows = [[1.0, *map(float, row)] for row in one["X"]]
+        targets = np.array([[float(y)] for y in one["y"]])
+        yield Case(name, "nist", np.array(rows), targets, 0.0, None, np.array([float(w) for w in one["certified"]]))
+
+
+def digits(weights: np.ndarray, certified: np.ndarray) -> float:
+    """Correct digits of the worst coefficient, −log₁₀ of its relative error, from 0 to the 15 that are certified."""
+    if not np.isfinite(weights).all():
+        return 0.0
+    worst = float(np.abs((weights.reshape(-1) - certified) / certified).max())
+    return float(np.clip(-np.log10(max(worst, 1e-300)), 0.0, 15.0))
+
+
+def real_case(
+    name: Literal["biotac", "roboskin"], data: Path, seed: int, dimension: int, most: int | None = None
+) -> Case:
+    """Codes of whole touches of "biotac" or "roboskin", as a memory has them; one fold is asked about.
+
+    Raises DatasetError for a folder that is not laid out as published.
+    """
+    recordings = load(data, name, seed)
+    chosen = np.random.default_rng([seed, 7]).permutation(len(recordings))[:most]
+    embedding = Kernels(dimension=dimension)
+    features = np.stack([embedding.embed(tactile_image(recordings.streams[at])) for at in chosen])
+    rows = to_codes(features, embedding.bound) * 2.0**-BITS
+    names = sorted(set(recordings.materials))
+    targets = np.eye(len(names))[[names.index(recordings.materials[at]) for at in chosen]]
+    taught = recordings.fold[chosen] != 0
+    return Case(
+        f"{recordings.name}, {dimension} features", "real", rows[taught], targets[taught], REAL_PENALTY, rows[~taught]
+    )

@@ -1,0 +1,200 @@
+"""`scroll-tactile bench vision`: what the vision embedding costs beside a bare forward pass of its network.
+
+For the images of BioTac and RoboSkin all alternatives take turns in one run; beside each stands how far its features
+lie from those of torch in float32. Streams are simulated: their content does not change the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from examples.benchmarks.bare_resnet import Plain
+from examples.benchmarks.timing import circumstances, take_turns
+from scroll_tactile import sensors
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.kernels import one_torch_thread
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime
+from scroll_tactile.embeddings.vision import Vision, to_planes
+from scroll_tactile.embeddings.weights import load_network
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import tactile_image
+
+__all__ = ["run_vision"]
+
+Record = dict[str, Any]
+Note = Callable[[str], None]
+Image = npt.NDArray[np.float32]
+
+USUAL, ALL = (1, 2, 3), (0, 1, 2, 3, 4)  # stages: those that Vision has by default, and all
+TOUCHES = 3  # of each material, learned before `predict` is timed
+YARDSTICK, ONE_THREAD = "bare forward, torch", "bare forward, torch, one thread"
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A way to run Vision."""
+
+    runtime: RuntimeName
+    precision: Precision
+    stages: tuple[int, ...] = USUAL
+
+    @property
+    def name(self) -> str:
+        """What the table calls it."""
+        stages = ", all stages" if self.stages == ALL else ""
+        return f"Vision, {self.runtime}, {self.precision}{stages}"
+
+    def make(self, state: dict[str, torch.Tensor]) -> Vision:
+        """Make the embedding of these weights."""
+        return Vision(state, stages=self.stages, runtime=self.runtime, precision=self.precision)
+
+
+WAYS = [
+    _Way("torch", "float32"),
+    _Way("torch", "float32", ALL),  # the same work as the bare pass
+    _Way("torch", "bfloat16"),
+    _Way("onnxruntime", "float32"),
+    _Way("onnxruntime", "float32", ALL),
+    _Way("openvino", "float32"),
+    _Way("openvino", "bfloat16"),
+]
+
+
+def run_vision(
+    *,
+    weights: Path | None = None,
+    data: Path | None = None,
+    seed: int = 0,
+    rounds: int = 30,
+    note: Note = lambda _: None,
+) -> Record:
+    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
+
+    weights: of a ResNet, a random ResNet-18 where it is None: the cost is the same, the errors are not.
+    data: folder of BioTac_slide_20_50, for the accuracy on RoboSkin beside each runtime (a minute for each); or None.
+    """
+    net = ResNet.random(seed) if weights is None else load_network(weights)
+    state = net.state_dict()
+    here = [name for name in ("onnxruntime", "openvino") if find_spec(name) and find_spec("onnx")]
+    ways = [way for way in WAYS if way.runtime in ("torch", *here)]
+    records: list[Record] = []
+    for sensor in (sensors.BIOTAC, sensors.ROBOSKIN):
+        note(f"{sensor.name}: embeddings beside a bare forward pass")
+        records += _one_sensor(sensor, net, [(way.name, way.make(state)) for way in ways], here, seed, rounds)
+    return {
+        "bench": "vision",
+        **circumstances(seed),
+        "runtimes": {name: version(name) for name in here},
+        "weights": "random" if weights is None else str(weights),
+        "threads": torch.get_num_threads(),
+        "rounds": rounds,
+        "records": records,
+        "accuracy": {}
+        if data is None
+        else _accuracies(data, state, [way for way in ways if way.stages == USUAL], note),
+    }
+
+
+def _one_sensor(
+    sensor: Sensor, net: ResNet, embeddings: list[tuple[str, Vision]], here: list[str], seed: int, rounds: int
+) -> list[Record]:
+    scene = Scene(sensor=sensor, seed=seed)
+    stream = scene.touch(scene.materials[0], 99)
+    image = tactile_image(stream)
+    planes = to_planes(torch.from_numpy(image[None]))
+    calls = _bare(net, planes, here)
+    calls |= {name: _embedding(embedding, image) for name, embedding in embeddings}
+    for name, embedding in embeddings:
+        if "all stages" not in name and "bfloat16" not in name:
+            calls[f"predict with {name}"] = _predicting(scene, embedding, np.array(stream.readings))
+    timings = take_turns(calls, rounds)
+    errors = _errors(embeddings, image)
+    return [
+        {
+            "case": case,
+            "image": f"{image.shape[0]} × {image.shape[1]} ({sensor.name})",
+            "milliseconds": timing.least * 1e3,
+            "median_milliseconds": timing.median * 1e3,
+            "ratio": timing.least / timings[YARDSTICK].least,
+            "ratio_to_one_thread": timing.least / timings[ONE_THREAD].least,
+            "relative_error": errors.get(case),
+        }
+        for case, timing in timings.items()
+    ]
+
+
+def _bare(net: ResNet, planes: torch.Tensor, here: list[str]) -> dict[str, Callable[[], object]]:
+    """The networks alone: all their layers, with the image made ready."""
+    plain = Plain(net).eval()
+    made: dict[str, Run] = {}
+    if "onnxruntime" in here:
+        made["bare session, onnxruntime, one thread"] = make_runtime("onnxruntime", net, 4)
+    if "openvino" in here:
+        made["bare request, openvino, one thread"] = make_runtime("openvino", net, 4)
+
+    def forward() -> None:
+        with torch.inference_mode():
+            plain(planes)
+
+    def forward_on_one() -> None:
+        with torch.inference_mode(), one_torch_thread():
+            plain(planes)
+
+    ready = planes.numpy()
+    return {YARDSTICK: forward, ONE_THREAD: forward_on_one} | {name: _running(run, ready) for name, run in made.items()}
+
+
+def _running(run: Run, planes: Image) -> Callable[[], object]:
+    return lambda: run(planes)
+
+
+def _embedding(embedding: Vision, image: Image) -> Callable[[], object]:
+    return lambda: embedding.embed(image)
+
+
+def _predicting(scene: Scene, embedding: Vision, readings: npt.NDArray[np.float32]) -> Callable[[], object]:
+    learner = TactileLearner(sensor=scene.sensor, embedding=embedding)
+    for name in scene.materials:
+        for repetition in range(TOUCHES):
+            learner.observe(name, scene.touch(name, repetition))
+    return lambda: learner.predict(readings)
+
+
+def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], note: Note) -> dict[str, float]:
+    """Way → share of RoboSkin's first fold told apart rightly, learned from the other four."""
+    recordings = load(data, "roboskin", 0)
+    touches = list(zip(recordings.materials, recordings.streams, (recordings.fold == 0).tolist(), strict=True))
+    shares = {}
+    for way in (way for way in ways if way.stages == USUAL):
+        note(f"accuracy of {way.name}")
+        learner = TactileLearner(sensor=recordings.sensor, embedding=way.make(state), exemplars=0)
+        for material, stream, held_out in touches:
+            if not held_out:
+                learner.observe(material, stream)
+        asked = [(material, stream) for material, stream, held_out in touches if held_out]
+        right = [learner.predict(stream).material == material for material, stream in asked]
+        shares[way.name] = sum(right) / len(right)
+    return shares
+
+
+def _errors(embeddings: list[tuple[str, Vision]], image: Image) -> dict[str, float]:
+    """‖features − torch's‖ / ‖torch's‖, against torch in float32 at the same stages."""
+    truth: dict[tuple[int, ...], npt.NDArray[np.float32]] = {}
+    errors = {}
+    for name, embedding in embeddings:
+        features = embedding.embed(image)
+        reference = truth.setdefault(embedding.stages, features)
+        errors[name] = float(np.linalg.norm(features - reference) / np.linalg.norm(reference))
+    return errors

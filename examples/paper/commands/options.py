@@ -1,0 +1,170 @@
+"""What the commands of `reproduce` share: their options, the sets that they read, and how they end."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+
+from examples.paper.commands.sets import leave_out, named, origin, parse_folds
+from examples.paper.runs.cells import Cell, Figures
+from examples.paper.runs.study import Study
+from examples.paper.studies.table1 import blocked
+from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
+from scroll_tactile.cli.terminal import say, write_json
+from scroll_tactile.datasets import Recordings, physiclear
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.errors import DatasetError
+
+__all__ = [
+    "QUICK_EPOCHS",
+    "QUICK_SETS",
+    "SETS",
+    "Device",
+    "PrecisionChoice",
+    "choose_folds",
+    "choose_systems",
+    "close",
+    "read_sets",
+    "say_conditions",
+]
+
+
+class Device(StrEnum):
+    """Where networks are trained."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+class PrecisionChoice(StrEnum):
+    """What the residual networks are trained in."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
+
+
+SETS: dict[str, Callable[[Path, int], Recordings]] = {
+    "biotac-20": lambda data, seed: load(data, "biotac", seed),
+    "biotac-20-blocked": lambda data, seed: blocked(load(data, "biotac", seed)),
+    "roboskin-20": lambda data, seed: load(data, "roboskin", seed),
+    "gelsight": physiclear.load,
+}
+QUICK_SETS = ("biotac-20", "roboskin-20")
+QUICK_EPOCHS = 6
+
+Data = Annotated[Path, typer.Option(help="Folder with biotac_slide_20_50/ in it, and physiclear/ for gelsight.")]
+Weights = Annotated[
+    str | None,
+    typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18. Without, rows are left out."),
+]
+Sets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(SETS)}.")]
+Systems = Annotated[str | None, typer.Option(help=f"Which systems, of {', '.join(SYSTEMS)}.")]
+Folds = Annotated[str | None, typer.Option(help='"all", or numbers from 0, such as 0 or 0,1.')]
+Epochs = Annotated[int | None, typer.Option(min=1, help="Of the networks' training.")]
+Where = Annotated[Device, typer.Option(help="Where networks are trained.")]
+InPrecision = Annotated[
+    PrecisionChoice, typer.Option("--precision", help="Of the ResNets' training; bfloat16 is up to twice as fast.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of all that is drawn.")]
+Quick = Annotated[
+    bool, typer.Option("--quick", help="One fold, every second touch, small images, 6 epochs: minutes, for a look.")
+]
+Run = Annotated[
+    Path | None,
+    typer.Option("--run", "--resume", help="Write finished cells into this folder; a killed run goes on from it."),
+]
+Json = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
+Plot = Annotated[Path | None, typer.Option(help="Draw the curves into this file.")]
+
+
+def choose_systems(asked: str | None, usual: Sequence[str], weights: str | None) -> tuple[str, ...]:
+    """The systems of --systems; without it all that can be made, and a word on the others."""
+    if asked is not None:
+        return named("--systems", asked, SYSTEMS)  # before anything is read
+    return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
+
+
+def read_sets(asked: str | None, usual: Sequence[str], data: Path, seed: int, quick: bool) -> list[Recordings]:
+    """The sets of --sets; without it the usual ones, of which a quick run has two.
+
+    Raises InputError for other names, DatasetError for a set that is not there.
+    """
+    if asked is not None:
+        names = named("--sets", asked, SETS)
+    else:
+        names = tuple(name for name in usual if name in QUICK_SETS or not quick)
+    try:
+        return [SETS[name](data, seed) for name in names]
+    except DatasetError as error:
+        error.add_note("Or name the sets that are there: --sets biotac-20,roboskin-20")
+        raise
+
+
+def choose_folds(asked: str | None, read: Sequence[Recordings], quick: bool) -> dict[str, list[int]]:
+    """The folds of --folds for each set; without it all, or the first in a quick run."""
+    wanted = asked if asked is not None else ("0" if quick else "all")
+    return {one.name: parse_folds(wanted, one) for one in read}
+
+
+def say_conditions(study: Study) -> None:
+    """What the figures have to be read with."""
+    if any(key in EPOCHAL for key in study.systems):
+        short = "" if study.epochs >= 100 else " where the paper has 100"
+        rounded = f", ResNets in {study.precision}" if study.precision != "float32" else ""
+        how = f"{study.epochs} epochs{short}, on {study.device}{rounded}"
+        say(f"networks: {how}; a tenth of what is learned is the validation")
+    if study.quick:
+        say(
+            "[yellow]quick:[/] learned from every second touch; the ResNets' images averaged to about 50 columns: "
+            "for a look, not for a report"
+        )
+
+
+def close(
+    study: Study,
+    results: Sequence[tuple[Cell, Figures]],
+    json: Path | None,
+    found: Mapping[str, Any],
+    sets: str | None,
+    folds: str | None,
+) -> None:
+    """Tell of folds of unequal size, and write the JSON."""
+    for one in study.sets:
+        sizes = {cell.fold: figures["tested"] for cell, figures in results if cell.dataset == one.name}
+        if len(set(sizes.values())) > 1:
+            say(
+                f"{one.name}: folds of unequal size, {', '.join(map(str, sizes.values()))}: every touch counts the same"
+            )
+    if json is None:
+        return
+    sensors = {one.name: one.sensor.model_dump(mode="json") for one in study.sets}
+    threads = {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    seconds = {"seconds": sum(figures["seconds"] for _, figures in results)}
+    cells = {cell.key: figures for cell, figures in results}
+    write_json(
+        json,
+        origin(_command(study, sets, folds))
+        | threads
+        | study.plan
+        | seconds
+        | {"sensors": sensors, **found, "cells": cells},
+    )
+    say(f"figures: {json}")
+
+
+def _command(study: Study, sets: str | None, folds: str | None) -> str:
+    words = ["scroll-tactile", "reproduce", study.name, "--data", "DATA", "--systems", ",".join(study.systems)]
+    words += ["--sets", sets] if sets is not None else []
+    words += ["--folds", folds] if folds is not None else []
+    words += ["--weights", Path(study.weights).name] if study.weights is not None else []
+    words += ["--epochs", str(study.epochs), "--device", study.device, "--seed", str(study.seed)]
+    words += ["--precision", study.precision] if study.precision != "float32" else []
+    words += ["--quick"] * study.quick + (["--run", "RUN"] if study.folder is not None else [])
+    return shlex.join(words)

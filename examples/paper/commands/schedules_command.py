@@ -1,0 +1,96 @@
+"""`scroll-tactile schedules`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from examples.paper.studies.schedules import Trial, try_schedules
+from scroll_tactile.cli.terminal import console, progress_bar, say
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.classification import Labelled
+from scroll_tactile.recordings.arrays import read_sensor
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["schedules"]
+
+
+def schedules(
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of biotac_slide_20_50, for real touches; simulated ones otherwise.")
+    ] = None,
+    sensor: Annotated[str, typer.Option(help="biotac or roboskin; simulated also contactile, or a JSON file.")] = (
+        "biotac"
+    ),
+    count: Annotated[int, typer.Option(min=1, help="How many schedules to try.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the schedules and of the simulated touches.")] = 0,
+    touches: Annotated[int, typer.Option(min=1, help="Touches of each material.")] = 6,
+    materials: Annotated[int, typer.Option(min=2, max=20, help="How many of the twenty materials.")] = 20,
+    features: Annotated[int, typer.Option(hidden=True, min=64)] = 1008,
+) -> None:
+    """Show that no schedule matters: the same touches give the same memory, to the bit.
+
+    Tries random orders, cut into batches, with the memory closed and opened again here and there, and split over two
+    learners whose statistics are added. All must have one digest and give the same predictions.
+    """
+    chosen = read_sensor(sensor)
+    lessons, probes = _touches(data, chosen, touches, materials, seed)
+    done: list[Trial] = []
+    with progress_bar() as progress:
+
+        def tell(trial: Trial) -> None:
+            done.append(trial)
+            progress("schedules", len(done), count)
+
+        trials = try_schedules(chosen, lessons, probes, count=count, seed=seed, features=features, tell=tell)
+    _show(trials, len(lessons), len(probes), "simulated" if data is None else "real")
+
+
+def _touches(
+    data: Path | None, sensor: Sensor, touches: int, materials: int, seed: int
+) -> tuple[list[Labelled], list[Labelled]]:
+    """What is learned, and one touch of each material that is only asked about."""
+    if data is None:
+        scene = Scene(sensor, seed)
+        names = scene.materials[:materials]
+        lessons = [(name, scene.touch(name, at)) for name in names for at in range(touches)]
+        return lessons, [(name, scene.touch(name, touches)) for name in names]
+    name = sensor.name
+    if name not in ("biotac", "roboskin"):
+        raise InputError(f"expected --sensor biotac or roboskin for the data in {data}; came {name!r}")
+    recordings = load(data, "biotac" if name == "biotac" else "roboskin")
+    by_material: dict[str, list[Labelled]] = {}
+    for material, stream in zip(recordings.materials, recordings.streams, strict=True):
+        by_material.setdefault(material, []).append((material, stream))
+    groups = list(by_material.values())[:materials]
+    if touches >= min(map(len, groups)):
+        raise InputError(f"expected fewer touches than there are of each material, 50; came {touches}")
+    return [touch for group in groups for touch in group[:touches]], [group[touches] for group in groups]
+
+
+def _show(trials: Sequence[Trial], touches: int, probes: int, kind: str) -> None:
+    table = Table("schedule", "batches", "reopened", "second learner", "digest", "predictions")
+    for at, trial in enumerate(trials):
+        table.add_row(
+            "plain" if at == 0 else str(at),
+            str(trial.batches),
+            str(trial.reopened),
+            str(trial.split),
+            trial.digest[:10],
+            "same" if trial.same_predictions else "[red]differ[/]",
+        )
+    console().print(table)
+    digests = {trial.digest for trial in trials}
+    same = all(trial.same_predictions for trial in trials)
+    say(
+        f"{len(trials)} schedules of {touches} {kind} touches: {len(digests)} digest{'s' * (len(digests) > 1)}, "
+        f"predictions for {probes} others {'the same to the bit' if same else 'differ'}"
+    )
+    if len(digests) > 1 or not same:
+        raise InputError("schedules made a difference: please report this as a bug, with the seed")

@@ -1,0 +1,94 @@
+"""What the commands that measure share: the recorded sets, which folds, and what a result says of its making."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Collection, Sequence
+from datetime import UTC, datetime
+from enum import StrEnum
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+from examples.paper.plots import drawing as plots
+from scroll_tactile.cli.terminal import say
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.errors import InputError
+
+__all__ = ["Dataset", "draw_into", "leave_out", "named", "origin", "parse_folds", "read", "require_folders"]
+
+
+_OPTIONAL = {"scikit-learn": "sklearn", "snntorch": "snntorch"}  # what made some results; distribution → module
+
+
+class Dataset(StrEnum):
+    """The recorded sets."""
+
+    BIOTAC = "biotac-20"
+    ROBOSKIN = "roboskin-20"
+    UNMIXED = "roboskin-20-unmixed"  # in the order of time, which the published arrays are not in
+
+
+def read(dataset: Dataset, data: Path, seed: int) -> Recordings:
+    """Read a recorded set. Raises DatasetError for a folder that is not laid out as published."""
+    sensor: Literal["biotac", "roboskin"] = "biotac" if dataset is Dataset.BIOTAC else "roboskin"
+    return load(data, sensor, seed, unmixed=dataset is Dataset.UNMIXED)
+
+
+def parse_folds(folds: str, recordings: Recordings) -> list[int]:
+    """The folds that --folds asks for: "all", or numbers. Raises InputError for anything else."""
+    if folds == "all":
+        return sorted(set(recordings.fold.tolist()))
+    try:
+        return list(dict.fromkeys(int(part) for part in folds.split(",")))
+    except ValueError:
+        raise InputError(f"expected --folds all, or numbers such as 0 or 0,1; came {folds!r}") from None
+
+
+def named(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
+    """The names that an option asks for, with commas between; each once. Raises InputError for unknown ones."""
+    names = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
+    if strange := [name for name in names if name not in known]:
+        raise InputError(f"expected {option} out of {', '.join(known)}; came {', '.join(map(repr, strange))}")
+    return names
+
+
+def leave_out(keys: Sequence[str], needing: Collection[str], option: str) -> tuple[str, ...]:
+    """The keys without those that need an option which was not given; a word on these."""
+    if out := [key for key in keys if key in needing]:
+        say(f"[yellow]Left out without {option}:[/] {', '.join(out)}")
+    return tuple(key for key in keys if key not in out)
+
+
+def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:
+    """Draw a picture into the file that was asked for, and say so; whether it could be: not without matplotlib."""
+    if plot is None:
+        return True
+    if not plots.available():
+        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+        return False
+    draw(plot)
+    say(f"plot: {plot}")
+    return True
+
+
+def require_folders(*files: Path | None) -> None:
+    """Raise InputError, before anything is measured, where a file could not be written for want of its folder."""
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
+
+
+def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]:
+    """What made a result: the command, when, with which versions, on what machine, and from which sensor, of one."""
+    versions = {name: version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy")}
+    versions |= {name: version(name) for name, module in _OPTIONAL.items() if find_spec(module)}
+    made = {
+        "command": command,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions | {"python": platform.python_version()},
+        "machine": f"{platform.machine()} {platform.system()}",
+    }
+    return made if recordings is None else made | {"sensor": recordings.sensor.model_dump(mode="json")}

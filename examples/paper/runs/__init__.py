@@ -1,0 +1,1 @@
+"""Runs of many cells that resume where they were stopped."""

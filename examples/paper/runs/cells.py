@@ -1,0 +1,176 @@
+"""Studies of many cells, each a system on a fold of a data set: finished ones are written down, and not done again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+
+from examples.paper.runs.runfile import RunFile
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
+from scroll_tactile.pipelines.classification import Labelled
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["Cell", "Split", "data_digest", "held_back", "pooled", "require_data", "run_cells", "split", "time_left"]
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One thing to be measured: a system, by its key, on one fold of a data set."""
+
+    dataset: str
+    fold: int
+    system: str
+
+    @property
+    def key(self) -> str:
+        """What its figures are noted under."""
+        return f"{self.dataset}, fold {self.fold}, {self.system}"
+
+
+@dataclass(frozen=True)
+class Split:
+    """The touches of one fold: N to learn, and their materials; some to choose settings on; and those of the test.
+
+    touch: of each touch of the test which recording it belongs to: frames of one video share it.
+    """
+
+    streams: list[Stream]
+    materials: list[str]
+    validation: list[Labelled]
+    exam: list[Labelled]
+    touch: list[int]
+
+    @property
+    def asked(self) -> list[Stream]:
+        """The streams of the test."""
+        return [stream for _, stream in self.exam]
+
+    @property
+    def truth(self) -> list[str]:
+        """The materials of the test."""
+        return [name for name, _ in self.exam]
+
+
+def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share: float = 0.1) -> Split:
+    """Split a data set for one fold: what is not tested is learned, but for a tenth of each material's recordings.
+
+    seed: draws the validation. every: learn every so many recordings only. share: of the recordings of a material
+    that go to the validation, at least one where there are three.
+
+    Raises InputError for a fold that is not there, or one with materials that the other folds do not teach.
+    """
+    there = sorted(set(recordings.fold.tolist()))
+    if fold not in there:
+        raise InputError(f"expected a fold of {recordings.name} out of {there}; came {fold}")
+    tested = recordings.fold == fold
+    materials = np.array(recordings.materials)
+    untaught = sorted(set(materials[tested].tolist()) - set(materials[~tested].tolist()))
+    if untaught:
+        raise InputError(
+            f"expected all materials of fold {fold} of {recordings.name} in its other folds too; {untaught[:5]} are "
+            "tested and never taught. Deal the folds within each material"
+        )
+    # Frames of a video must not be parted; a number of a touch may stand for one in each fold.
+    marks = zip(recordings.materials, recordings.fold.tolist(), recordings.repetition.tolist(), strict=True)
+    groups = np.unique(["/".join(map(str, mark)) for mark in marks], return_inverse=True)[1]
+    random = np.random.default_rng([seed, fold])
+    held: set[int] = set()
+    left_out: set[int] = set()
+    for name in sorted(set(recordings.materials)):
+        own = random.permutation(np.unique(groups[(materials == name) & ~tested]))
+        left_out.update(own[np.arange(len(own)) % every != 0].tolist())
+        own = own[::every]
+        held.update(own[: held_back(len(own), share)].tolist())
+    pick = [at for at in np.flatnonzero(~tested) if groups[at] not in held | left_out]
+    validation = [at for at in np.flatnonzero(~tested) if groups[at] in held]
+    exam = np.flatnonzero(tested)
+    labelled = list(zip(recordings.materials, recordings.streams, strict=True))
+    return Split(
+        streams=[recordings.streams[at] for at in pick],
+        materials=[recordings.materials[at] for at in pick],
+        validation=[labelled[at] for at in validation],
+        exam=[labelled[at] for at in exam],
+        touch=groups[exam].tolist(),
+    )
+
+
+def held_back(count: int, share: float = 0.1) -> int:
+    """How many of so many recordings of a material go to the validation: at least one where there are three."""
+    return max(int(count >= 3), round(share * count))
+
+
+def run_cells(
+    notes: RunFile, cells: Sequence[Cell], measure: Callable[[Cell, Progress], Figures], progress: Progress
+) -> Iterator[tuple[Cell, Figures]]:
+    """The figures of each cell in turn: read back where it was finished, else measured and noted at once.
+
+    progress: told the cells done, the time left, and what the cell in hand is doing. A run that is killed loses the
+    cell in hand. Raises what `measure` raises, and InputError where the notes cannot be written.
+    """
+    for number, cell in enumerate(cells):
+        if cell.key not in notes.notes:
+            done = {one: notes.notes[one.key]["seconds"] for one in cells if one.key in notes.notes}
+            ahead = f"{number + 1}/{len(cells)}{time_left(done, cells[number:])}: {cell.key}"
+
+            def told(what: str, at: int, of: int, ahead: str = ahead) -> None:
+                progress(f"{ahead}: {what}", at, of)
+
+            told("starting", 0, 1)
+            begun = time.perf_counter()
+            figures = measure(cell, told)
+            notes.note(cell.key, figures | {"seconds": time.perf_counter() - begun})
+        yield cell, notes.notes[cell.key]
+
+
+def time_left(seconds: Mapping[Cell, float], ahead: Sequence[Cell]) -> str:
+    """In words, how long cells will take, by what the same system took on the same set, else elsewhere, else any.
+
+    Empty before anything was measured.
+    """
+    if not seconds:
+        return ""
+    total = 0.0
+    for cell in ahead:
+        if cell in seconds:
+            continue
+        same = [s for one, s in seconds.items() if one.system == cell.system]
+        near = [s for one, s in seconds.items() if (one.system, one.dataset) == (cell.system, cell.dataset)]
+        total += float(np.mean(near or same or [*seconds.values()]))
+    return f", about {total / 60:.0f} min left" if total >= 90 else f", about {total:.0f} s left"
+
+
+def data_digest(recordings: Recordings) -> str:
+    """16 hex digits of a hash over all streams, materials and folds."""
+    digest = blake2b(digest_size=8)
+    for stream, material, fold in zip(recordings.streams, recordings.materials, recordings.fold.tolist(), strict=True):
+        digest.update(stream.key + f"{material}\n{fold}\n".encode())
+    return digest.hexdigest()
+
+
+def require_data(notes: RunFile, recordings: Recordings) -> None:
+    """Note which data a run measures. Raises InputError where it began with other data of that name."""
+    key, digest = f"data of {recordings.name}", data_digest(recordings)
+    if notes.notes.setdefault(key, digest) != digest:
+        raise InputError(
+            f"the run in {notes.path} was begun on other recordings or folds of {recordings.name} "
+            f"({notes.notes[key]} there, {digest} here). Give the same data, or take another folder"
+        )
+
+
+def pooled(cells: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Right answers by all that were asked for, over folds that may differ in size; their standard deviation."""
+    shares = [cell["right"] / cell["tested"] for cell in cells]
+    return {
+        "mean": sum(cell["right"] for cell in cells) / sum(cell["tested"] for cell in cells),
+        "sd": float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0,
+        "folds": len(shares),
+    }

@@ -1,0 +1,152 @@
+"""What the studies of the paper's systems share: what is measured on what, and where it is written down."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
+from examples.paper.runs.runfile import RunFile
+from examples.paper.systems.catalogue import NEED_WEIGHTS, SYSTEMS, Catalogue
+from examples.paper.systems.descent import Course, Precision
+from examples.paper.systems.system_protocol import System
+from examples.paper.systems.trained import require_device
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings.weights import PUBLISHED
+from scroll_tactile.errors import InputError, WeightsError
+from scroll_tactile.finetune.training import Progress
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["NOT_OF_FRAMES", "Study", "columns_averaged", "weights_digest"]
+
+NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda")
+"""What is not run on a camera's frames: systems of streams, for which the paper has no figure there, and ours of two
+embeddings, for `Frames` with a network is one."""
+
+QUICK_COLUMNS = 50  # about, of the residual networks' images in a quick run
+QUICK_EVERY = 2  # of the recordings that are learned in a quick run
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study: what is to be measured; a subclass has a name, and measures a cell.
+
+    sets: of different names. systems: keys of SYSTEMS. weights: of a trained ResNet, for those in NEED_WEIGHTS.
+    epochs: of the networks. device: of all networks but ours. seed: of all that is drawn.
+    precision: of the residual networks' training, see `Course`.
+    quick: learn every second recording, and let residual networks read about 50 columns an image: for a look.
+    folder: where finished cells are noted, so that a run that was killed goes on; or None.
+
+    Raises InputError for unknown systems, sets of one name, a device that is not there, or weights that are needed and
+    not given.
+    """
+
+    sets: Sequence[Recordings]
+    systems: tuple[str, ...]
+    weights: str | None = None
+    epochs: int = 100
+    device: str = "cpu"
+    seed: int = 0
+    quick: bool = False
+    folder: Path | None = None
+    precision: Precision = "float32"
+
+    name = "study"
+
+    def __post_init__(self) -> None:
+        strange = [key for key in self.systems if key not in SYSTEMS]
+        if strange or not self.systems:
+            raise InputError(f"expected systems out of {', '.join(SYSTEMS)}; came {', '.join(strange) or 'none'}")
+        needing = [key for key in self.systems if key in NEED_WEIGHTS and self.weights is None]
+        if needing:
+            raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
+        if len({one.name for one in self.sets}) < len(self.sets) or not self.sets:
+            raise InputError(f"expected data sets of different names; came {[one.name for one in self.sets]}")
+        _ = self.course  # is refused where it cannot be
+        require_device(self.device)
+        if self.seed < 0:
+            raise InputError(f"expected a seed of 0 or more; came {self.seed}")
+
+    @property
+    def course(self) -> Course:
+        """How the networks are trained: as the paper's are, as far as the epochs reach."""
+        return Course(epochs=self.epochs, precision=self.precision)
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """All that each figure depends on, beside the data; sets, systems and folds can be added, not weights."""
+        options = {name: getattr(self, name) for name in ("epochs", "device", "seed", "quick", "precision")}
+        return {"run": self.name, **options, "weights": None if self.weights is None else weights_digest(self.weights)}
+
+    def cells(self, folds: Mapping[str, Sequence[int]]) -> list[Cell]:
+        """The cells of these folds of each set, by name; set by set and system by system."""
+        return [
+            Cell(one.name, fold, key)
+            for one in self.sets
+            for key in self.systems
+            for fold in folds[one.name]
+            if not (one.sensor.camera and key in NOT_OF_FRAMES)
+        ]
+
+    def run(
+        self, folds: Mapping[str, Sequence[int]], progress: Progress = lambda what, done, of: None
+    ) -> Iterator[tuple[Cell, Figures]]:
+        """The figures of each cell as it is finished; those finished before are read back.
+
+        Raises InputError for a folder of another run or folds that are not there, and what the systems raise.
+        """
+        notes = RunFile(None if self.folder is None else self.folder / f"{self.name}.json", self.plan)
+        cells = self.cells(folds)
+        for one in self.sets:
+            require_data(notes, one)
+            for fold in folds[one.name]:
+                split(one, fold, self.seed)  # what is refused is refused before anything is measured
+        yield from run_cells(notes, cells, self._measure, progress)
+
+    def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        raise NotImplementedError
+
+    def _split(self, cell: Cell) -> Split:
+        return split(self._by_name[cell.dataset], cell.fold, self.seed, every=QUICK_EVERY if self.quick else 1)
+
+    def _system(self, cell: Cell) -> System:
+        return self._catalogues[self._by_name[cell.dataset].sensor.name].make(cell.system)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Recordings]:
+        return {one.name: one for one in self.sets}
+
+    @cached_property
+    def _catalogues(self) -> dict[str, Catalogue]:
+        # One for all sets of a sensor: other folds of the same touches need not be embedded again.
+        return {one.sensor.name: self._catalogue(one) for one in self.sets}
+
+    def _catalogue(self, recordings: Recordings) -> Catalogue:
+        every = columns_averaged(recordings.sensor) if self.quick else 1
+        camera = recordings.sensor.camera
+        return Catalogue(self.weights, self.course, self.device, every, self.seed, camera=camera)
+
+
+def columns_averaged(sensor: Sensor) -> int:
+    """How many columns of a sensor's images are averaged in a quick run, so that about QUICK_COLUMNS are left."""
+    columns = sensor.shape[1] if sensor.camera else sensor.readings
+    return max(1, round(columns / QUICK_COLUMNS))
+
+
+def weights_digest(weights: str) -> str:
+    """What a run knows weights by: a published name, or 16 hex digits of the file's SHA-256.
+
+    Raises WeightsError where there is no such file.
+    """
+    if weights in PUBLISHED:
+        return weights
+    path = Path(weights)
+    if not path.is_file():
+        raise WeightsError(
+            f"expected weights: a file, or a published name out of {sorted(PUBLISHED)}; there is no file {path}"
+        )
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

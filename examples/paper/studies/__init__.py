@@ -1,0 +1,1 @@
+"""The studies: what is measured for each table and figure."""

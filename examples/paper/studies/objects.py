@@ -1,0 +1,284 @@
+"""Everyday objects under a camera: which of them it is, and what those are like that were never touched before.
+
+PhysiCLeAR's videos of a GelSight, each a stream of four frames in contact. Objects that were touched are told in folds
+of their videos. Attributes (hardness, roughness, texture, each of three values) are told of objects never touched: they
+are left out in groups, and told by heads over the others (`unseen`); beside it, by `compose`, to which each value is a
+constituent that the others were described to have or not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from examples.paper.runs.cached import Cached
+from examples.paper.runs.cells import data_digest
+from examples.paper.runs.runfile import RunFile
+from examples.paper.runs.study import weights_digest
+from examples.paper.studies.replay import Progress
+from examples.paper.studies.unseen import fit_heads
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Embedding, Frames, embed_windows
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.results import Composition
+from scroll_tactile.signals.contact import image_of
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import FRAMES
+from scroll_tactile.statistics.grid import in_units
+
+__all__ = ["COSINES", "TREES", "VALUES", "Objects", "most_often", "object_groups", "summary"]
+
+FloatArray = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+VALUES = (0, 1, 2)
+"""Of every attribute."""
+COSINES = 700
+"""Of the surface's counts, by which attributes are told."""
+TREES = 100
+"""Of the baseline, scikit-learn's extremely randomised trees on the counts and the light of each frame."""
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Objects in folds of their videos, and attributes of objects in groups that are left out.
+
+    recordings: whole videos, see `physiclear.videos`. attributes: object → attribute → value, of those that are known.
+    weights: of a trained ResNet, by which objects that were touched are told, too; None: by `Frames`' counts alone.
+    Attributes are told by cosines of the counts. groups: into which the objects with attributes are
+    dealt, one of which is never touched; seed: deals them, and grows the trees. trees: of the baseline; 0: none.
+    folder: where finished parts are noted, so that an interrupted run goes on; or None.
+
+    Raises InputError for fewer groups than two, or more than objects.
+    """
+
+    recordings: Recordings
+    attributes: Mapping[str, Mapping[str, int]]
+    weights: str | None = None
+    groups: int = 5
+    seed: int = 0
+    trees: int = TREES
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.groups <= len(self.attributes):
+            raise InputError(
+                f"expected 2 groups or more, and no more than the {len(self.attributes)} objects with attributes; came "
+                f"{self.groups}"
+            )
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """All that the figures depend on, in JSON's types."""
+        settings = {"groups": self.groups, "seed": self.seed, "trees": self.trees, "cosines": COSINES}
+        known = {"attributes": {name: dict(one) for name, one in self.attributes.items()}}
+        weights = None if self.weights is None else weights_digest(self.weights)
+        data = {"dataset": self.recordings.name, "data": data_digest(self.recordings)}
+        return {"run": "objects", "weights": weights} | data | settings | known
+
+    def run(self, folds: Sequence[int], progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+        """The figures of each of these folds of videos, then of each group of objects, as they are finished.
+
+        Raises InputError for a fold that is not there or where scikit-learn is missing, and what learning raises.
+        """
+        there = sorted(set(self.recordings.fold.tolist()))
+        if not folds or set(folds) - set(there):
+            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        notes = RunFile(None if self.folder is None else self.folder / "objects.json", self.plan)
+        for by in self._embeddings:
+            for fold in folds:
+                if (name := f"{by}, fold {fold}") not in notes.notes:
+                    notes.note(name, {"part": f"known, {by}", "number": fold} | self._known(by, fold, name, progress))
+                yield notes.notes[name]
+        for at, group in enumerate(object_groups(sorted(self.attributes), self.groups, self.seed)):
+            if (name := f"group {at}") not in notes.notes:
+                result = {"part": "never touched", "number": at, "objects": group}
+                notes.note(name, result | self._unknown(group, name, progress))
+            yield notes.notes[name]
+
+    @cached_property
+    def _names(self) -> npt.NDArray[np.str_]:
+        return np.array(self.recordings.materials)
+
+    @cached_property
+    def _embeddings(self) -> dict[str, Embedding]:
+        # Every frame is one of contact, and none shows the gel at rest.
+        made: dict[str, Embedding] = {"counts": Cached(Frames(rest=None))}
+        if self.weights is not None:
+            made["network"] = Cached(Frames(self.weights, rest=None))
+        return made
+
+    @cached_property
+    def _waves(self) -> Embedding:
+        return Cached(Frames(rest=None, cosines=COSINES))
+
+    @cached_property
+    def _counts(self) -> FloatArray:
+        """Of every frame what the trees read: `Frames` without a network, (videos, frames, d)."""
+        plain = self._embeddings["counts"]
+        return np.stack([self._read(plain, at) for at in range(len(self.recordings))]).astype(np.float64)
+
+    @property
+    def _width(self) -> int:
+        """Columns of a frame in its tactile image, the one scale of a camera's memory."""
+        return min(FRAMES, self.recordings.sensor.shape[1])
+
+    def _read(self, embedding: Embedding, at: int) -> npt.NDArray[np.floating]:
+        """Features of each frame of a video, (frames, d)."""
+        image, width = image_of(self.recordings.streams[at], None), self._width
+        return embed_windows(embedding, image, {width: list(range(0, image.shape[1], width))})[width]
+
+    def _taught(self, embedding: Embedding, taught: Mask, what: str, progress: Progress) -> TactileLearner:
+        learner = TactileLearner(sensor=self.recordings.sensor, embedding=embedding, exemplars=0)
+        lessons = np.flatnonzero(taught).tolist()
+        for done, at in enumerate(lessons, start=1):
+            learner.observe(self.recordings.materials[at], self.recordings.streams[at])
+            progress(what, done, len(lessons))
+        return learner
+
+    def _known(self, by: str, fold: int, what: str, progress: Progress) -> dict[str, Any]:
+        begun = time.perf_counter()
+        tested = self.recordings.fold == fold
+        learner = self._taught(self._embeddings[by], ~tested, what, progress)
+        streams = [self.recordings.streams[at] for at in np.flatnonzero(tested)]
+        truth = self._names[tested].tolist()
+        said = [learner.predict(stream) for stream in streams]
+        of_frames = [[str(learner.predict(one).material) for one in _frames(stream)] for stream in streams]
+        votes = [most_often(answers) for answers in of_frames]
+        figures = {
+            "learned": int((~tested).sum()),
+            "tested": len(truth),
+            "video": accuracy(truth, [one.material for one in said]),
+            "frame": float(
+                np.mean([one == name for name, those in zip(truth, of_frames, strict=True) for one in those])
+            ),
+            "vote": accuracy(truth, votes),
+            "called unknown": float(np.mean([not one.known for one in said])),
+            "digest": learner.digest(),
+        }
+        if self.trees and by == "counts":  # they read nothing else
+            progress(f"{what}: trees", 0, 1)
+            chances, classes = self._grown(~tested, tested, self._names)
+            figures["trees"] = accuracy(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
+            told = [most_often(one.tolist()) for one in classes[chances.argmax(axis=2)]]
+            figures["trees' vote"] = accuracy(truth, told)
+        return figures | {"seconds": time.perf_counter() - begun}
+
+    def _unknown(self, group: Sequence[str], what: str, progress: Progress) -> dict[str, Any]:
+        begun = time.perf_counter()
+        tested = np.isin(self._names, group)
+        learner = self._taught(self._waves, ~tested, what, progress)
+        for name, values in self.attributes.items():
+            if name not in group:
+                learner.describe(name, {_constituent(key, v): one == v for key, one in values.items() for v in VALUES})
+        exam = np.flatnonzero(tested).tolist()
+        said = [learner.compose(self.recordings.streams[at], unfamiliar=1.0) for at in exam]
+        keys = list(next(iter(self.attributes.values())))
+        taught = {name: values for name, values in self.attributes.items() if name not in group}
+        heads = fit_heads(learner._memory.statistics, self._width, taught, keys)
+        means = [in_units(self._read(self._waves, at), self._waves.bound).mean(axis=0) for at in exam]
+        told: dict[str, dict[str, Any]] = {}
+        for key in keys:
+            truth = [self.attributes[self.recordings.materials[at]][key] for at in exam]
+            composed = [_likeliest(one, key) for one in said]
+            told[key] = {
+                "right": _share(truth, [heads[key](mean) for mean in means]),
+                "composed": _share(truth, composed),
+                "penalty": heads[key].readout.penalty,
+                "gamma": heads[key].gamma,
+                **self._baselines(key, truth, tested, progress),
+            }
+        figures = {"learned": int((~tested).sum()), "tested": len(exam), "attributes": told}
+        return figures | {"digest": learner.digest(), "seconds": time.perf_counter() - begun}
+
+    def _baselines(self, key: str, truth: Sequence[int], tested: Mask, progress: Progress) -> dict[str, float]:
+        """Saying always what most videos of the others have; and the trees."""
+        values = np.array([self.attributes.get(name, {}).get(key, -1) for name in self.recordings.materials])
+        taught = ~tested & (values >= 0)
+        often = most_often(values[taught].tolist())
+        figures = {"always": _share(truth, [often] * len(truth))}
+        if self.trees:
+            progress(f"trees of {key}", 0, 1)
+            chances, classes = self._grown(taught, tested, values)
+            figures["trees"] = _share(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
+        return figures
+
+    def _grown(self, taught: Mask, tested: Mask, targets: npt.NDArray[Any]) -> tuple[FloatArray, npt.NDArray[Any]]:
+        """Probabilities of each frame of the tested videos, (videos, frames, classes), and the classes."""
+        try:
+            from sklearn.ensemble import ExtraTreesClassifier
+        except ImportError as error:
+            raise InputError(
+                "the baseline's trees are scikit-learn's, which is not installed: pip install 'scroll-tactile[bench]', "
+                "or leave it out with --trees 0"
+            ) from error
+        rows, frames = self._counts, self._counts.shape[1]
+        forest = ExtraTreesClassifier(self.trees, random_state=self.seed)
+        forest.fit(rows[taught].reshape(-1, rows.shape[2]), np.repeat(targets[taught], frames))
+        chances: FloatArray = forest.predict_proba(rows[tested].reshape(-1, rows.shape[2]))
+        return chances.reshape(-1, frames, chances.shape[1]), forest.classes_
+
+
+def object_groups(names: Sequence[str], groups: int, seed: int) -> list[list[str]]:
+    """Names dealt into groups of nearly equal size; the same arguments give the same groups."""
+    dealt = np.random.default_rng([seed, groups]).permutation(len(names)) % groups
+    return [[name for name, own in zip(names, dealt.tolist(), strict=True) if own == at] for at in range(groups)]
+
+
+def most_often(said: Sequence[Any]) -> Any:
+    """What is said most often; of equals the first in order."""
+    return max(sorted(set(said)), key=list(said).count)
+
+
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each kind of part: mean over its videos, and standard deviation over its folds or groups, of each figure.
+
+    Figures of attributes are named as "hardness", "hardness, composed", "hardness, trees" and "hardness, always".
+    """
+    means: dict[str, dict[str, dict[str, float]]] = {}
+    for kind in dict.fromkeys(result["part"] for result in results):
+        those = [(_flat(result), result["tested"]) for result in results if result["part"] == kind]
+        weights = [tested for _, tested in those]
+        for name in those[0][0]:
+            values = [figures[name] for figures, _ in those]
+            _, spread = mean_and_spread(values)
+            means.setdefault(kind, {})[name] = {"mean": float(np.average(values, weights=weights)), "sd": spread}
+    return means
+
+
+def _flat(result: Mapping[str, Any]) -> dict[str, float]:
+    figures = {name: result[name] for name in ("video", "vote", "frame", "trees", "trees' vote") if name in result}
+    for key, one in result.get("attributes", {}).items():
+        figures |= {
+            key if what == "right" else f"{key}, {what}": value
+            for what, value in one.items()
+            if what not in ("penalty", "gamma")
+        }
+    return figures
+
+
+def _constituent(attribute: str, value: int) -> str:
+    return f"{attribute} {value}"
+
+
+def _share(truth: Sequence[int], said: Sequence[int]) -> float:
+    return float(np.mean([one == other for one, other in zip(truth, said, strict=True)]))
+
+
+def _likeliest(said: Composition, attribute: str) -> int:
+    """The value of the largest presence; one without a head, which no or every object has, is never said."""
+    chances = [said[_constituent(attribute, value)].presence for value in VALUES]
+    return int(np.argmax([-1.0 if chance is None else chance for chance in chances]))
+
+
+def _frames(stream: Stream) -> list[Stream]:
+    return [Stream(stream.sensor, stream.readings[at : at + 1]) for at in range(len(stream))]

@@ -1,0 +1,245 @@
+"""Replays of recorded sets: learned in one pass by a schedule, fold by fold, and tested on what was held out."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from examples.paper.runs.runfile import RunFile
+from examples.paper.studies.schedules import ScheduleName, arrange
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.classification import Answers, Labelled, ask, missing
+from scroll_tactile.pipelines.metrics import auroc, calibration_error, mean_and_spread
+from scroll_tactile.readouts.readout import ReadoutName
+
+__all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "subset", "summary"]
+
+Progress = Callable[[str, int, int], object]
+"""Told (what is being done, steps done, steps in all)."""
+
+FIGURES = ("accuracy", "first", "half", "twice", "calibration_error", "false_alarms", "novelty_auroc")
+"""Of each fold: accuracy after the last material; from the first 0.3 s; of half streams after learning full ones;
+of full streams after learning half ones; expected calibration error; the share of known touches called unknown;
+AUROC of novelty with a fifth of the materials held out."""
+
+PUBLISHED = {"BioTac-20": (0.938, 0.989), "RoboSkin-20": (0.848, 0.960)}
+"""The paper's accuracies: ridge on its frozen vision model, and a pre-trained ResNet fine-tuned offline."""
+
+_FIRST = 0.3  # seconds
+_ROTATIONS = 5
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What to replay and how.
+
+    recordings: the streams. schedule, seed: see `arrange`; the seed draws the order. readout: "lda" or "ridge".
+    blocked: folds of successive repetitions, instead of the published or drawn ones.
+    curve: measure the accuracy over the materials met so far after every so many twentieths of the pass; 0: never.
+    novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
+    features: of the embedding.
+    folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
+
+    Raises InputError for a negative curve, and DatasetError where there are no blocked folds.
+    """
+
+    recordings: Recordings
+    schedule: ScheduleName = "class-by-class"
+    seed: int = 0
+    readout: ReadoutName = "lda"
+    blocked: bool = False
+    curve: int = 0
+    novelty: bool = False
+    features: int = 1008
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.curve <= 20:
+            raise InputError(f"expected a curve measured after every 1 to 20 twentieths, or 0; came {self.curve}")
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """All that the figures depend on, in JSON's types."""
+        options = ("schedule", "seed", "readout", "blocked", "curve", "novelty", "features")
+        size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
+        return {"run": "replay", "dataset": self.recordings.name, **size} | {
+            name: getattr(self, name) for name in options
+        }
+
+    def run(self, folds: Sequence[int], progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+        """The figures of each fold in turn, as they are finished; those finished before are read back.
+
+        Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
+        """
+        places = self.recordings.blocked() if self.blocked else self.recordings.fold
+        there = sorted(set(places.tolist()))
+        if not folds or set(folds) - set(there):
+            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        notes = RunFile(None if self.folder is None else self.folder / "replay.json", self.plan)
+        for fold in folds:
+            name = f"fold-{fold}"
+            if "digest" not in notes.notes.get(name, {}):
+                notes.note(name, _Fold(self, fold, places == fold, progress).run(notes))
+            yield notes.notes[name]
+
+
+class _Fold:
+    """One fold: what is learned, what is tested, and the figures that come of it."""
+
+    def __init__(self, replay: Replay, number: int, tested: np.ndarray, progress: Progress) -> None:
+        self.replay = replay
+        self.number = number
+        self.progress = progress
+        recordings = replay.recordings
+        touches: list[Labelled] = list(zip(recordings.materials, recordings.streams, strict=True))
+        taught = [touch for touch, held in zip(touches, tested, strict=True) if not held]
+        self.exam = [touch for touch, held in zip(touches, tested, strict=True) if held]
+        order = arrange(replay.schedule, [name for name, _ in taught], replay.seed)
+        self.lessons = [taught[at] for at in order]
+
+    def run(self, notes: RunFile) -> dict[str, Any]:
+        begun = time.perf_counter()
+        folder = self.replay.folder
+        with self._learner(None if folder is None else folder / f"fold-{self.number}") as learner:
+            curve = self._learn(learner, notes)
+            figures = self._figures(learner)
+            digest = learner.digest()
+        figures["twice"] = self._twice()
+        figures["novelty_auroc"] = self._novelty() if self.replay.novelty else None
+        return {
+            "fold": self.number,
+            "learned": len(self.lessons),
+            "tested": len(self.exam),
+            "tested_of": dict(Counter(name for name, _ in self.exam)),
+            **{name: figures[name] for name in (*FIGURES, "confusions")},
+            "curve": curve,
+            "equals_offline": self._offline() == digest,
+            "digest": digest,
+            "seconds": time.perf_counter() - begun,
+        }
+
+    def _learner(self, path: Path | None = None) -> TactileLearner:
+        sensor, readout = self.replay.recordings.sensor, self.replay.readout
+        embedding = Kernels(dimension=self.replay.features)
+        if path is None:
+            return TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
+        return TactileLearner.open(path, sensor=sensor, embedding=embedding, readout=readout)
+
+    def _learn(self, learner: TactileLearner, notes: RunFile) -> list[list[float]]:
+        """Teach what is missing; returns (materials met, accuracy over them) at each point of the curve."""
+        name, every = f"curve-{self.number}", self.replay.curve
+        points: dict[str, list[float]] = dict(notes.notes.get(name, {}))
+        total = len(self.lessons)
+        # After which observation a point is measured: every twentieth is one of twenty materials, class by class.
+        stops = {round(total * part / 20) for part in range(every, 21, every)} if every else set()
+        remaining = missing(self.lessons, learner.materials)
+        for done in range(total - len(remaining), total + 1):
+            if done in stops and str(done) not in points:
+                met = learner.materials
+                asked = [touch for touch in self.exam if touch[0] in met]
+                points[str(done)] = [len(met), ask(learner, asked).accuracy]
+                notes.note(name, points)
+            if done < total:
+                learner.observe(*self.lessons[done])
+            self.progress("learning", done, total)
+        return [points[key] for key in sorted(points, key=int)]
+
+    def _figures(self, learner: TactileLearner) -> dict[str, Any]:
+        self.progress("testing", 0, 3)
+        whole = ask(learner, self.exam)
+        self.progress("testing", 1, 3)
+        first = ask(learner, self.exam, seconds=_FIRST)
+        self.progress("testing", 2, 3)
+        half = ask(learner, [(name, stream.first(stream.seconds / 2)) for name, stream in self.exam])
+        self.progress("testing", 3, 3)
+        return {
+            "accuracy": whole.accuracy,
+            "first": first.accuracy,
+            "half": half.accuracy,
+            "calibration_error": _calibration_error(whole),
+            "false_alarms": float(np.mean([not prediction.known for prediction in whole.predictions])),
+            "confusions": whole.confusions(),
+        }
+
+    def _twice(self) -> float:
+        learner = self._learner()
+        shorter = [(name, stream.first(stream.seconds / 2)) for name, stream in self.lessons]
+        self._teach(learner, shorter, "learning halves")
+        return ask(learner, self.exam).accuracy
+
+    def _offline(self) -> str:
+        """The digest of the same touches learned in another order, all at random: offline training's."""
+        learner = self._learner()
+        order = np.random.default_rng([self.replay.seed, 1]).permutation(len(self.lessons))
+        self._teach(learner, [self.lessons[at] for at in order], "learning offline")
+        return learner.digest()
+
+    def _novelty(self) -> float:
+        """Mean AUROC over five rotations, a fifth of the materials held out in each."""
+        names = sorted({name for name, _ in self.lessons}, key=_number)
+        areas = []
+        for rotation in range(_ROTATIONS):
+            out = set(names[rotation::_ROTATIONS])
+            learner = self._learner()
+            lessons = [touch for touch in self.lessons if touch[0] not in out]
+            self._teach(learner, lessons, f"novelty {rotation + 1}/{_ROTATIONS}")
+            answers = ask(learner, self.exam)
+            novelty = np.array([prediction.novelty for prediction in answers.predictions])
+            new = np.array([name in out for name in answers.truth])
+            areas.append(auroc(novelty[new], novelty[~new]))
+        return float(np.mean(areas))
+
+    def _teach(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:
+        for done, (name, stream) in enumerate(touches):
+            learner.observe(name, stream)
+            self.progress(what, done + 1, len(touches))
+
+
+def _number(name: str) -> tuple[int, str]:
+    digits = "".join(filter(str.isdigit, name))
+    return int(digits or 0), name
+
+
+def _calibration_error(answers: Answers) -> float:
+    right = [truth == said for truth, said in zip(answers.truth, answers.said, strict=True)]
+    return calibration_error([prediction.probability for prediction in answers.predictions], right)
+
+
+def summary(folds: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Mean and standard deviation over the folds of each figure that all of them have."""
+    means = {}
+    for name in FIGURES:
+        values = [fold[name] for fold in folds]
+        if values and None not in values:
+            mean, spread = mean_and_spread(values)
+            means[name] = {"mean": mean, "sd": spread}
+    return means
+
+
+def subset(recordings: Recordings, materials: int) -> Recordings:
+    """The recordings of the first few materials only.
+
+    Raises InputError for fewer than two, or more than there are.
+    """
+    names = list(dict.fromkeys(recordings.materials))
+    if not 2 <= materials <= len(names):
+        raise InputError(f"expected 2 to {len(names)} materials; came {materials}")
+    kept = [at for at, name in enumerate(recordings.materials) if name in set(names[:materials])]
+    return Recordings(
+        name=recordings.name,
+        sensor=recordings.sensor,
+        streams=[recordings.streams[at] for at in kept],
+        materials=[recordings.materials[at] for at in kept],
+        repetition=recordings.repetition[kept],
+        fold=recordings.fold[kept],
+        ordered=recordings.ordered,
+    )

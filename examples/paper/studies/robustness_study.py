@@ -1,0 +1,242 @@
+"""Robustness: systems that learned from clean touches, asked about touches that were made or felt otherwise.
+
+A study is a grid of strengths, systems, with and without augmentation, and folds. A system learns a fold once, for
+all of its studies; only "sitting" (folds of successive repetitions: tomorrow's touches) has lessons of its own. Each
+cell is written down when it is finished, and an interrupted run goes on with the next.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from examples.paper.runs.cells import require_data
+from examples.paper.runs.runfile import RunFile
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Embedding, Robust
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
+from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.robustness import STUDIES
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["NAMES", "PAPER", "SITTING", "Learned", "Make", "Robustness", "System", "ours", "summary", "worst"]
+
+SITTING = "sitting"
+NAMES = (*STUDIES, SITTING)
+"""The names of the studies."""
+
+PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
+"""(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
+with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
+
+AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
+"""The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
+
+Progress = Callable[[str, int, int], object]
+
+
+class System(Protocol):
+    """Whatever names the materials of touches."""
+
+    def predict(self, streams: Sequence[Stream]) -> Sequence[str | None]:
+        """The material of each of N streams."""
+        ...
+
+
+Make = Callable[[Sequence[Labelled], bool, Progress], System]
+"""Makes a system that has learned these touches, with its augmentation (True) or without; told how far it is."""
+
+
+class Learned:
+    """A learner as a system: the material of the most probable answer, known or not."""
+
+    def __init__(self, learner: TactileLearner) -> None:
+        self.learner = learner
+
+    def predict(self, streams: Sequence[Stream]) -> list[str | None]:
+        """The material of each of N streams."""
+        return [self.learner.predict(stream).material for stream in streams]
+
+
+def ours(
+    sensor: Sensor, augmentation: Augmented = AUGMENTED, embedding: Embedding | None = None
+) -> tuple[Make, dict[str, Any]]:
+    """The one-pass learner of a sensor, and what it depends on; one setting for every sensor and every study.
+
+    Without augmentation it is the default learner. With it the embedding is `Robust()`, unless given.
+    """
+    robust = Robust() if embedding is None else embedding
+
+    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
+        if augmented:
+            learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
+        else:
+            learner = TactileLearner(sensor=sensor, exemplars=0)
+        done = count()
+        observe_all(learner, lessons, lambda: progress("learning", next(done) + 1, len(lessons)))
+        return Learned(learner)
+
+    return make, {"embedding": repr(robust), "augmentation": augmentation.to_json()}
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What to study.
+
+    recordings: the touches. systems: by name, what makes and teaches each. settings: by name, all that a system's
+    answers depend on beside its name, in JSON's types, so that what other settings gave is not gone on with.
+    studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
+    quick: fewer strengths. folder: where finished cells are kept, or None.
+
+    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "sitting" where the
+    order of recording is not known.
+    """
+
+    recordings: Recordings
+    systems: Mapping[str, Make]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    studies: Sequence[str] = NAMES
+    augmented: Sequence[bool] = (False, True)
+    seed: int = 0
+    quick: bool = False
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        strange = [name for name in self.studies if name not in NAMES]
+        if strange or not self.studies:
+            raise InputError(f"expected studies out of {', '.join(NAMES)}; came {strange or 'none'}")
+        if self.seed < 0:
+            raise InputError(f"expected a seed of 0 or more; came {self.seed}")
+        if SITTING in self.studies:
+            self.recordings.blocked()
+        if self.recordings.sensor.camera:
+            raise InputError(
+                f"expected touches of channels, which are cut, resampled and made noisy along time; "
+                f"{self.recordings.name} is of camera {self.recordings.sensor.name!r}"
+            )
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """What all figures depend on, in JSON's types; studies, folds and systems can be added to a run later."""
+        size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
+        return {"run": "robustness", "dataset": self.recordings.name, **size, "seed": self.seed}
+
+    def run(
+        self, folds: Sequence[int], progress: Progress = lambda what, done, of: None
+    ) -> Iterator[list[dict[str, Any]]]:
+        """The records of each fold in turn, as they are finished; cells finished before are read back.
+
+        A record holds study, strength, system, augmented, fold, accuracy (a share) and tested (touches).
+
+        Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
+        under other settings.
+        """
+        there = sorted(set(self.recordings.fold.tolist()))
+        if not folds or set(folds) - set(there):
+            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
+        require_data(notes, self.recordings)
+        for name in self.systems:
+            self._require_settings(notes, name)
+        for fold in folds:
+            cells = self.cells(fold)
+            yield [
+                record
+                for system in self.systems
+                for augmented in self.augmented
+                for record in self._taught(system, augmented, cells, notes, progress)
+            ]
+
+    def cells(self, fold: int) -> list[tuple[str, float, int]]:
+        """(study, strength, fold) of all that is asked of a system in a fold."""
+        sensor = self.recordings.sensor
+        return [
+            (study, strength, fold)
+            for study in self.studies
+            for strength in ((0.0,) if study == SITTING else STUDIES[study].of(sensor, quick=self.quick))
+        ]
+
+    def _require_settings(self, notes: RunFile, name: str) -> None:
+        given = json.loads(json.dumps(self.settings.get(name)))
+        kept = notes.notes.setdefault(f"settings of {name}", given)
+        if kept != given:
+            raise InputError(
+                f"the run in {notes.path} was begun with other settings of {name}: {kept} there, {given} here. Ask for "
+                "the same, or take another folder"
+            )
+
+    def _taught(
+        self,
+        name: str,
+        augmented: bool,
+        cells: Sequence[tuple[str, float, int]],
+        notes: RunFile,
+        progress: Progress,
+    ) -> Iterator[dict[str, Any]]:
+        systems: dict[bool, System] = {}  # by whether it has learned for "sitting"
+        what = f"{name}{', augmented' if augmented else ''}"
+        for done, (study, strength, fold) in enumerate(cells):
+            where = f"fold {fold}: {what}: {study} {strength:g}"
+            progress(where, done, len(cells))
+            key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
+            if key not in notes.notes:
+                sitting = study == SITTING
+                lessons, exam = self._split(fold, sitting)
+                if sitting not in systems:
+
+                    def told(step: str, at: int, of: int, where: str = where) -> None:
+                        progress(f"{where}: {step}", at, of)
+
+                    systems[sitting] = self.systems[name](lessons, augmented, told)
+                asked = exam if sitting else self._perturbed(exam, study, strength)
+                said = systems[sitting].predict([stream for _, stream in asked])
+                share = accuracy([material for material, _ in asked], list(said))
+                notes.note(key, {"accuracy": share, "tested": len(asked)})
+            about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
+            yield about | notes.notes[key]
+
+    def _perturbed(self, exam: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
+        perturb = STUDIES[study].perturb
+        return [(material, perturb(stream, strength, self.seed)) for material, stream in exam]
+
+    def _split(self, fold: int, sitting: bool) -> tuple[list[Labelled], list[Labelled]]:
+        places: npt.NDArray[np.int64] = self.recordings.blocked() if sitting else self.recordings.fold
+        return hold_out(self.recordings, places == fold)
+
+
+def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Mean and standard deviation over folds of each (study, strength, system, augmented), in the records' order."""
+    groups: dict[tuple[Any, ...], list[float]] = {}
+    for record in records:
+        cell = tuple(record[name] for name in ("study", "strength", "system", "augmented"))
+        groups.setdefault(cell, []).append(record["accuracy"])
+    rows = []
+    for (study, strength, system, augmented), values in groups.items():
+        mean, spread = mean_and_spread(values)
+        about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
+        rows.append(about | {"mean": mean, "sd": spread, "folds": len(values)})
+    return rows
+
+
+def worst(
+    rows: Sequence[Mapping[str, Any]], study: str, system: str, augmented: bool, least: float, most: float
+) -> Any:
+    """The lowest mean of `summary`'s rows among strengths from least to most; None where none was measured."""
+    among = [
+        row["mean"]
+        for row in rows
+        if (row["study"], row["system"], row["augmented"]) == (study, system, augmented)
+        and least <= row["strength"] <= most
+    ]
+    return min(among, default=None)

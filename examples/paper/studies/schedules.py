@@ -1,0 +1,183 @@
+"""Schedules: in what order touches are learned; and the proof that it makes no difference, to the bit."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.classification import Labelled
+from scroll_tactile.results import Prediction
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["SCHEDULES", "ScheduleName", "Trial", "arrange", "try_schedules"]
+
+ScheduleName = Literal["class-by-class", "reversed", "shuffled", "batches", "interleaved"]
+SCHEDULES: tuple[ScheduleName, ...] = get_args(ScheduleName)
+
+_BATCH = 4  # materials in a batch: five batches of twenty, the usual split of continual learning
+
+
+def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list[int]:
+    """The order in which N touches are learned: a permutation of 0 … N − 1.
+
+    materials: of each touch, N names. seed: 0 or more.
+    "class-by-class": all touches of one material, then of the next, materials in a drawn order; "reversed": the
+    same backwards; "shuffled": at random; "batches": four materials at a time, shuffled among themselves;
+    "interleaved": one touch of every material, then the next of every one.
+
+    Raises InputError for another schedule.
+    """
+    if schedule not in SCHEDULES:
+        raise InputError(f"expected a schedule, one of {', '.join(SCHEDULES)}; came {schedule!r}")
+    random = np.random.default_rng(seed)
+    names = sorted(set(materials))
+    turn = {names[place]: at for at, place in enumerate(random.permutation(len(names)))}
+    draw = random.permutation(len(materials))
+    seen: dict[str, int] = {}
+    repetition = []
+    for name in materials:
+        repetition.append(seen.get(name, 0))
+        seen[name] = repetition[-1] + 1
+    places = range(len(materials))
+    if schedule == "shuffled":
+        return [int(at) for at in draw]
+    if schedule == "batches":
+        return sorted(places, key=lambda at: (turn[materials[at]] // _BATCH, draw[at]))
+    if schedule == "interleaved":
+        return sorted(places, key=lambda at: (repetition[at], turn[materials[at]]))
+    order = sorted(places, key=lambda at: (turn[materials[at]], repetition[at]))
+    return order[::-1] if schedule == "reversed" else order
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One random schedule: what was done, what came of it, and whether the answers are those of the first.
+
+    batches: stretches of touches, with a prediction after each. reopened: how often the memory was closed and opened
+    again. split: touches that a second learner felt (0: there was none). digest: of the joined statistics.
+    """
+
+    batches: int
+    reopened: int
+    split: int
+    digest: str
+    same_predictions: bool
+
+
+def try_schedules(
+    sensor: Sensor,
+    touches: Sequence[Labelled],
+    probes: Sequence[Labelled],
+    *,
+    count: int = 20,
+    seed: int = 0,
+    features: int = 1008,
+    tell: Callable[[Trial], object] = lambda trial: None,
+) -> list[Trial]:
+    """Learn the same touches by `count` random schedules, on disk; the first is the plain one, in memory.
+
+    Each draws an order, a batching, where the memory is closed and opened again, and, every other time, which
+    touches a second learner feels, whose statistics are added in the end. All should have one digest, and give the
+    probes' predictions of the first, to the bit. `tell` hears of each trial when it is done. features: of the
+    embedding.
+
+    Raises InputError for a count below 1 or no touches.
+    """
+    if count < 1 or not touches or not probes:
+        raise InputError(
+            f"expected at least one schedule, touch and probe; came {count}, {len(touches)} and {len(probes)}"
+        )
+    embedding = Kernels(dimension=features)
+    plain = TactileLearner(sensor=sensor, embedding=embedding)
+    for name, stream in touches:
+        plain.observe(name, stream)
+    expected = _predictions(plain, probes)
+    trials = [Trial(1, 0, 0, plain.digest(), True)]
+    tell(trials[0])
+    for number in range(1, count):
+        random = np.random.default_rng([seed, number])
+        with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
+            trials.append(
+                _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
+            )
+        tell(trials[-1])
+    return trials
+
+
+def _try(
+    sensor: Sensor,
+    embedding: Kernels,
+    touches: Sequence[Labelled],
+    probes: Sequence[Labelled],
+    expected: list[Prediction],
+    random: np.random.Generator,
+    folder: Path,
+    *,
+    split: bool,
+) -> Trial:
+    order = random.permutation(len(touches))
+    cuts = np.flatnonzero(random.random(len(touches)) < 4 / len(touches))  # about five batches
+    second = set(random.permutation(len(touches))[: random.integers(1, len(touches))].tolist()) if split else set()
+    parts = [[at for at in order if at not in second]] + ([[at for at in order if at in second]] if split else [])
+    reopened = 0
+    with ExitStack() as opened:
+        learners = []
+        for at, part in enumerate(parts):
+            path = folder / str(at)
+            reopened += _learn(
+                path, sensor, embedding, [touches[place] for place in part], set(cuts.tolist()), probes[0], random
+            )
+            learners.append(opened.enter_context(TactileLearner.open(path, embedding=embedding, mode="read")))
+        joint = learners[0] if len(learners) == 1 else _joined(learners)
+        same = _predictions(joint, probes) == expected
+        return Trial(len(cuts) + 1, reopened, len(second), joint.digest(), same)
+
+
+def _learn(
+    path: Path,
+    sensor: Sensor,
+    embedding: Kernels,
+    touches: list[Labelled],
+    cuts: set[int],
+    probe: Labelled,
+    random: np.random.Generator,
+) -> int:
+    """Fill a memory on disk; after each batch it is opened anew, or asked; returns how often it was opened anew."""
+    reopened = 0
+    learner = TactileLearner.open(path, sensor=sensor, embedding=embedding)
+    try:
+        for at, (name, stream) in enumerate(touches):
+            learner.observe(name, stream)
+            if at in cuts and random.random() < 0.5:
+                learner.close()
+                learner = TactileLearner.open(path, embedding=embedding)
+                reopened += 1
+            elif at in cuts:
+                learner.predict(probe[1])
+    finally:
+        learner.close()
+    return reopened
+
+
+def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
+    """One learner, in memory, that has felt what all of these have."""
+    joint = TactileLearner(sensor=learners[0].sensor, embedding=learners[0].embedding)
+    memory = joint._memory
+    for learner in learners:
+        memory.statistics = memory.statistics + learner._memory.statistics
+        for material, key, touch in learner._memory.pool:
+            memory.pool.add(material, key, touch)
+    return joint
+
+
+def _predictions(learner: TactileLearner, probes: Sequence[Labelled]) -> list[Prediction]:
+    return [learner.predict(stream) for _, stream in probes]

@@ -1,0 +1,111 @@
+"""The paper's Table I: every system on every data set, fold by fold, with the paper's figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from examples.paper.runs.cells import Cell, Figures, pooled
+from examples.paper.runs.study import Study
+from examples.paper.systems.catalogue import SYSTEMS
+from examples.paper.systems.descent import Course
+from examples.paper.systems.trained import Trained
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.finetune.training import Progress
+from scroll_tactile.pipelines.metrics import accuracy
+
+__all__ = ["PAPER", "Table1", "blocked", "rows"]
+
+PAPER: dict[str, dict[str, float]] = {
+    "svm": {"BioTac-20": 0.942, "RoboSkin-20": 0.505},
+    "svm-spikes": {"BioTac-20": 0.935, "RoboSkin-20": 0.633},
+    "conv-lstm": {"BioTac-20": 0.945, "RoboSkin-20": 0.935},
+    "snn": {"BioTac-20": 0.946, "RoboSkin-20": 0.922},
+    "least-squares": {"BioTac-20": 0.938, "RoboSkin-20": 0.848, "GelSight-45": 0.671},
+    "resnet": {"BioTac-20": 0.980, "RoboSkin-20": 0.950, "GelSight-45": 0.929},
+    "resnet-pretrained": {"BioTac-20": 0.989, "RoboSkin-20": 0.960, "GelSight-45": 0.951},
+}
+"""Key of a system → data set → accuracy in the paper. GelSight-45 is not public: nothing of ours stands beside it."""
+
+
+class Table1(Study):
+    """The paper's Table I: each cell a fit and a test."""
+
+    name = "table1"
+
+    @property
+    def course(self) -> Course:
+        """The whole training, in fewer epochs where there is no time for the paper's hundred."""
+        return Course.in_proportion(self.epochs, self.precision)
+
+    def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        touches, system = self._split(cell), self._system(cell)
+        exam, truth = touches.asked, touches.truth
+        curve: list[float] = []
+        system.fit(
+            touches.streams,
+            touches.materials,
+            touches.validation,
+            self.seed,
+            progress,
+            watch=lambda: curve.append(accuracy(truth, system.predict(exam))),
+        )
+        said = system.predict(exam)
+        figures = {
+            "taught": len(touches.streams),
+            "validation": len(touches.validation),
+            "tested": len(truth),
+            "right": sum(one == other for one, other in zip(truth, said, strict=True)),
+            **_votes(truth, said, touches.touch),
+        }
+        if isinstance(system, Trained):
+            figures["epochs"] = [
+                {"accuracy": share, "loss": e.loss, "validation_loss": e.validation_loss, "rate": e.rate}
+                for share, e in zip(curve, system.epochs, strict=True)
+            ]
+        for chosen in ("chosen", "penalty"):
+            if hasattr(system, chosen):
+                figures["chosen"] = getattr(system, chosen)
+        return figures
+
+
+def _votes(truth: Sequence[str], said: Sequence[str], touch: Sequence[int]) -> Figures:
+    """Right answers by the majority of what is said of one recording, where recordings have several frames."""
+    ballots: dict[int, list[str]] = {}
+    for one, answer in zip(touch, said, strict=True):
+        ballots.setdefault(one, []).append(answer)
+    if len(ballots) == len(truth):
+        return {}
+    name_of = dict(zip(touch, truth, strict=True))
+    right = sum(max(sorted(set(votes)), key=votes.count) == name_of[one] for one, votes in ballots.items())
+    return {"recordings": len(ballots), "recordings_right": right}
+
+
+def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
+    """One row for each system: data set → accuracy over its folds, the paper's, and the difference."""
+    found: list[dict[str, Any]] = []
+    for key in SYSTEMS:
+        sets: dict[str, Any] = {}
+        for dataset in dict.fromkeys(cell.dataset for cell, _ in results):
+            cells = [figures for cell, figures in results if (cell.system, cell.dataset) == (key, dataset)]
+            if not cells:
+                continue
+            ours = pooled(cells)
+            paper = PAPER.get(key, {}).get(dataset)
+            sets[dataset] = ours | {
+                "paper": paper,
+                "difference": None if paper is None else ours["mean"] - paper,
+                "seconds": sum(cell["seconds"] for cell in cells),
+            }
+            if "recordings" in cells[0]:
+                asked = sum(cell["recordings"] for cell in cells)
+                sets[dataset]["vote"] = sum(cell["recordings_right"] for cell in cells) / asked
+        if sets:
+            found.append({"key": key, "system": SYSTEMS[key], "sets": sets})
+    return found
+
+
+def blocked(recordings: Recordings) -> Recordings:
+    """The same recordings in folds of successive repetitions, named so. Raises DatasetError where there are none."""
+    return replace(recordings, name=f"{recordings.name} blocked", fold=recordings.blocked())

@@ -1,0 +1,83 @@
+"""Heads for objects never touched, over a memory's own statistics, with a λ that is chosen by leaving objects out.
+
+`compose` takes over the λ by which materials are told apart, 0.03 of a feature's variance at most, so that describing
+costs no factorisation. Where objects are few and unlike each other a head wants a tamer one. Here both λ and γ (see
+`ridge.attributes`) are those of least squared error on the class means of objects left out, one by one: of a head that
+solves with B, the error of leaving object y out is α_y / B_yy, so no head is fitted twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.readouts.attributes import GAMMAS, solve
+from scroll_tactile.readouts.readout import Readout, fit_readout
+from scroll_tactile.readouts.selection import task_of
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
+
+__all__ = ["PENALTIES", "UnseenHead", "fit_heads"]
+
+FloatArray = npt.NDArray[np.float64]
+
+PENALTIES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""λ, as shares of a scaled feature's variance."""
+
+
+@dataclass(frozen=True)
+class UnseenHead:
+    """A head for one attribute: how much speaks for each of its values.
+
+    values: V of them. readout: with the chosen λ, of all objects. places: of the K objects whose value is known.
+    weights: (α, b) of each value, shape (K + 1, V). gamma: the chosen γ. error: squared, of objects left out, summed.
+    """
+
+    values: tuple[int, ...]
+    readout: Readout
+    places: npt.NDArray[np.intp]
+    weights: FloatArray
+    gamma: float
+    error: float
+
+    def __call__(self, mean: FloatArray) -> int:
+        """The value that a touch feels like; mean: its mean features in the codes' unit, (d,). Ties go to the first."""
+        z = self.readout.project(mean)[self.places]
+        return self.values[int(np.argmax(z @ self.weights[:-1] + self.weights[-1]))]
+
+
+def fit_heads(
+    statistics: Statistics, scale: int, attributes: Mapping[str, Mapping[str, int]], keys: Sequence[str]
+) -> dict[str, UnseenHead]:
+    """Attribute → its head over what was felt at a scale.
+
+    attributes: material → attribute → value, of those that are known; of others there may be any.
+
+    Raises InputError where fewer than two materials with known attributes were felt.
+    """
+    names = statistics.names(scale)
+    places = np.array([at for at, name in enumerate(names) if name in attributes], dtype=np.intp)
+    if len(places) < 2:
+        raise InputError(f"expected two materials or more with known attributes; felt was {len(places)}")
+    known = {key: np.array([attributes[names[at]][key] for at in places]) for key in keys}
+    best: dict[str, UnseenHead] = {}
+    with one_thread():
+        task = task_of(statistics, scale)
+        # From the tamest on: of equals the first stays.
+        for penalty in sorted(PENALTIES, reverse=True):
+            readout = fit_readout(task, penalty)
+            gram = readout.gram[np.ix_(places, places)]
+            for gamma in sorted(GAMMAS, reverse=True):
+                inverse = solve(gram, gamma).inverse
+                for key, truth in known.items():
+                    values = np.unique(truth)
+                    weights = inverse[:, :-1] @ (truth[:, None] == values).astype(np.float64)
+                    missed = weights[:-1] / np.diagonal(inverse)[:-1, None]
+                    error = float(np.square(missed).sum())
+                    if key not in best or error < best[key].error:
+                        best[key] = UnseenHead(tuple(values.tolist()), readout, places, weights, gamma, error)
+    return best

@@ -1,0 +1,1 @@
+"""The tables of RESULTS.md, made from the files of results."""

@@ -1,0 +1,243 @@
+"""Transfer across sensors: materials learned with one, and asked about with another, after few touches of it or none.
+
+Every way stands beside learning from these few touches alone, and all have the same draws of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from examples.paper.runs.cached import Cached
+from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
+from examples.paper.runs.runfile import RunFile
+from examples.paper.studies.peers import touch_features
+from examples.paper.systems.system_protocol import silent
+from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
+from examples.paper.transfer.few_touches import Feeler, draw_touches, feeler_maker, few_touches
+from examples.paper.transfer.shared_features import Features, Shared
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
+from scroll_tactile.pipelines.metrics import mean_and_spread
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["ALONE", "COUNTS", "WAYS", "SensorTransfer", "rows"]
+
+COUNTS = (0, 1, 2, 5)
+"""Touches of each material of the new sensor."""
+
+ALONE = "alone"
+WAYS = {
+    ALONE: "the few touches alone (TactileLearner, kernels)",
+    "spectra-alone": "the few touches alone, spectra",
+    "as-they-are": "spectra as they are, the old sensor's readout",
+    "standardised": "spectra, each standardised on its sensor",
+    "resampled": "kernels of ten channels, each standardised on its sensor",
+    "together": "spectra of both sensors' touches learned together",
+    "scatter": "spectra: scatter of the old sensor, means of the new",
+    "ridge-map": "kernels mapped to the old sensor's means by ridge regression",
+    "procrustes": "kernels turned to the old sensor's means (Procrustes)",
+    "prior": "means drawn together as the old sensor's lie",
+    "prior-control": "… as if all lay apart alike",
+}
+"""Key → name, as in tables."""
+
+_BLIND = ("as-they-are", "standardised", "resampled")  # ways that ask no touch of the new sensor to be named
+_IN_KERNELS = ("ridge-map", "procrustes", "prior", "prior-control")
+LIKENESS = 0.3
+"""Of "prior", set with one fold: 0.3, 0.6 and 0.9 gain −0.1, 0 and −0.4 points (± 0.1 to 0.2) with one touch of
+RoboSkin, and 0.7, 1.0 and 0 (± 0.5) with one of BioTac, over 0, the control."""
+
+
+@dataclass(frozen=True)
+class SensorTransfer:
+    """Two sensors that touched the same materials; each is learned with in turn, and the other asked about.
+
+    sets: two, of different sensors without a camera, with the same materials. ways: keys of WAYS.
+    folds: tested, of the new sensor; counts: touches of each material of the new sensor, 0 or more; draws: of these.
+    seed: of the draws. folder: where finished cells are noted, so that a run that was killed goes on; or None.
+
+    What is not labelled of the new sensor's touches outside the fold serves "standardised" and "resampled": each
+    feature's mean and spread. Raises InputError for what cannot be.
+    """
+
+    sets: tuple[Recordings, Recordings]
+    ways: tuple[str, ...] = tuple(WAYS)
+    folds: tuple[int, ...] = (0,)
+    counts: tuple[int, ...] = COUNTS
+    draws: int = 5
+    seed: int = 0
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        one, other = self.sets
+        if one.sensor == other.sensor or set(one.materials) != set(other.materials):
+            raise InputError(
+                f"expected two sensors that touched the same materials; came {one.sensor.name!r} with "
+                f"{len(set(one.materials))} and {other.sensor.name!r} with {len(set(other.materials))} materials, "
+                f"{len(set(one.materials) & set(other.materials))} of them the same"
+            )
+        strange = [key for key in self.ways if key not in WAYS]
+        if strange or not self.ways:
+            raise InputError(f"expected ways out of {', '.join(WAYS)}; came {', '.join(strange) or 'none'}")
+        if not self.folds or not self.counts or min(self.counts) < 0 or self.draws < 1 or self.seed < 0:
+            raise InputError(
+                "expected one fold or more, counts of 0 touches or more, 1 draw or more and a seed of 0 or more; came "
+                f"folds {self.folds}, counts {self.counts}, draws {self.draws}, seed {self.seed}"
+            )
+        Shared((one.sensor, other.sensor))
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """All that each figure depends on, beside the data; ways and folds can be added to a run later."""
+        return {"run": "transfer sensors", "counts": self.counts, "draws": self.draws, "seed": self.seed}
+
+    @property
+    def chance(self) -> float:
+        """The share that is right of answers given blindly."""
+        return 1 / len(set(self.sets[0].materials))
+
+    def cells(self) -> list[Cell]:
+        """A direction's name, a fold of the new sensor and a way each; those in which something is asked."""
+        return [
+            Cell(name, fold, way)
+            for name in self._directions
+            for fold in self.folds
+            for way in self.ways
+            if self._counts_of(way)
+        ]
+
+    def run(self, progress: Progress = lambda what, done, of: None) -> Iterator[tuple[Cell, Figures]]:
+        """The figures of each cell as it is finished; those finished before are read back.
+
+        Raises InputError for a folder of another run or folds that are not there, and what learning raises.
+        """
+        notes = RunFile(None if self.folder is None else self.folder / "transfer-sensors.json", self.plan)
+        for one in self.sets:
+            require_data(notes, one)
+            for fold in self.folds:
+                draw_touches(one, fold, self.seed, 0)  # what is refused is refused before anything is measured
+        yield from run_cells(notes, self.cells(), self._measure, progress)
+
+    def agreement(self) -> dict[str, dict[str, float]]:
+        """How far the sensors agree on which materials feel alike: of spectra and kernels, all touches.
+
+        correlation: over pairs of materials, of the cosines between their means where the scatter within is white;
+        chance: its standard deviation where one sensor's materials are exchanged at random.
+        """
+        found = {}
+        random = np.random.default_rng([self.seed, 1])
+        pairs = np.triu_indices(len(set(self.sets[0].materials)), 1)
+        for kind in ("spectra", "kernels"):
+            ours, theirs = (self._known(one, kind, silent).likeness for one in self.sets)
+            exchanged = [random.permutation(len(ours)) for _ in range(200)]
+            by_chance = [_correlation(ours[np.ix_(order, order)][pairs], theirs[pairs]) for order in exchanged]
+            found[kind] = {
+                "correlation": _correlation(ours[pairs], theirs[pairs]),
+                "chance": float(np.std(by_chance)),
+            }
+        return found
+
+    @cached_property
+    def _directions(self) -> dict[str, tuple[Recordings, Recordings]]:
+        """Name → what is learned with, and what is asked about with."""
+        one, other = self.sets
+        return {f"{old.name} → {new.name}": (old, new) for old, new in ((one, other), (other, one))}
+
+    def _counts_of(self, way: str) -> list[int]:
+        return [count for count in self.counts if (count == 0) == (way in _BLIND)]
+
+    def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        old, new = self._directions[cell.dataset]
+        make = self._maker(cell.system, old, new, cell.fold, progress)
+        draws = 1 if cell.system in _BLIND else self.draws  # nothing is drawn without touches
+        counts = self._counts_of(cell.system)
+        return few_touches(new, cell.fold, make, counts, draws, self.seed, progress)
+
+    def _maker(self, way: str, old: Recordings, new: Recordings, fold: int, progress: Progress) -> Callable[[], Feeler]:
+        """What makes new learners of a way."""
+        if way == ALONE:
+            return feeler_maker(new.sensor, self._kernels)
+        kind = "resampled" if way == "resampled" else "kernels" if way in _IN_KERNELS else "spectra"
+        features = self._features[kind]
+        if way == "spectra-alone":
+            return lambda: OneReadout(features, None)
+        known = self._known(old, kind, progress)
+        if way in ("ridge-map", "procrustes"):
+            return lambda: MapsAcross(features, known, turned=way == "procrustes")
+        if way in ("prior", "prior-control"):
+            return lambda: SharesPrior(features, known, likeness=LIKENESS if way == "prior" else 0.0)
+        if way in ("standardised", "resampled"):
+            unlabelled = np.array([features(new.streams[at]) for at in np.flatnonzero(new.fold != fold)])
+            return lambda: OneReadout(features, known, unlabelled=unlabelled)
+        return lambda: OneReadout(features, known, as_it_is=way == "as-they-are", apart=way == "scatter")
+
+    def _known(self, old: Recordings, kind: str, progress: Progress) -> Known:
+        vectors = []
+        for done, stream in enumerate(old.streams):
+            vectors.append(self._features[kind](stream))
+            progress(f"{kind} of {old.name}", done + 1, len(old))
+        return Known(np.array(vectors), list(old.materials), [stream.key for stream in old.streams])
+
+    @cached_property
+    def _kernels(self) -> Cached:
+        return Cached(Kernels())
+
+    @cached_property
+    def _features(self) -> dict[str, Features]:
+        shared = Shared((self.sets[0].sensor, self.sets[1].sensor))
+        made: dict[str, Features] = {
+            "spectra": shared.spectra,
+            "resampled": shared.resampled(Kernels()),
+            "kernels": lambda stream: touch_features(self._kernels, [stream])[0],
+        }
+        return {name: _kept(features) for name, features in made.items()}
+
+
+def _correlation(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _kept(features: Features) -> Features:
+    """The same features, of each touch computed once."""
+    found: dict[bytes, npt.NDArray[np.float64]] = {}
+
+    def keep(stream: Stream) -> npt.NDArray[np.float64]:
+        if stream.key not in found:
+            found[stream.key] = features(stream)
+        return found[stream.key]
+
+    return keep
+
+
+def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
+    """A row for each direction and way.
+
+    points: count → mean accuracy over folds and draws, its standard deviation, and those of the difference to the few
+    touches alone, of the same draws (None without any touch, or where it was not measured).
+    """
+    shares: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for cell, figures in results:
+        own = shares.setdefault((cell.dataset, cell.system), {})
+        for count, right in figures["right"].items():
+            own.setdefault(count, []).extend(hits / figures["tested"] for hits in right)
+    found = []
+    for (direction, way), own in shares.items():
+        points = {}
+        for count, values in own.items():
+            mean, spread = mean_and_spread(values)
+            point: dict[str, float | None] = {"mean": mean, "sd": spread, "gain": None, "gain sd": None}
+            alone = shares.get((direction, ALONE), {}).get(count, [])
+            if len(alone) == len(values):
+                point["gain"], point["gain sd"] = mean_and_spread(np.subtract(values, alone).tolist())
+            points[count] = point
+        found.append({"direction": direction, "way": way, "name": WAYS[way], "points": points})
+    return found

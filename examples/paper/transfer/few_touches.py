@@ -1,0 +1,177 @@
+"""Few touches of each material, drawn several times, learned by a closed-form readout, and a test after each number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Embedding
+from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.prediction.features import Perception
+from scroll_tactile.readouts.selection import Selection, select
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Reading
+from scroll_tactile.statistics.grid import in_units, to_codes
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics, fold_of
+
+__all__ = ["COUNTS", "Feeler", "WidestFeatures", "WidestReadout", "draw_touches", "feeler_maker", "few_touches"]
+
+COUNTS = (1, 2, 5, 10, 20)
+"""Touches of each material after which the test is taken."""
+
+
+class Feeler(Protocol):
+    """What learns touches one by one, and says of others which material they are of."""
+
+    def observe(self, material: str, stream: Stream) -> object:
+        """Learn a touch."""
+
+    def name_of(self, stream: Stream) -> str:
+        """The material of a touch, one of those learned."""
+
+
+class WidestFeatures:
+    """Features of touches at the widest scale, each touch embedded once.
+
+    Raises InputError for an embedding whose answers rest on more than the widest scale that fits.
+    """
+
+    def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
+        reading = Reading.of(sensor, embedding)
+        if reading.judged != "widest" or reading.beginning or reading.noisy:
+            raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
+        self.embedding = embedding
+        self._reading = reading
+        self._perception = Perception(sensor, embedding, reading, None)
+        self._kept: dict[bytes, npt.NDArray[np.floating]] = {}
+
+    def __call__(self, stream: Stream) -> npt.NDArray[np.floating]:
+        """Features of a touch's windows, (windows, d), the widest scale's. Raises InputError for a shorter touch."""
+        if stream.key not in self._kept:
+            image = tactile_image(stream)
+            width = self._reading.widths[-1]
+            if image.shape[1] < width:
+                raise InputError(f"expected touches of {width} readings or more; came one of {image.shape[1]}")
+            features = self._perception.features(image, [width])[width]
+            self._kept[stream.key] = features[self._reading.places(image.shape[1])[width]]
+        return self._kept[stream.key]
+
+
+class WidestReadout:
+    """A `TactileLearner` with LDA, of touches that are all whole, and an embedding that judges by the widest scale.
+
+    It says the same materials: narrower windows have no say there. It spares embedding them, which for a network is
+    four fifths of the work, and the calibration, which changes no ranking.
+
+    features: of touches, kept and shared by as many readouts as there are draws.
+    """
+
+    def __init__(self, features: WidestFeatures) -> None:
+        self._features = features
+        self._statistics = Statistics(features.embedding.dimension, (0,))
+        self._selection: Selection | None = None
+
+    def observe(self, material: str, stream: Stream) -> None:
+        """See `Feeler.observe`."""
+        codes = to_codes(self._features(stream), self._features.embedding.bound)
+        self._statistics.add(material, fold_of(stream.key), {0: codes})
+        self._selection = None
+
+    def name_of(self, stream: Stream) -> str:
+        """See `Feeler.name_of`. Raises InputError before anything was learned."""
+        with one_thread():
+            self._selection = self._selection or select(self._statistics, 0, "lda")
+        if self._selection is None:
+            raise InputError("expected a readout that has learned something; it has not. Call observe first")
+        mean = in_units(self._features(stream), self._features.embedding.bound).mean(axis=0)
+        readout = self._selection.readout
+        return self._selection.names[int(readout.scores(readout.project(mean), "lda").argmax())]
+
+
+class _Learner:
+    """A `TactileLearner` as a Feeler."""
+
+    def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
+        self._learner = TactileLearner(sensor=sensor, embedding=embedding, exemplars=0)
+        self.observe = self._learner.observe
+
+    def name_of(self, stream: Stream) -> str:
+        return str(self._learner.predict(stream).material)
+
+
+def feeler_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], Feeler]:
+    """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that says the same."""
+    if Reading.of(sensor, embedding).judged == "widest":
+        features = WidestFeatures(sensor, embedding)
+        return lambda: WidestReadout(features)
+    return lambda: _Learner(sensor, embedding)
+
+
+def draw_touches(recordings: Recordings, fold: int, seed: int, draw: int) -> dict[str, list[list[int]]]:
+    """Material → its touches outside a fold, in an order that a seed draws; each the places of its recordings.
+
+    Frames of one video are one touch. Another draw is another order; the same draw is the same whatever is learned.
+    Raises InputError for a fold that is not there, or that leaves a material without touches.
+    """
+    if fold not in recordings.fold:
+        there = sorted(set(recordings.fold.tolist()))
+        raise InputError(f"expected a fold of {recordings.name} out of {there}; came {fold}")
+    touches: dict[str, dict[tuple[int, int], list[int]]] = {name: {} for name in sorted(set(recordings.materials))}
+    for at in np.flatnonzero(recordings.fold != fold).tolist():
+        mark = (int(recordings.fold[at]), int(recordings.repetition[at]))
+        touches[recordings.materials[at]].setdefault(mark, []).append(at)
+    drawn: dict[str, list[list[int]]] = {}
+    for place, (name, own) in enumerate(touches.items()):
+        if not own:
+            raise InputError(f"expected touches of {name!r} of {recordings.name} outside of fold {fold}; there is none")
+        groups = list(own.values())
+        order = np.random.default_rng([seed, fold, draw, place]).permutation(len(groups))
+        drawn[name] = [groups[at] for at in order]
+    return drawn
+
+
+def few_touches(
+    recordings: Recordings,
+    fold: int,
+    make: Callable[[], Feeler],
+    counts: Sequence[int],
+    draws: int,
+    seed: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Right answers on a fold after so many touches of each material from the others, for several draws of these.
+
+    Returns tested, the number of recordings asked about, and by count: right, one number a draw, and taught, the mean
+    number of touches of a material. A count that no material has is left out; a material that has fewer gives all.
+    """
+    exam = np.flatnonzero(recordings.fold == fold).tolist()
+    drawn = [draw_touches(recordings, fold, seed, draw) for draw in range(draws)]
+    most = max(len(own) for own in drawn[0].values())
+    stops = [count for count in sorted(counts) if count <= most]
+    right: dict[str, list[int]] = {str(count): [] for count in stops}
+    taught = {str(count): float(np.mean([min(count, len(own)) for own in drawn[0].values()])) for count in stops}
+    for draw, touches in enumerate(drawn):
+        feeler, begun = make(), 0
+        for stop in stops:
+            lessons = [(name, at) for name, own in touches.items() for group in own[begun:stop] for at in group]
+            total = len(lessons) + len(exam)
+            what = f"draw {draw + 1} of {draws}, {stop} touches"
+            for done, (name, at) in enumerate(lessons):
+                feeler.observe(name, recordings.streams[at])
+                progress(what, done + 1, total)
+            hits = 0
+            for done, at in enumerate(exam):
+                hits += feeler.name_of(recordings.streams[at]) == recordings.materials[at]
+                progress(what, len(lessons) + done + 1, total)
+            right[str(stop)].append(hits)
+            begun = stop
+    return {"tested": len(exam), "right": right, "taught": taught}

@@ -1,0 +1,85 @@
+"""`scroll-tactile describe` and `compose`: what the materials of a memory on disk are made of."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from scroll_tactile.cli.everyday import MemoryFolder, StreamFile
+from scroll_tactile.cli.terminal import console, percent, say
+from scroll_tactile.errors import DescriptionError
+from scroll_tactile.pipelines.memories import open_memory
+from scroll_tactile.recordings.arrays import read_stream
+
+__all__ = ["compose", "describe"]
+
+WORDS = {"yes": True, "no": False, "unknown": None}
+
+
+def describe(
+    memory: MemoryFolder,
+    material: Annotated[str, typer.Argument(help="A material, felt or not yet.", show_default=False)],
+    constituents: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown. None: what was said "
+            "before is taken back.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
+    told = dict(_constituent(one) for one in constituents or [])
+    with open_memory(memory) as learner:
+        learner.describe(material, told or None)
+        felt = learner.materials.get(material, 0)
+    said = "what it is made of is taken back" if not told else f"made of {', '.join(map(escape, told))}"
+    say(f"{escape(material)}: {said}; felt {felt} time{'s' * (felt != 1)}")
+
+
+def _constituent(text: str) -> tuple[str, float | bool | None]:
+    name, sign, value = text.rpartition("=")
+    if value in WORDS and sign:
+        return name.strip(), WORDS[value]
+    try:
+        return name.strip(), float(value if sign else "")
+    except ValueError:
+        raise DescriptionError(
+            f"expected a constituent as NAME=SHARE, such as wool=0.65, or NAME=yes, no or unknown; came {text!r}"
+        ) from None
+
+
+def compose(
+    memory: MemoryFolder,
+    file: StreamFile,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
+    readings = read_stream(file)
+    with open_memory(memory, mode="read") as learner:
+        made_of = learner.compose(readings)
+    if as_json:
+        found = [
+            {
+                "constituent": one.name,
+                "presence": one.presence,
+                "share": one.share,
+                "evidence": one.evidence,
+                "unlearned": one.unlearned,
+            }
+            for one in made_of.constituents
+        ]
+        answer = {"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material}
+        typer.echo(json.dumps(answer, ensure_ascii=False))
+        return
+    table = Table("constituent", "there with", "share", "feels most like")
+    for one in made_of.constituents:
+        there = escape(one.unlearned) if one.presence is None else percent(one.presence)
+        share = "" if one.share is None else percent(one.share)
+        table.add_row(escape(one.name), there, share, escape(one.evidence[0][0]) if one.evidence else "")
+    console().print(table)
+    say(f"a material never felt: {percent(made_of.unfamiliar)}")

@@ -1,0 +1,1 @@
+"""Fine-tuning: the optional pass over the exemplars that makes f*."""

@@ -1,0 +1,114 @@
+"""Descriptions: what materials are made of, as far as it is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from scroll_tactile.errors import DescriptionError
+from scroll_tactile.settings import LONGEST_NAME
+
+__all__ = ["Description", "Target", "checked", "require_constituents", "targets_of"]
+
+Description = dict[str, float | bool | None]
+"""Constituent → its share by mass; or whether it is there, where it is no mass; or None where that is unknown."""
+
+SLACK = 1e-6  # of shares that are to sum to one: thirds of six digits pass, a forgotten percent does not
+
+
+def checked(material: str, constituents: Mapping[str, Any]) -> Description:
+    """A description as it is kept: in alphabetical order, shares as floats.
+
+    Raises DescriptionError for no constituents, names that cannot be used, values that are neither shares nor truth
+    values, shares that are negative or not finite, and shares that do not sum to one (with None among the values: that
+    sum to more).
+    """
+    where = f"the description of {material!r}"
+    if not isinstance(constituents, Mapping):
+        raise DescriptionError(
+            f"expected {where} as a mapping from constituents to shares, such as {{'wool': 0.35, 'viscose': 0.65}}; "
+            f"came {type(constituents).__name__} {constituents!r:.60}"
+        )
+    if not constituents:
+        raise DescriptionError(f"expected at least one constituent in {where}; came none. None takes it away")
+    for name in constituents:
+        if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
+            raise DescriptionError(
+                f"expected constituents in {where} as names of 1 to {LONGEST_NAME} printable characters; came {name!r}"
+            )
+    kept = {name: _value(where, name, value) for name, value in sorted(constituents.items())}
+    shares = [value for value in kept.values() if isinstance(value, float)]
+    total, unknown = math.fsum(shares), None in kept.values()
+    if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
+        raise DescriptionError(
+            f"expected the shares in {where} to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. "
+            "Name all constituents, or give None for those whose share is unknown"
+        )
+    return kept
+
+
+def _value(where: str, name: str, value: Any) -> float | bool | None:
+    if value is None or isinstance(value, bool | np.bool_):
+        return None if value is None else bool(value)
+    if not isinstance(value, Real):
+        raise DescriptionError(
+            f"expected a share from 0 to 1, True, False or None for {name!r} in {where}; came {value!r:.60}"
+        )
+    share = float(value)
+    if not math.isfinite(share) or share < 0 or share > 1 + SLACK:
+        raise DescriptionError(
+            f"expected a share from 0 to 1 for {name!r} in {where}; came {share:g}"
+            + (". Shares are parts of one, not percent" if 1 < share <= 100 else "")
+        )
+    return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
+
+
+def require_constituents(wanted: Collection[str], known: Collection[str]) -> list[str]:
+    """The constituents that are asked for, in alphabetical order.
+
+    Raises DescriptionError for one that no description names, or none.
+    """
+    if isinstance(wanted, str):
+        raise DescriptionError(f"expected constituents as a sequence of names; came the string {wanted!r}")
+    missing = sorted(set(wanted) - set(known))
+    if missing or not wanted:
+        raise DescriptionError(f"expected constituents out of {sorted(known)}; came {missing or 'none'}")
+    return sorted(set(wanted))
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is known of one constituent.
+
+    presence: material → whether it has it. share: material → its share by mass. A material of which it is unknown is
+    in neither.
+    """
+
+    presence: dict[str, bool]
+    share: dict[str, float]
+
+
+def targets_of(descriptions: Mapping[str, Description]) -> dict[str, Target]:
+    """Constituent → what is known of it, both in alphabetical order.
+
+    A material whose shares sum to one has nothing else that is a mass: a constituent of which any material has a share
+    is absent from it, with a share of 0, where it is not named.
+    """
+    names = sorted({name for one in descriptions.values() for name in one})
+    masses = {name for one in descriptions.values() for name, value in one.items() if isinstance(value, float)}
+    targets = {name: Target({}, {}) for name in names}
+    for material, one in sorted(descriptions.items()):
+        whole = any(isinstance(value, float) for value in one.values()) and None not in one.values()
+        for name in names:
+            value = one.get(name, 0.0 if whole and name in masses else None)
+            if isinstance(value, bool):
+                targets[name].presence[material] = value
+            elif value is not None:
+                targets[name].presence[material] = value > 0
+                targets[name].share[material] = value
+    return targets

@@ -1,0 +1,342 @@
+"""A memory and the store that keeps it: each change is durable before it is told, and there whole or not at all."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
+from scroll_tactile.memory.rows import Codes, pack_codes, spans
+from scroll_tactile.memory.state import DESCRIBE, OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
+from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.prediction.following import Added
+from scroll_tactile.results import Compacted, Merged, Receipt
+from scroll_tactile.signals.stream import Stream
+from store import ReadOnlyError, Record, Store, StoreClosedError, StoreError
+
+__all__ = ["Ledger"]
+
+logger = logging.getLogger(__name__)
+
+MOST_ADDED = 256  # touches to be followed: more of them are dearer than fitting again
+SNAPSHOT_EVERY = 1024  # rows between generations: replaying so many takes about a second on opening
+
+
+class Ledger:
+    """The memory of one learner, and what is written down of it.
+
+    load: makes the memory as it is in the store, or an empty one where there is no store. lock: held by whoever looks
+    at the memory or changes it. version: another number after each change of what was felt, and only then. described:
+    likewise of what is said of materials. added: the observations
+    since it was last cleared, where `follow` says that they are wanted; None where anything else has changed.
+    """
+
+    def __init__(self, load: Callable[[], Memory], store: Store | None = None) -> None:
+        self.store = store
+        self.lock = threading.RLock()
+        self.version = 0
+        self.described = 0
+        self.follow = False
+        self.added: list[Added] | None = []
+        self._load = load
+        self._memory = load()
+        self._saved = self._memory.saved
+        self._closed = False
+        self._whole = True
+        self._batching = False
+
+    @property
+    def memory(self) -> Memory:
+        """The memory; read anew from the store where ctrl-C, say, came in the middle of a change.
+
+        Raises ScrollTactileError where there is no store to read it from.
+        """
+        if not self._whole:
+            if self.store is None:
+                raise ScrollTactileError(
+                    "an observation was interrupted while it was added, and a memory without a path has nothing to go "
+                    "back to: make a new one"
+                )
+            self._memory = self._load()
+            self._changed()
+        return self._memory
+
+    def _changed(self, added: Added | None = None) -> None:
+        self._whole = True
+        self.version += 1
+        if added is None or (self.added is not None and len(self.added) >= MOST_ADDED):
+            self.added = None
+        elif self.follow and self.added is not None:
+            self.added.append(added)
+
+    def require_open(self) -> None:
+        """Raise StoreClosedError after `close`."""
+        if self._closed:
+            where = "in memory" if self.store is None else self.store.path
+            raise StoreClosedError(f"the memory {where} is closed: open its path again")
+
+    def require_store(self, doing: str) -> Store:
+        """The store. Raises InputError where there is none, and so no journal to go by."""
+        self.require_open()
+        if self.store is None:
+            raise InputError(
+                f"a memory without a path keeps no journal, and cannot {doing}: TactileLearner.open(path, ...) makes "
+                "one that does"
+            )
+        return self.store
+
+    def require_writing(self) -> None:
+        """Raise beforehand what would keep a generation from being written."""
+        self.require_open()
+        if self.store is None:
+            return
+        if self._batching:
+            raise InputError("no generation can be written in a batch: end it first")
+        if self.store.mode == "read":
+            raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
+        self._pass_over_failures(self.store)
+
+    def _pass_over_failures(self, store: Store) -> None:
+        try:
+            store.flush()
+        except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
+            logger.warning("%s: no generation could be written: %s", store.path, error)
+
+    def observe(self, material: str, felt: Stream, columns: int, codes: Codes) -> Receipt:
+        """Write an observation down, then add it."""
+        with self.lock:
+            self.require_open()
+            # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
+            self.memory.statistics.require_room(codes)
+            readings = felt.readings if self._memory.exemplars is not None else None
+            self._whole = False
+            sequence = self._written(material, felt.key, columns, codes, readings)
+            self._memory.add(material, felt.key, columns, codes, sequence, readings)
+            self._changed((material, codes))
+            self._snapshot_if_due()
+            durable = self.store is not None and not self._batching
+        return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, durable)
+
+    def _written(
+        self,
+        material: str,
+        key: bytes,
+        columns: int,
+        codes: Codes,
+        readings: npt.NDArray[np.float32] | None,
+    ) -> int:
+        if self.store is None:
+            return self._memory.sequence + 1
+        attributes, arrays = {"columns": columns}, pack_codes(codes)
+        if readings is not None:
+            # All, and not only those that are exemplars now: one taken back leaves its place to any other.
+            attributes["nbytes"], arrays[READINGS] = readings.nbytes, readings
+        try:
+            return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
+        except StoreError:
+            # The journal refused it and the memory never had it; but of a batch all is lost that was added before.
+            self._whole = not self._batching
+            raise
+
+    def describe(self, material: str, constituents: Description | None) -> None:
+        """As `TactileLearner.describe`, of what was checked."""
+        with self.lock:
+            self.require_open()
+            memory = self.memory
+            if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but says another thing
+                return
+            self._whole = False
+            if self.store is not None:
+                try:
+                    attributes = {"constituents": constituents}
+                    row = self.store.append(DESCRIBE, material, b"", attributes=attributes)
+                except StoreError:
+                    self._whole = not self._batching
+                    raise
+                memory.sequence = row.sequence
+            memory.describe(material, constituents)
+            self._whole = True
+            self.described += 1
+            self._snapshot_if_due()
+
+    def retract(self, receipt: Receipt | int) -> None:
+        """As `TactileLearner.retract`."""
+        with self.lock:
+            store = self.require_store("take anything back")
+            self._withdraw(store, [observation_of(store, self.memory, receipt)], "")
+
+    def forget(self, material: str) -> int:
+        """As `TactileLearner.forget`."""
+        with self.lock:
+            store = self.require_store("forget anything")
+            found = observations_of(store, self.memory, material)
+            self._withdraw(store, [store.record(sequence) for sequence in found], material)
+        return len(found)
+
+    def _withdraw(self, store: Store, taken: list[Record], material: str) -> None:
+        # In the memory first: what that reads again may be damaged, and once it is written down that they are taken
+        # back, every opening would have to read it.
+        store.base()
+        memory, sequences = self._memory, spans(record.sequence for record in taken)
+        before = memory.pool, memory.exemplars, memory.tuned
+        self._whole = False
+        try:
+            for record in taken:
+                memory.withdraw(record)
+            memory.refill(store)
+            row = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
+        except StoreError:
+            for record in taken:
+                memory.put_back(record)
+            memory.pool, memory.exemplars, memory.tuned = before
+            self._whole = not self._batching
+            raise
+        memory.sequence = row
+        memory.describe(material, None)
+        self._changed()
+        self._snapshot_if_due()
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """As `TactileLearner.batch`."""
+        with self.lock:
+            self.require_open()
+            if self.store is None or self._batching:
+                yield
+                return
+            raised: BaseException | None = None
+            self._batching = True
+            try:
+                with self.store.batch():
+                    try:
+                        yield
+                    except BaseException as error:  # not the store's: it would take all of the batch back
+                        raised = error
+            except BaseException:
+                self._whole = False
+                raise
+            finally:
+                self._batching = False
+            self._snapshot_if_due()
+            if raised is not None:
+                raise raised
+
+    def merge(
+        self,
+        path: str | os.PathLike[str],
+        shared: Literal["once", "twice"],
+        descriptions: Choice,
+        told: Callable[[str, int, int], object],
+    ) -> Merged:
+        """As `TactileLearner.merge`."""
+        with self.lock:
+            store, memory = self.require_store("merge"), self.memory
+            if self._batching:
+                raise InputError("a merge is a batch of its own: end the batch before it")
+            with Store.open(path, mode="read") as source:
+                incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
+                self._whole = False
+                with store.batch():
+                    added = incoming.append_to(store, memory, lambda done, of: told("merging", done, of))
+            self._changed()
+            self._snapshot_if_due()
+        return Merged(added, incoming.shared, len(incoming.descriptions))
+
+    def compact(self, keep: int) -> Compacted:
+        """As `TactileLearner.compact`."""
+        with self.lock:
+            store, memory = self.require_store("compact"), self.memory
+            upto = compaction_point(store, memory, keep)
+            before = sum(store.size().values())
+            self.require_writing()
+            if upto > memory.base:
+                self._snapshot()
+                base = memory.until(store, upto) if upto < memory.sequence else memory
+                arrays, attributes = base.to_arrays(base_at=upto)
+                self._whole = False  # should ctrl-C come when it is done already, what can be taken back is read anew
+                store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
+                memory.base = upto
+                memory.withdrawn = {sequence for sequence in memory.withdrawn if sequence > upto}
+                self._whole = True
+                give_back_scratch()
+            return Compacted(memory.base, before, sum(store.size().values()))
+
+    def refresh(self) -> bool:
+        """As `TactileLearner.refresh`."""
+        with self.lock:
+            self.require_open()
+            memory, store = self.memory, self.store
+            if store is None or store.mode == "write":
+                return False
+            if (store.newest, store.last) == (memory.generation, memory.sequence):
+                return False
+            # Anew, and not only the rows since: a fine-tune is in a new generation alone, and a compaction may have
+            # taken away what a retraction needs.
+            self._memory = self._load()
+            self._changed()
+            return True
+
+    def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, taken_back: int) -> None:
+        """Make f* the memory's, durably, where nothing was taken back of what it was made from.
+
+        made_from, upto, taken_back: the memory, its sequence and its count when the training began.
+        """
+        with self.lock:
+            self.require_writing()
+            memory = self.memory
+            if memory is not made_from or memory.taken_back != taken_back:
+                raise FineTuneError("what f* was being made from was taken back meanwhile: fine-tune again")
+            before = memory.tuned, memory.tuned_upto
+            memory.tuned, memory.tuned_upto = tuned, upto
+            try:
+                self._snapshot()
+            except BaseException:
+                # Ctrl-C may have come after the generation was current: closing writes the f* before again.
+                (memory.tuned, memory.tuned_upto), self._saved = before, -1
+                raise
+
+    def _snapshot_if_due(self) -> None:
+        if self.store is None or self._batching or self._memory.sequence - self._saved < SNAPSHOT_EVERY:
+            return
+        arrays, attributes = self._memory.to_arrays()
+        try:
+            chunks = self._memory.chunks()
+            self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes, chunks=chunks)
+        except StoreError as error:
+            # What was done is durable; only the next opening has more to replay.
+            logger.warning("%s: no generation could be written: %s", self.store.path, error)
+        self._saved = self._memory.sequence
+        del arrays
+        give_back_scratch()
+
+    def _snapshot(self) -> None:
+        if self.store is not None:
+            arrays, attributes = self._memory.to_arrays()
+            self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
+            self.store.commit(arrays, upto=self._saved, attributes=attributes, chunks=self._memory.chunks())
+
+    def close(self) -> None:
+        """As `TactileLearner.close`."""
+        with self.lock:
+            if self._batching:
+                raise InputError("a memory cannot be closed in a batch: end it first")
+            store, self._closed = self.store, True
+            if store is None:
+                return
+            try:
+                # Half a change is never saved: the journal has the whole of it, or nothing.
+                if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
+                    self._pass_over_failures(store)
+                    self._snapshot()
+            finally:
+                store.close()
+                give_back_scratch()

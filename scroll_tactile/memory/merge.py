@@ -1,0 +1,201 @@
+"""What was felt, as the journal tells it: which observations can be taken back, and how two memories become one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.rows import unspanned
+from scroll_tactile.memory.state import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory, hear
+from scroll_tactile.results import Receipt
+from store import Head, Record, Store
+
+__all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations_of", "withdrawn_in"]
+
+
+def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
+    """The journal's row of an observation that can be taken back.
+
+    Raises ObservationError where there is none, it was taken back before, or compacted.
+    """
+    sequence = receipt.sequence if isinstance(receipt, Receipt) else receipt
+    if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= store.last:
+        raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
+    if sequence in memory.withdrawn:
+        raise ObservationError(f"observation {sequence} of {store.path} was taken back already")
+    if sequence <= memory.base:
+        raise ObservationError(
+            f"observation {sequence} of {store.path} cannot be taken back: rows 1 to {memory.base} were compacted, and "
+            "their features given up"
+        )
+    record = store.record(sequence)
+    if record.kind != OBSERVE:
+        raise ObservationError(f"row {sequence} of {store.path} is no observation, but of kind {record.kind!r}")
+    if isinstance(receipt, Receipt) and (receipt.material, receipt.key) != (record.label, record.key):
+        raise ObservationError(
+            f"the receipt is of another memory: it says that observation {sequence} is of {receipt.material!r} "
+            f"({receipt.key.hex()[:12]}); in {store.path} it is of {record.label!r} ({record.key.hex()[:12]})"
+        )
+    return record
+
+
+def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
+    """The sequences of all observations of a material, ascending.
+
+    Raises UnknownMaterialError for one never felt, and ObservationError where some were compacted.
+    """
+    felt = memory.statistics.materials.get(material, 0)
+    if not felt:
+        raise UnknownMaterialError(f"{material!r} was never felt; felt were {list(memory.statistics.materials)[:30]}")
+    found = [head.sequence for head in memory.retractable(store, material)]
+    if len(found) != felt:
+        raise ObservationError(
+            f"{material!r} cannot be forgotten: {felt - len(found)} of its {felt} observations in {store.path} were "
+            "compacted, and their features given up. Retract the others one by one, by their receipts"
+        )
+    return found
+
+
+def compaction_point(store: Store, memory: Memory, keep: int) -> int:
+    """The last row to be compacted where the newest `keep` observations are to stay as they are."""
+    if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
+        raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
+    if keep == 0:
+        return store.last
+    sequences = [head.sequence for head in memory.retractable(store)]
+    return memory.base if len(sequences) <= keep else sequences[-keep] - 1
+
+
+Choice = Literal["same", "ours", "theirs"]
+"""Whose description of a material is kept where two memories have one each; "same": it must be the same."""
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """What another memory would bring: rows to be appended, in order.
+
+    rows: its heads. shared: streams that both felt. descriptions: those that are not ours already, by material.
+    Made by `Incoming.of`.
+    """
+
+    source: Store
+    rows: list[Head]
+    shared: int
+    descriptions: dict[str, Description]
+
+    @classmethod
+    def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool, descriptions: Choice) -> Incoming:
+        """Look through both journals.
+
+        once: leave out streams that both felt, of one material with one content hash. Raises MismatchError where
+        theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
+        shared stream cannot be left out.
+        """
+        _require_mergeable(ours, memory, theirs)
+        base, there = theirs.compacted, _standing(theirs)
+        known = {(head.label, head.key) for head in _standing(ours) if head.kind != MERGE}
+        both = [head for head in there if head.kind != MERGE and (head.label, head.key) in known]
+        fixed = [head for head in both if head.sequence <= base or head.kind == FELT]
+        if once and fixed:
+            raise ObservationError(
+                f"{len(fixed)} streams that both memories felt, such as one of {fixed[0].label!r}, cannot be counted "
+                f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
+                'or count them twice, with shared="twice"'
+            )
+        rows = there if not once else [head for head in there if (head.label, head.key) not in known]
+        bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
+        if bare and memory.exemplars is not None:
+            raise MismatchError(
+                f"{theirs.path} kept no readings of what it felt (exemplars=0), of which {ours.path} keeps "
+                "exemplars: feel it again, or merge into a memory made with exemplars=0"
+            )
+        return cls(theirs, rows, len(both), _descriptions(ours, memory, theirs, descriptions))
+
+    def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
+        """Append the rows to our journal and add them to our memory; the number of observations that came in.
+
+        The caller makes a batch of it, and tells `each` (rows done, rows in all) what is shown.
+        """
+        total = len(self.rows)
+        for material, one in self.descriptions.items():
+            memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": one}).sequence
+            memory.describe(material, one)
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._told(), start=1):
+            head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
+            if kind != FELT:
+                memory.replay(ours.record(head.sequence), ours)
+            memory.sequence = head.sequence
+            each(done, total)
+        return sum(head.kind in (OBSERVE, FELT) for head in self.rows)
+
+    def _told(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+        base = self.source.base()
+        if base is not None:
+            left_out = ("tuned", "descriptions")  # these come as rows of their own, where they do
+            attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
+            arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
+            yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
+        for head in self.rows:
+            if base is not None and head.sequence <= base.upto:
+                if head.kind != MERGE:  # a merge before the base is a part of it
+                    yield FELT, head.label, head.key, {}, None, head.time
+            else:
+                record = self.source.record(head.sequence)
+                yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
+
+
+def withdrawn_in(heads: Iterable[Head]) -> set[int]:
+    """All sequences that these rows took back."""
+    return {at for head in heads if head.kind == RETRACT for at in unspanned(head.attributes["sequences"])}
+
+
+def _standing(store: Store) -> list[Head]:
+    """The rows by which anything is known, compacted ones too, without what was ever taken back."""
+    heads = list(store.heads())
+    gone = withdrawn_in(heads)
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, FELT) and head.sequence not in gone]
+
+
+def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
+    """Their descriptions that are to come in."""
+    base = theirs.base()
+    said = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
+    for head in theirs.heads(0 if base is None else base.upto):
+        hear(said, head)
+    new = {name: one for name, one in sorted(said.items()) if repr(memory.descriptions.get(name)) != repr(one)}
+    differing = [name for name in new if name in memory.descriptions]
+    if differing and choice == "same":
+        name = differing[0]
+        raise MismatchError(
+            f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
+            f"here it is {memory.descriptions[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
+        )
+    return {name: one for name, one in new.items() if choice != "ours" or name not in memory.descriptions}
+
+
+def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
+    if ours.path.resolve() == theirs.path.resolve():
+        raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
+    for part in ("sensor", "embedding", "reading", "grid", "augmentation"):
+        mine, other = ours.identity.get(part), theirs.identity.get(part)
+        if mine != other:
+            raise MismatchError(
+                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is {_told_of(mine)}, "
+                f"there {_told_of(other)}. Merge memories of one sensor and one embedding"
+            )
+    whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
+    if whole and memory.exemplars is not None and ours.identity.get("exemplars") != theirs.identity.get("exemplars"):
+        raise MismatchError(
+            f"{theirs.path} was compacted and keeps exemplars {theirs.identity.get('exemplars')} (streams, bytes); "
+            f"{ours.path} keeps {ours.identity.get('exemplars')}, and those that are missing cannot be had back"
+        )
+
+
+def _told_of(part: Any) -> str:
+    if isinstance(part, dict):
+        fields = {name: value[:12] if name == "fingerprint" else value for name, value in part.items()}
+        return ", ".join(f"{name} {value!r}" for name, value in fields.items() if value is not None)
+    return repr(part)

@@ -1,0 +1,372 @@
+"""A memory: exact statistics, pool, exemplars and f*, and how they are kept in a store."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool
+from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
+from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.signals.windows import NOISY, Reading
+from scroll_tactile.statistics.sample import Pool, Touch
+from scroll_tactile.statistics.statistics import Statistics, fold_of
+from store import CompactedError, DamageError, Head, Record, Store
+
+__all__ = [
+    "DESCRIBE",
+    "FELT",
+    "MERGE",
+    "OBSERVE",
+    "READINGS",
+    "RETRACT",
+    "Capacity",
+    "Memory",
+    "give_back_scratch",
+    "hear",
+]
+
+logger = logging.getLogger(__name__)
+
+# The kinds of journal rows.
+OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kept, its readings are the arrays
+RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
+MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
+FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
+DESCRIBE = "describe"  # what a material is made of; the attribute "constituents" holds it, or null to take it away
+KINDS = [OBSERVE, RETRACT, MERGE, FELT, DESCRIBE]
+READINGS = "readings"  # the array of a row that keeps a stream raw
+ATTEMPTS = 20  # of a reader to read what a writer goes on changing
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Of the exemplar buffer: in streams, or in bytes of raw readings; 0 streams: nothing is kept raw."""
+
+    streams: int | None = 400
+    nbytes: int | None = None
+
+    def pool(self) -> ExemplarPool | None:
+        """An empty pool of this capacity; None where nothing is to be kept."""
+        return None if self.streams == 0 else ExemplarPool(self.streams, capacity_bytes=self.nbytes)
+
+
+class Memory:
+    """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
+
+    dimension: d. reading: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
+    tuned: f*, of the last fine-tune; None before one, or where what it was made from was taken back.
+    tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
+    excluded: of a base, the sequences up to it that had been taken back when it was made.
+    taken_back: how often anything was, since it was loaded.
+    descriptions: material → what it is made of, whether it was felt or not.
+    base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
+    saved: the last sequence that a generation is known to hold.
+    """
+
+    def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
+        self.reading = reading
+        self.capacity = capacity or Capacity()
+        self.statistics = Statistics(dimension, reading.scales)
+        self.pool = Pool()
+        self.exemplars = self.capacity.pool()
+        self.tuned: Tuned | None = None
+        self.tuned_upto = 0
+        self.withdrawn: set[int] = set()
+        self.excluded: set[int] = set()
+        self.base = 0
+        self.generation: int | None = None
+        self.saved = 0
+        self.sequence = 0
+        self.taken_back = 0
+        self.descriptions: dict[str, Description] = {}
+        self._stale = False
+
+    def add(
+        self,
+        material: str,
+        key: bytes,
+        columns: int,
+        codes: Codes,
+        sequence: int,
+        readings: npt.NDArray[np.float32] | None = None,
+    ) -> None:
+        """Add an observation: a touch of so many columns, its codes by scale, its readings where they are wanted.
+
+        Raises CapacityError before anything is added.
+        """
+        self.statistics.add(material, fold_of(key), codes, columns)
+        if self.pool.wants(material, key):
+            self.pool.add(material, key, self._touch(columns, codes))
+        if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key, readings.nbytes):
+            self.exemplars.add(Exemplar.of(material, key, readings, codes))
+        self.sequence = sequence
+
+    def replay(self, record: Record, store: Store) -> None:
+        """Do again what a journal row tells, without embedding anything again.
+
+        After the last row `refill` has to be called. Raises MismatchError for a row of a kind that this version
+        does not know.
+        """
+        hear(self.descriptions, record)
+        if record.kind == OBSERVE:
+            codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
+            self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
+        elif record.kind == RETRACT:
+            for sequence in unspanned(record.attributes["sequences"]):
+                if sequence > self.base:
+                    self.withdraw(store.record(sequence))
+                elif sequence not in self.excluded:  # not by `compact`, which leaves them out: by a repair
+                    logger.warning(
+                        "%s: observation %d was taken back by row %d, and is still in: its features were lost to "
+                        "damage. Only a copy from before the damage can be without it",
+                        store.path,
+                        sequence,
+                        record.sequence,
+                    )
+        elif record.kind == MERGE:
+            self._join(record.arrays, cast(dict[str, Any], record.attributes))
+        elif record.kind not in (FELT, DESCRIBE):
+            raise MismatchError(
+                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
+                f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
+            )
+        self.sequence = record.sequence
+
+    def describe(self, material: str, constituents: Any) -> None:
+        """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
+        _say(self.descriptions, material, constituents)
+
+    def withdraw(self, record: Record) -> None:
+        """Take an observation out of the sums; `refill` then mends the pools."""
+        material, key = record.label, record.key
+        self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
+        self.withdrawn.add(record.sequence)
+        self.taken_back += 1
+        if self.pool.depends_on(material, key) or (self.exemplars and self.exemplars.depends_on(material, key)):
+            self._stale = True
+        if record.sequence <= self.tuned_upto:
+            self.tuned = None
+
+    def retractable(self, store: Store, material: str | None = None) -> list[Head]:
+        """The observations in the journal, of one material or all, that can be taken back and were not; in order."""
+        rows = store.heads(self.base, kind=OBSERVE, label=material)
+        return [head for head in rows if head.sequence not in self.withdrawn]
+
+    def put_back(self, record: Record) -> None:
+        """Undo `withdraw` in the sums, exactly; the samples and f* are the caller's to put back."""
+        self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), _columns(record))
+        self.withdrawn.discard(record.sequence)
+        self._stale = False
+
+    def refill(self, store: Store) -> None:
+        """Choose pool and exemplars again, as if what was withdrawn had never been felt, where that can matter."""
+        if not self._stale:
+            return
+        touches = {(material, key): touch for material, key, touch in self.pool}
+        kept = {(one.material, one.key): one for one in self.exemplars or ()}
+        fresh = self._base_samples(store)
+        # No further than was read: a writer may have gone on since.
+        merged = [one for one in store.heads(self.base, kind=MERGE) if one.sequence <= self.sequence]
+        for head in merged:
+            record = store.record(head.sequence)
+            fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
+        heads = [one for one in self.retractable(store) if one.sequence <= self.sequence]
+        felt = [(one.label, one.key, cast(int, one.attributes.get("nbytes", 0)), one.sequence) for one in heads]
+
+        def touch(material: str, key: bytes, sequence: int) -> Touch:
+            if (there := touches.get((material, key))) is not None:
+                return there
+            record = store.record(sequence)
+            return self._touch(_columns(record), unpack_codes(record.arrays))
+
+        def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
+            return kept.get((material, key)) or _exemplar(store.record(sequence))
+
+        fresh.pool.refill(felt, touch)
+        self.pool = fresh.pool
+        if fresh.exemplars is not None:
+            fresh.exemplars.refill((one for one in felt if one[2]), exemplar)
+            self.exemplars = fresh.exemplars
+        self._stale = False
+
+    def _empty(self) -> Memory:
+        """Another memory of the same making."""
+        return Memory(self.statistics.dimension, self.reading, self.capacity)
+
+    def _base_samples(self, store: Store) -> Memory:
+        """A memory with pool and exemplars of the base, empty ones without a base."""
+        fresh = self._empty()
+        if store.compacted != self.base:
+            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+        try:
+            base = store.base()
+        except DamageError as damage:
+            # Statistics need no base. Not to open for the samples' sake would lose more than they are.
+            logger.warning(
+                "%s; of what was compacted pool and exemplars now hold only what they held: repair it (scroll-tactile "
+                "memory repair)",
+                damage,
+            )
+            kinds = (OBSERVE, FELT)
+            compacted = {
+                (one.label, one.key) for one in store.heads() if one.sequence <= self.base and one.kind in kinds
+            }
+            fresh.pool.update({}, ((name, key, one, 0) for name, key, one in self.pool if (name, key) in compacted))
+            if fresh.exemplars is not None:
+                for one in self.exemplars or ():
+                    if (one.material, one.key) in compacted:
+                        fresh.exemplars.add(one)
+            return fresh
+        if base is not None:
+            fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
+        return fresh
+
+    def _touch(self, columns: int, codes: Codes) -> Touch:
+        stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
+        if all(scale in codes for scale in NOISY):  # the first noisy copy, at a stage behind all that a touch can reach
+            unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            stages += [*unreached, {scale: [0] for scale in NOISY}]
+        return Touch.of(stages, codes)
+
+    def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+        """Add all that another memory of the same making held: arrays and attributes of one of its generations."""
+        other = self._empty()
+        other._take(arrays, attributes)
+        self.statistics = self.statistics + other.statistics
+        self.pool.update({}, ((material, key, touch, 0) for material, key, touch in other.pool))
+        if self.exemplars is not None and other.exemplars is not None:
+            self.exemplars.update(other.exemplars)
+
+    def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be taken back."""
+        arrays, names = self.statistics.to_arrays()
+        pooled, materials = self.pool.to_arrays()
+        attributes: dict[str, Any] = {
+            "dimension": self.statistics.dimension,
+            "scales": list(self.statistics.scales),
+            "materials": names,
+            "pool": materials,
+            "capacity": [self.capacity.streams, self.capacity.nbytes],
+            "tuned_upto": self.tuned_upto,
+            "descriptions": dict(sorted(self.descriptions.items())),
+        }
+        arrays |= pooled
+        # A base is gone on from with the rows behind it, which tell again what of them was taken back.
+        gone = sorted(self.withdrawn if base_at is None else ())
+        out = [sequence for sequence in sorted(self.withdrawn) if base_at is not None and sequence <= base_at]
+        arrays["withdrawn"], arrays["excluded"] = np.array(gone, dtype=np.int64), np.array(out, dtype=np.int64)
+        for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
+            if part is not None:
+                its_arrays, attributes[name] = part.to_arrays()
+                arrays |= its_arrays
+        return arrays, attributes
+
+    def chunks(self) -> dict[str, int]:
+        """Rows in a chunk, of the arrays that are read piece by piece: one exemplar of the usual length is one read."""
+        lengths = [] if self.exemplars is None else [len(one.readings) for one in self.exemplars]
+        return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
+
+    @classmethod
+    def load(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None = None) -> Memory:
+        """The memory that a store holds: its newest generation, then the journal's rows after it."""
+        for _ in range(ATTEMPTS - 1):
+            newest = store.newest
+            try:
+                memory = cls._loaded(store, dimension, reading, capacity)
+            except CompactedError:  # a writer compacted it between two looks of this reader
+                continue
+            # A generation that came between the looks may hold an f* from before the rows that were read.
+            if store.newest == newest:
+                return memory
+        return cls._loaded(store, dimension, reading, capacity)
+
+    @classmethod
+    def _loaded(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None) -> Memory:
+        memory = cls(dimension, reading, capacity)
+        memory.base = store.compacted
+        # Where no generation verifies the base's own error says what is lost; without one all rows are there.
+        generation = store.latest() or store.base()
+        if generation is not None:
+            memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
+            memory.sequence = memory.saved = generation.upto
+            memory.generation = generation.number
+        replayed = 0
+        for record in store.records(after=memory.sequence):
+            memory.replay(record, store)
+            replayed += 1
+        memory.refill(store)
+        logger.info(
+            "%s: generation %s, %d rows of the journal replayed, %d compacted",
+            store.path,
+            memory.generation,
+            replayed,
+            memory.base,
+        )
+        return memory
+
+    def until(self, store: Store, upto: int) -> Memory:
+        """The memory of the observations up to `upto` that were not taken back since: what a base there holds."""
+        memory = self._empty()
+        memory.base, memory.sequence = self.base, self.base
+        if (base := store.base()) is not None:
+            memory._take(base.arrays, cast(dict[str, Any], base.attributes))
+        for record in store.records(after=self.base):
+            if record.sequence > upto:
+                break
+            if record.kind == RETRACT:
+                hear(memory.descriptions, record)
+            elif record.sequence not in self.withdrawn:
+                memory.replay(record, store)
+        memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
+        return memory
+
+    def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+        names, scales = attributes["materials"], self.reading.scales
+        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
+        self.pool = Pool.from_arrays(arrays, attributes["pool"])
+        if self.exemplars is not None and "exemplars" in attributes:
+            self.exemplars = ExemplarPool.from_arrays(
+                arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
+            )
+        self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
+        self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
+        if "tuned" in attributes:
+            self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+
+
+def hear(descriptions: dict[str, Description], row: Head | Record) -> None:
+    """Take in what a journal row says that materials are made of; one that is forgotten takes its description along."""
+    if row.kind in (DESCRIBE, RETRACT):  # of which a retraction has no constituents, and a label where all is forgotten
+        _say(descriptions, row.label, row.attributes.get("constituents"))
+
+
+def _say(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
+    if constituents is None:
+        descriptions.pop(material, None)
+    else:
+        descriptions[material] = dict(constituents)
+
+
+def _columns(record: Record) -> int:
+    return cast(int, record.attributes["columns"])
+
+
+def _exemplar(record: Record) -> Exemplar:
+    return Exemplar.of(record.label, record.key, record.arrays[READINGS], unpack_codes(record.arrays))
+
+
+def give_back_scratch() -> None:
+    """Return freed memory to the system where the C library can: fitting and saving leave 40 MB of it."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)

@@ -1,0 +1,1 @@
+"""Prediction: from a touch to an answer."""

@@ -1,0 +1,77 @@
+"""A model that follows a memory between two fits: the readouts are those of all that was felt, to rounding.
+
+Choosing λ and calibrating takes a dozen factorisations a scale. Where observing and asking alternate, that is done
+again only when the memory has grown by a share; in between the readouts are updated row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.prediction.model import Model
+from scroll_tactile.readouts.recursive import Recursive
+from scroll_tactile.readouts.selection import Selection
+from scroll_tactile.readouts.tracking import Follower, Tracked
+from scroll_tactile.signals.windows import CHANNELS
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
+
+__all__ = ["Added", "Following", "SolverName"]
+
+SolverName = Literal["exact", "recursive"]
+FOLLOWERS: dict[SolverName, type[Follower]] = {"exact": Tracked, "recursive": Recursive}
+
+Added = tuple[str, dict[int, npt.NDArray[np.int32]]]
+"""A material, and the codes of a touch of it by scale."""
+
+
+class Following:
+    """What a model that was fitted to a memory becomes as touches are added.
+
+    model: fitted to the memory as it is now. refit: the share by which the memory may grow before `follow` refuses.
+    solver: "exact", against a factor of the exact statistics, or "recursive", by the paper's recursion.
+    """
+
+    def __init__(self, model: Model, memory: Memory, refit: float, solver: SolverName) -> None:
+        self.model = model
+        self._follower = FOLLOWERS[solver]
+        self._felt = sum(memory.statistics.materials.values())
+        self._most = (1 + refit) * self._felt
+        self._tracked: dict[int, Follower] = {}
+
+    def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
+        """Take in the touches that were added since; False where the model has to be fitted again.
+
+        memory: as it is with them.
+        """
+        statistics = memory.statistics
+        self._felt += len(added)
+        judging = [scale for scale in statistics.scales if scale != CHANNELS]
+        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in judging):
+            return False
+        with one_thread():
+            self.model = replace(self.model, selections=self._followed(statistics, added))
+        return True
+
+    def _followed(self, statistics: Statistics, added: Sequence[Added]) -> dict[int, Selection]:
+        selections = dict(self.model.selections)
+        for scale, selection in selections.items():
+            rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]
+            if not rows:
+                continue
+            if (tracked := self._tracked.get(scale)) is None:
+                tracked = self._tracked[scale] = self._follower(statistics, scale, selection.readout)
+            elif not all(tracked.add(codes, place) for place, codes in rows):
+                tracked.anchor(statistics)
+            selections[scale] = replace(selection, readout=tracked.readout())
+        return selections
+
+    def _names(self, scale: int) -> list[str]:
+        selection = self.model.selections.get(scale)
+        return [] if selection is None else selection.names

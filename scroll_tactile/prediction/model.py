@@ -1,0 +1,149 @@
+"""The model: everything that predictions need of one state of a memory, computed from it and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
+from scroll_tactile.readouts.readout import ReadoutName
+from scroll_tactile.readouts.selection import PENALTIES, Selection, select
+from scroll_tactile.signals.windows import CHANNELS, NOISY, Reading
+from scroll_tactile.statistics.moments import one_thread
+
+__all__ = ["Judgement", "Model"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """probability: of each candidate, shape (C,). novelty: see Prediction. calibration: of the stage judged at."""
+
+    probability: FloatArray
+    novelty: float
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class Model:
+    """names: the materials. selections: scale → its readout. stages: for each, the scales that judge there.
+
+    noisy: of touches felt through noise; None where none were learned.
+    """
+
+    kind: ReadoutName
+    names: list[str]
+    reading: Reading
+    stages: list[list[int]]
+    selections: dict[int, Selection]
+    calibrations: list[Calibration]
+    noisy: Calibration | None = None
+
+    @classmethod
+    def of(cls, memory: Memory, kind: ReadoutName) -> Model:
+        """Fit the readouts of a memory and calibrate them."""
+        statistics = memory.statistics
+        scales = statistics.scales
+        stages = [memory.reading.judging(length) for length in memory.reading.milestones()]
+        with one_thread():
+            penalties = memory.reading.penalties or PENALTIES
+            chosen = {scale: select(statistics, scale, kind, penalties) for scale in scales if scale != CHANNELS}
+            selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
+            calibrations = calibrate(memory.pool, stages, selections, kind)
+            noisy = None
+            if all(scale in selections for scale in NOISY):
+                noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISY], kind)
+        give_back_scratch()
+        return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations, noisy)
+
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """The widths of windows, ascending."""
+        return self.reading.widths
+
+    def is_last(self, columns: int) -> bool:
+        """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
+        return min(len(self.reading.stages(columns)), len(self.calibrations)) == len(self.stages)
+
+    def needed(self, candidates: Sequence[str], columns: int) -> list[int]:
+        """The scales whose windows judging these candidates for a touch of so many columns takes."""
+        decided = self._decided(candidates, len(self.reading.stages(columns)))
+        return sorted({scale for stage, _ in decided for scale in self.stages[stage]})
+
+    def judge(
+        self,
+        candidates: Sequence[str],
+        means: Mapping[int, FloatArray],
+        columns: int,
+        tuned: Mapping[str, float] | None = None,
+    ) -> Judgement:
+        """Weigh the candidates for a touch.
+
+        means: for each scale that is `needed` the touch's mean features in the codes' unit, (d,). columns: felt so far.
+        tuned: logits of f*, by material, in place of the last stage's scores.
+
+        Materials that were felt at fewer scales are weighed against all others at the stage that they share; what
+        these leave over is shared out among the others at the finer stages.
+        """
+        reached = len(self.reading.stages(columns))
+        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
+        probability, mass = np.ones(len(candidates)), 1.0
+        decided = self._decided(candidates, reached)
+        for at, (stage, members) in enumerate(decided):
+            names = [candidates[place] for place in members]
+            if tuned is not None and stage == len(self.stages) - 1:
+                logits = np.array([tuned[name] for name in names])
+            else:
+                logits = self._weighted(self.stages[stage], self.calibrations[stage], z, names)
+            chances = np.exp(logits - logits.max())
+            probability[members] = chances / chances.sum() * mass
+            later = decided[at + 1][1] if at + 1 < len(decided) else []
+            mass = float(probability[later].sum())
+        best = int(np.argmax(probability))
+        stage = max(stage for stage, members in decided if best in members)
+        calibration = self.calibrations[stage]
+        distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
+        return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
+
+    def judge_noisy(self, candidates: Sequence[str], means: Mapping[int, FloatArray]) -> Judgement:
+        """Weigh the candidates for a touch felt through noise; means: scale → its features in the codes' unit, (d,)."""
+        assert self.noisy is not None
+        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
+        logits = self._weighted(NOISY, self.noisy, z, candidates)
+        chances = np.exp(logits - logits.max())
+        novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISY]))
+        return Judgement(chances / chances.sum(), float(novelty), self.noisy)
+
+    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
+        """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
+        groups = [self._felt_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
+        return [
+            (stage, members)
+            for stage, members in enumerate(groups)
+            if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
+        ]
+
+    def _felt_at(self, scales: Sequence[int], candidates: Sequence[str]) -> list[int]:
+        """The places of the candidates that were felt at all of these scales."""
+        known = [self.selections[scale].places for scale in scales]
+        return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
+
+    def _weighted(
+        self, scales: Sequence[int], calibration: Calibration, z: Mapping[int, FloatArray], names: Sequence[str]
+    ) -> FloatArray:
+        logits = np.zeros(len(names))
+        for scale, weight in zip(scales, calibration.weights, strict=True):
+            selection = self.selections[scale]
+            places = [selection.places[name] for name in names]
+            logits += weight * selection.readout.scores(z[scale], self.kind)[places]
+        return logits
+
+    def _distance(self, scale: int, z: FloatArray, candidates: Sequence[str]) -> float:
+        selection = self.selections[scale]
+        places = np.array([selection.places[name] for name in candidates if name in selection.places])
+        return float(selection.readout.novelty(z, places))

@@ -1,0 +1,1 @@
+"""Readouts: classifiers computed from the statistics alone, and their calibration."""

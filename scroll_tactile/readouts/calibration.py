@@ -1,0 +1,163 @@
+"""From scores to probabilities, and from distances to "never felt this", by touches held out.
+
+Every touch of the pool is scored by the readouts of the folds that it is not in. On these scores one weight a
+scale is fitted (a temperature, and how far each scale is to be believed), and the novelty of materials that
+are known is measured. Both are functions of the statistics and the pool, so of what was felt and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.readouts.selection import Selection
+from scroll_tactile.statistics.sample import Pool
+from scroll_tactile.statistics.statistics import fold_of
+
+__all__ = ["FEWEST", "Calibration", "calibrate", "calibrate_stage", "fit_weights"]
+
+FloatArray = npt.NDArray[np.float64]
+
+FEWEST = 8  # held-out touches; with fewer, a stage keeps the weights and threshold that follow
+PRIOR_WEIGHT = {
+    "lda": 0.1,
+    "ridge": 10.0,
+}  # of the scores of all scales together: what both sensors' data come to
+PRIOR_TOUCHES = 0.5  # the prior counts as much as these
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the scores and distances of one stage are to be read.
+
+    weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
+    scale_novelty: mean and spread of each scale's novelty for known materials, shape (S, 2).
+    novelties: sorted standardised novelty of known, held-out touches, shape (touches,).
+    """
+
+    weights: FloatArray
+    scale_novelty: FloatArray
+    novelties: FloatArray
+
+    def novelty(self, distances: FloatArray) -> FloatArray:
+        """Standardised novelty, shape (…,), of distances by scale, shape (…, S)."""
+        mean, spread = self.scale_novelty.T
+        standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
+        return standard
+
+    def threshold(self, false_alarms: float) -> float:
+        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
+        if len(self.novelties) < FEWEST:
+            return UNMEASURED
+        # The conformal quantile: of n + 1 exchangeable touches no more than this share lies above it.
+        rank = int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
+        return float(self.novelties[rank - 1]) if rank <= len(self.novelties) else float(2 * self.novelties[-1])
+
+
+UNMEASURED = 5.0  # spreads: where too little could be held out to measure the distances of known touches
+
+
+def calibrate(
+    pool: Pool, stages: Sequence[Sequence[int]], selections: Mapping[int, Selection], kind: ReadoutName
+) -> list[Calibration]:
+    """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
+    return [
+        calibrate_stage(stage, pool, [selections[scale] for scale in scales], kind)
+        for stage, scales in enumerate(stages)
+        if all(scale in selections for scale in scales)
+    ]
+
+
+def calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName) -> Calibration:
+    """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
+    scores, targets, distances = _held_out(stage, pool, selections, kind)
+    prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
+    weights = fit_weights(scores, targets, prior)
+    if len(distances) < FEWEST:
+        return Calibration(weights, _assumed(selections), np.zeros(0))
+    spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
+    shape = np.stack([distances.mean(axis=0), spread], axis=1)
+    unsorted = Calibration(weights, shape, np.zeros(0)).novelty(distances)
+    # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
+    spread = shape[:, 1] * max(float(unsorted.std()), 1e-9)
+    shape = np.stack([shape[:, 0], spread], axis=1)
+    return Calibration(weights, shape, np.sort(Calibration(weights, shape, np.zeros(0)).novelty(distances)))
+
+
+def _held_out(
+    stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName
+) -> tuple[list[FloatArray], list[int], FloatArray]:
+    """Scores (scales, C') and target place of each held-out touch, and its distances (touches, scales)."""
+    scores: list[FloatArray] = []
+    targets: list[int] = []
+    distances: list[FloatArray] = []
+    for material, key, touch in pool:
+        means = touch.means(stage)
+        judged = None if means is None else _judge(means, material, fold_of(key), selections, kind)
+        if judged is not None:
+            scores.append(judged[0])
+            targets.append(judged[1])
+            distances.append(judged[2])
+    return scores, targets, np.array(distances).reshape(len(scores), len(selections))
+
+
+def _judge(
+    means: list[FloatArray], material: str, fold: int, selections: list[Selection], kind: ReadoutName
+) -> tuple[FloatArray, int, FloatArray] | None:
+    if any(fold not in selection.held_out for selection in selections):
+        return None
+    known = [[selection.names[at] for at in selection.held_out[fold][0]] for selection in selections]
+    common = sorted(set.intersection(*map(set, known)))
+    if material not in common or len(common) < 2:
+        return None
+    rows, distances = [], []
+    for scale, selection in enumerate(selections):
+        readout = selection.held_out[fold][1]
+        z = readout.project(means[scale])
+        rows.append(readout.scores(z, kind)[[known[scale].index(name) for name in common]])
+        distances.append(float(readout.novelty(z)))
+    return np.stack(rows), common.index(material), np.array(distances)
+
+
+def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray) -> FloatArray:
+    """Weights ≥ 0 of least held-out log loss, a convex problem, drawn to the prior where touches are few."""
+    if not scores:
+        return prior
+    groups: dict[int, list[int]] = {}
+    for at, one in enumerate(scores):
+        groups.setdefault(one.shape[1], []).append(at)
+    # Scores less the target's, (touches, scales, classes), for each number of classes.
+    gaps = [np.stack([scores[at] - scores[at][:, [targets[at]]] for at in members]) for members in groups.values()]
+
+    def loss(weights: FloatArray) -> tuple[float, FloatArray]:
+        value, slope = 0.0, np.zeros_like(weights)
+        for gap in gaps:
+            logits = np.einsum("tsc,s->tc", gap, weights)
+            top = logits.max(axis=1, keepdims=True)
+            chances = np.exp(logits - top)
+            total = chances.sum(axis=1, keepdims=True)
+            value += float((np.log(total) + top).sum())
+            slope += np.einsum("tsc,tc->s", gap, chances / total)
+        pull = weights / prior - 1
+        return value + PRIOR_TOUCHES * float(pull @ pull) / 2, slope + PRIOR_TOUCHES * pull / prior
+
+    fit = minimize(loss, prior, jac=True, bounds=[(0.0, None)] * len(prior), method="L-BFGS-B")
+    fitted: FloatArray = fit.x
+    return fitted
+
+
+def _assumed(selections: list[Selection]) -> FloatArray:
+    """Without held-out touches: the distances of the class means themselves, spread by their own mean size."""
+    shapes = []
+    for selection in selections:
+        readout: Readout = selection.readout
+        at_means = readout.novelty(readout.gram)  # row y of G is z at the mean of class y
+        typical = float(np.mean(at_means))
+        size = float(np.mean(np.diagonal(readout.gram)))
+        shapes.append([typical, max(size, 1e-9) / UNMEASURED])
+    return np.array(shapes)

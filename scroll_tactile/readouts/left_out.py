@@ -1,0 +1,67 @@
+"""What readouts that never felt a touch say of it, by taking its row out of the statistics.
+
+Readouts of folds know two thirds of what was felt, and are wrong more often than the one that answers; scores that
+are read as theirs deserve say too little. Let S = S_w + N λ V, W = N S⁻¹ Mᵀ and G = M W as in `readouts`. A row x of a
+material with n rows and mean m, u = x − m and q = uᵀ S⁻¹ u, leaves by
+
+    S⁻¹ + f S⁻¹ u uᵀ S⁻¹,  f = k / (1 − k q),  k = n / (n − 1)     (Sherman and Morrison 1950; Bartlett 1951)
+
+and its material's mean becomes m − u / (n − 1). With g = Wᵀ u / N all scores follow from G, g and q, so that the
+whole takes one factorisation. The ridge N λ V stays what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg.lapack import dpotrf, dpotrs
+
+from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
+from scroll_tactile.statistics.moments import one_thread, within_scatter
+from scroll_tactile.statistics.statistics import Statistics
+
+__all__ = ["left_out"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def left_out(
+    statistics: Statistics, scale: int, readout: Readout, rows: FloatArray, places: Sequence[int]
+) -> FloatArray:
+    """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been felt.
+
+    readout: of all the statistics of the scale. rows: in codes, shape (N, d), each one that was added to them.
+    places: of their materials among the readout's classes, each of two rows or more, shape (N,).
+
+    Raises numpy.linalg.LinAlgError where the scatter with its ridge is not positive definite to working precision.
+    """
+    counts, sums = statistics.totals(scale)
+    total = int(counts.sum())
+    _, means = centred_means(counts, sums)
+    at = np.asarray(places, dtype=np.intp)
+    apart = rows - readout.center - means[at]
+    system = within_scatter(statistics.total_second(scale), counts, sums)
+    system[np.diag_indices_from(system)] += readout.penalties
+    with one_thread():
+        factor, failed = dpotrf(np.asfortranarray(system), lower=0, overwrite_a=1)
+        require_definite(readout.penalty, failed)
+        solved, _ = dpotrs(factor, apart.T, lower=0)
+    length = np.einsum("nd,dn->n", apart, solved)
+    along, gram = apart @ readout.weights / total, readout.gram / total
+    each, count = np.arange(len(at)), counts[at].astype(np.float64)
+    gain = count / (count - 1)
+    gain = gain / (1 - gain * length)
+    # The products of the other materials' means with the row, then that of its own, which has lost it.
+    onto = gram[at] + along
+    reach = along.copy()  # S⁻¹ u on each mean
+    own, share = along[each, at], 1 / (count - 1)
+    onto[each, at] -= share * (own + length)
+    reach[each, at] -= share * length
+    sizes = np.tile(np.diagonal(gram), (len(at), 1))
+    sizes[each, at] += share * (share * length - 2 * own)
+    onto += (gain * (own + length))[:, None] * reach
+    sizes += gain[:, None] * np.square(reach)
+    scores: FloatArray = total * (onto - sizes / 2)
+    return scores

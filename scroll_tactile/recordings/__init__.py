@@ -1,0 +1,1 @@
+"""Recordings: streams in files."""

@@ -1,0 +1,1 @@
+"""Signals: streams of readings, their tactile images, windows, contact and augmentation."""

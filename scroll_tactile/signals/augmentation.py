@@ -1,0 +1,240 @@
+"""The paper's four augmentations of a tactile image, each a change in how the touch was made.
+
+The paper (Zandonati et al. 2023) flips tactile images along the data axis, resizes and crops them along time, and
+jitters them. Here all four act along time: the slide went the other way, faster or slower, for less long, over a
+noisier, drifting sensor. The channels keep their places: a sensor's electrodes do not move.
+
+Each takes an image (C, T) or a batch of images of one width, (…, C, T), and does the same to all of it; noise and drift
+are drawn for each image of a batch apart. `changed` puts any of them on a stream, and `Augmentation.streams` draws all
+four for each of several streams.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import Stream, fewest_readings, validate
+
+__all__ = ["Augmentation", "Change", "augment", "changed", "crop", "fit", "flip", "jitter", "resize"]
+
+Image = npt.NDArray[np.float32]
+
+KNOTS = 4  # of the drift: over a touch it turns once or twice, as warming and pressure do
+
+
+def flip(image: Image) -> Image:
+    """The touch made the other way: time reversed, same shape (…, C, T).
+
+    Raises InputError for another shape or type.
+    """
+    _require_image(image)
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def resize(image: Image, factor: float) -> Image:
+    """The touch made slower (factor > 1) or faster: T · factor columns, at least one, by linear interpolation.
+
+    The first and the last column stay. Raises InputError for a factor that is not finite and positive, or another
+    image than float32 of shape (…, C, T).
+    """
+    _require_image(image)
+    if not (math.isfinite(factor) and factor > 0):
+        raise InputError(f"expected a finite factor above 0 to resize by; came {factor}")
+    columns = image.shape[-1]
+    at = np.linspace(0, columns - 1, max(1, round(columns * factor)))
+    before = np.minimum(at.astype(np.int64), max(columns - 2, 0))
+    part = (at - before).astype(np.float32)
+    after = np.minimum(before + 1, columns - 1)
+    resized: Image = image[..., before] * (1 - part) + image[..., after] * part
+    return resized
+
+
+def crop(image: Image, start: int, columns: int) -> Image:
+    """The touch made for less long: `columns` columns from `start` on, shape (…, C, columns).
+
+    Raises InputError for columns that the image has not.
+    """
+    _require_image(image)
+    if start < 0 or columns < 1 or start + columns > image.shape[-1]:
+        raise InputError(f"expected a stretch of the image's {image.shape[-1]} columns; came {columns} from {start} on")
+    return np.ascontiguousarray(image[..., start : start + columns])
+
+
+def jitter(image: Image, noise: npt.NDArray[np.float32], drift: npt.NDArray[np.float32]) -> Image:
+    """The touch felt by a noisier, slowly drifting sensor: image + noise + drift, clipped to [-1, 1].
+
+    noise: shape (…, C, T). drift: shape (…, C, K), K values that are spread evenly over the touch with straight lines
+    between them. Both in units of the image, half the sensor's range. Raises InputError for other shapes or values
+    that are not finite.
+    """
+    _require_image(image)
+    if noise.shape != image.shape or drift.shape[:-1] != image.shape[:-1] or not drift.shape[-1]:
+        raise InputError(
+            f"expected noise of shape {image.shape} and drift of shape {image.shape[:-1]} and K, K of 1 or more; "
+            f"came {noise.shape} and {drift.shape}"
+        )
+    if not (np.isfinite(noise).all() and np.isfinite(drift).all()):
+        raise InputError("expected finite noise and drift; some values are NaN or infinite")
+    slow = resize(drift.astype(np.float32), image.shape[-1] / drift.shape[-1])
+    jittered: Image = np.clip(image + noise.astype(np.float32) + slow, np.float32(-1), np.float32(1))
+    return jittered
+
+
+def fit(image: Image, columns: int) -> Image:
+    """The image's first `columns` columns; where it has fewer it goes on as its mirror image, back and forth.
+
+    Raises InputError for less than one column.
+    """
+    _require_image(image)
+    if columns < 1:
+        raise InputError(f"expected 1 column or more to fit an image to; came {columns}")
+    length = image.shape[-1]
+    at = np.arange(columns) % (2 * length)
+    return np.ascontiguousarray(image[..., np.minimum(at, 2 * length - 1 - at)])
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one augmentation does; `apply` is a function of it and the image.
+
+    flip: whether time is reversed. speed: the factor of `resize`. keep: part of the columns that stays, in (0, 1].
+    place: where the rest is cut off, from 0 (all behind) to 1 (all in front). noise: standard deviation of the white
+    noise. drift: of the slow offset. seed: of the noise's and the drift's values.
+    """
+
+    flip: bool = False
+    speed: float = 1.0
+    keep: float = 1.0
+    place: float = 0.0
+    noise: float = 0.0
+    drift: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        numbers = {one.name: float(getattr(self, one.name)) for one in fields(self)}
+        if not all(map(math.isfinite, numbers.values())):
+            raise InputError(f"expected finite numbers; came {self}")
+        positive = self.speed > 0 and 0 < self.keep <= 1 and 0 <= self.place <= 1
+        if not positive or min(self.noise, self.drift, self.seed) < 0:
+            raise InputError(
+                f"expected a speed above 0, keep in (0, 1], place in [0, 1], and noise, drift and seed of 0 or more; "
+                f"came {self}"
+            )
+
+    def apply(self, image: Image, columns: int | None = None) -> Image:
+        """The changed image, float32 of shape (…, C, T'), in [-1, 1]; of `columns` columns where that is given.
+
+        Cut or continued by `fit` to that width. Raises InputError for another image than float32 of shape (…, C, T).
+        """
+        made = flip(image) if self.flip else image
+        made = resize(made, self.speed)
+        kept = max(1, round(made.shape[-1] * self.keep))
+        made = crop(made, round((made.shape[-1] - kept) * self.place), kept)
+        if columns is not None:
+            made = fit(made, columns)
+        rng = np.random.default_rng(self.seed)
+        slow = rng.standard_normal((*made.shape[:-1], KNOTS), dtype=np.float32) * np.float32(self.drift)
+        noise = rng.standard_normal(made.shape, dtype=np.float32) * np.float32(self.noise)
+        return jitter(made, noise, slow)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How strongly touches are changed.
+
+    flip: the probability of the other direction. speed: (least, most) factor, drawn evenly on a logarithmic scale.
+    keep: the least part of the touch that stays. noise, drift: the most, as standard deviations in units of the
+    image, half the sensor's range.
+
+    Raises InputError for strengths that cannot be.
+    """
+
+    flip: float = 0.5
+    speed: tuple[float, float] = (0.8, 1.25)
+    keep: float = 0.8
+    noise: float = 0.01
+    drift: float = 0.02
+
+    def __post_init__(self) -> None:
+        numbers = (self.flip, *self.speed, self.keep, self.noise, self.drift)
+        possible = all(map(math.isfinite, numbers)) and len(self.speed) == 2
+        possible = possible and 0 <= self.flip <= 1 and 0 < self.speed[0] <= self.speed[1] and 0 < self.keep <= 1
+        if not possible or min(self.noise, self.drift) < 0:
+            raise InputError(
+                f"expected a probability to flip, speeds 0 < least ≤ most, keep in (0, 1], noise and drift of 0 or "
+                f"more; came {self}"
+            )
+
+    def draw(self, rng: np.random.Generator) -> Change:
+        """One change of at most these strengths; it takes the same numbers from `rng` whatever they are."""
+        turned, speed, kept, place, noise, drift = rng.random(6)
+        least, most = self.speed
+        return Change(
+            flip=bool(turned < self.flip),
+            speed=float(least * (most / least) ** speed),
+            keep=float(1 - kept * (1 - self.keep)),
+            place=float(place),
+            noise=float(noise * self.noise),
+            drift=float(drift * self.drift),
+            seed=int(rng.integers(2**63)),
+        )
+
+    def augment(self, image: Image, rng: np.random.Generator, *, columns: int | None = None) -> Image:
+        """The image with all four changes, drawn from `rng`; see `Change.apply`."""
+        return self.draw(rng).apply(image, columns)
+
+    def streams(self, streams: Sequence[Stream], rng: np.random.Generator) -> list[Stream]:
+        """Each of N streams as another touch of its material would have given it, drawn from `rng` for each alone.
+
+        None is made shorter than the 0.1 s that a stream has to last: it goes on as its mirror image up to there.
+        Raises InputError for a camera's stream.
+        """
+
+        def one(stream: Stream) -> Stream:
+            return changed(stream, partial(_long_enough, self.draw(rng), fewest_readings(stream.sensor)))
+
+        return [one(stream) for stream in streams]
+
+
+def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
+    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
+
+    `changed(stream, flip)` is the slide the other way. Raises InputError for a camera's stream, and what `validate`
+    raises for what came out.
+    """
+    sensor = stream.sensor
+    if sensor.camera:
+        raise InputError(f"changes are of channels along time, and camera {sensor.name!r} takes whole frames")
+    image = change(tactile_image(stream)).T.astype(np.float64)
+    return validate(sensor.low + (image + 1) / 2 * (sensor.high - sensor.low), sensor)
+
+
+def _long_enough(change: Change, least: int, image: Image) -> Image:
+    made = change.apply(image)
+    return made if made.shape[-1] >= least else fit(made, least)
+
+
+def augment(image: Image, rng: np.random.Generator, *, columns: int | None = None) -> Image:
+    """A tactile image of shape (C, T) as another touch of the same material would have given it.
+
+    All four augmentations at their default strengths, drawn from `rng`; float32 of shape (C, columns) in [-1, 1],
+    without `columns` as wide as its speed and duration make it. Raises InputError for another image than float32 of
+    shape (C, T), or less than one column.
+    """
+    return Augmentation().augment(image, rng, columns=columns)
+
+
+def _require_image(image: Image) -> None:
+    if image.ndim < 2 or image.dtype != np.float32 or 0 in image.shape:
+        raise InputError(
+            "expected a tactile image, float32 of shape (C, T) with a column or more, or a batch of them; "
+            f"came {image.dtype} of shape {image.shape}. See tactile_image"
+        )

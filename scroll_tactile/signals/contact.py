@@ -1,0 +1,103 @@
+"""Which of a camera's frames count: those in which the gel is pressed, told by their difference from the gel at rest.
+
+The resting image is the first frame of every stream, or one that is given once and for all, or there is none and every
+frame counts; an embedding that reads frames says which, by its attribute `rest`. A frame is in contact where enough of
+it is brighter or darker than at rest, in any colour: a function of the stream alone, so that a memory is one, too.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError, NoContactError
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import scaled_down, tactile_image
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["Rest", "image_of", "in_contact", "pressed", "require_rest", "rest_of"]
+
+Rest = Literal["first"] | npt.NDArray[np.float32] | None
+
+# Of the range. The camera's noise, averaged over the cells of `_CELLS`, is below 1 % of it, the slow drift of its lamps
+# about that; of 1892 frames of GelSight in contact every one passes, against the median of them all.
+DIFFERENCE = 0.02
+AREA = 0.01  # of the frame, that has to differ
+_CELLS = (60, 80)  # at most, rows and columns that a frame is averaged to before it is compared
+MOST_FRAMES = 64  # in contact that are kept of a stream, evenly spread
+
+
+def rest_of(embedding: Any) -> Rest:
+    """The resting image that an embedding asks for; None for one that does not speak of it."""
+    rest: Rest = getattr(embedding, "rest", None)
+    return rest
+
+
+def require_rest(embedding: Any, sensor: Sensor) -> None:
+    """Raise InputError where an embedding of frames is to read channels, or its resting image is not the sensor's."""
+    if getattr(embedding, "reads_frames", False) and not sensor.camera:
+        raise InputError(
+            f"embedding {embedding.name!r} reads a camera's frames, and sensor {sensor.name!r} has "
+            f"{sensor.channels} channels: take Kernels()"
+        )
+    rest = rest_of(embedding)
+    if isinstance(rest, np.ndarray) and rest.shape != sensor.shape:
+        raise InputError(
+            f"expected a resting image of sensor {sensor.name!r} of shape {sensor.shape}; {embedding.name!r} has one "
+            f"of {rest.shape}"
+        )
+
+
+def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:
+    """Whether each frame is in contact, shape (T,); without a resting image all are, and the first never if it is that.
+
+    A frame is averaged to at most 60 × 80 cells; in contact, 1 % of them or more differ from the rest by 2 % of the
+    range or more in some colour.
+    """
+    frames = stream.readings
+    if rest is None:
+        return np.ones(len(frames), dtype=bool)
+    still = frames[0] if isinstance(rest, str) else rest
+    gap = np.abs(scaled_down(frames, *_CELLS) - scaled_down(still[None], *_CELLS)).max(axis=3)
+    span = np.float32(stream.sensor.high) - np.float32(stream.sensor.low)
+    differing = np.count_nonzero(gap >= np.float32(DIFFERENCE) * span, axis=(1, 2))
+    told: npt.NDArray[np.bool_] = differing >= max(1.0, AREA * gap[0].size)
+    return told
+
+
+def pressed(stream: Stream, rest: Rest) -> Stream:
+    """The stream of the frames in contact, at most 64, behind the first frame where that is the resting image.
+
+    What it gives it gives again for its own result.
+
+    Raises NoContactError where there are none.
+    """
+    if rest is None or not stream.sensor.camera:
+        return stream
+    touching = np.flatnonzero(in_contact(stream, rest))
+    if not len(touching):
+        still = "the first of them" if isinstance(rest, str) else "the one given"
+        raise NoContactError(
+            f"expected frames of sensor {stream.sensor.name!r} in contact; of {len(stream)} none differs from the "
+            f"resting image, {still}, by {DIFFERENCE:.0%} of the range on {AREA:.0%} of its area. Press the gel, begin "
+            "the stream before it is pressed, or take Frames(rest=None), to which every frame counts"
+        )
+    if len(touching) > MOST_FRAMES:
+        touching = touching[np.linspace(0, len(touching) - 1, MOST_FRAMES).round().astype(np.intp)]
+    kept = np.concatenate([[0], touching]) if isinstance(rest, str) else touching
+    if len(kept) == len(stream):
+        return stream
+    readings = stream.readings[kept]
+    readings.setflags(write=False)
+    return Stream(stream.sensor, readings, min(stream.clipped, readings.size))
+
+
+def image_of(stream: Stream, rest: Rest) -> npt.NDArray[np.float32]:
+    """The tactile image of a `pressed` stream: of its frames' difference from the resting image, where there is one."""
+    if rest is None or not stream.sensor.camera:
+        return tactile_image(stream)
+    if isinstance(rest, str):
+        return tactile_image(Stream(stream.sensor, stream.readings[1:]), stream.readings[0])
+    return tactile_image(stream, rest)

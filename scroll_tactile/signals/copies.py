@@ -1,0 +1,134 @@
+"""Augmented observation: a touch is learned together with copies of it as they would have been felt otherwise.
+
+The copies are drawn with a generator that is seeded by the touch's content hash, so that what is learned of a touch
+is a function of the touch: in any order, on any machine, at any time the same bits. Only the four operations that
+IEEE 754 rounds correctly are used, and no power or logarithm, whose last bit differs between machines.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.signals.augmentation import Image, crop, resize
+
+__all__ = ["Augmented", "hiss", "silence", "wander"]
+
+FEWEST = 2  # columns of a copy: a touch is not sped up until nothing of it is left
+
+
+def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
+    """The touch felt by a noisy sensor: uniform noise in ± `amplitude`, a share of the range; clipped to the range.
+
+    image: float32 of shape (C, T) in [-1, 1], twice the share. Every value has noise of its own.
+    """
+    noise = rng.random(image.shape, dtype=np.float32) * np.float32(2) - np.float32(1)
+    noisy: Image = np.clip(image + noise * np.float32(2 * amplitude), np.float32(-1), np.float32(1))
+    return noisy
+
+
+def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
+    """The touch felt with broken wires: a `share` of the channels, rounded, reads the low end of the range throughout.
+
+    image: float32 of shape (C, T) in [-1, 1]. Which channels are broken is drawn.
+    """
+    silent = image.copy()
+    silent[rng.permutation(len(image))[: round(share * len(image))]] = -1
+    return silent
+
+
+def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -> Image:
+    """The touch felt by a sensor that warms up: each channel's gain and zero change along a straight line.
+
+    image: float32 of shape (C, T) in [-1, 1]. From nothing at the beginning to, at the end, an offset of at most
+    `offset` of the range and a gain of at most 1 ± `gain` about the low end of the range, drawn for each channel;
+    clipped to the range.
+    """
+    along = np.linspace(0, 1, image.shape[1], dtype=np.float32)
+    drawn = rng.random((2, len(image), 1), dtype=np.float32) * np.float32(2) - np.float32(1)
+    change = (image + 1) * (drawn[0] * np.float32(gain)) + drawn[1] * np.float32(2 * offset)
+    wandered: Image = np.clip(image + change * along, np.float32(-1), np.float32(1))
+    return wandered
+
+
+@dataclass(frozen=True)
+class Augmented:
+    """Which copies a touch is observed with.
+
+    copies: how many that differ in all but noise, the same for every touch, so that each counts alike. speed: the most
+    that a copy is slower, or faster, as a factor of 1 or more. dead: the largest share of channels that read the low
+    end of the range. offset, gain: the most that a channel's zero (as a share of the range) and its gain drift by
+    until the end of the touch. noisy: how many copies more that differ in noise alone. noise: its largest amplitude,
+    uniform and as a share of the range; the least is a tenth of that.
+
+    thinned: whether the fastest copy has every n-th reading, n the whole part of `speed`, 2 or more. Readings of the
+    other copies lie between two of the touch's, and are smoothed by that as no sensor smooths.
+
+    The speeds are spread evenly over the copies, two of them faster for each that is slower: there is less of a fast
+    touch to be known by. A copy is no longer than the touch: what is slower is cut off there, as it is where it is
+    asked about.
+
+    Raises InputError for strengths that cannot be.
+    """
+
+    copies: int = 4
+    speed: float = 2.0
+    dead: float = 0.0
+    offset: float = 0.0
+    gain: float = 0.0
+    noisy: int = 0
+    noise: float = 1.0
+    thinned: bool = False
+
+    def __post_init__(self) -> None:
+        counts = (self.copies, self.noisy)
+        counted = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in counts)
+        strengths = (self.speed - 1, self.dead, self.offset, self.gain, self.noise)
+        possible = all(math.isfinite(one) and one >= 0 for one in strengths) and self.dead < 1
+        thinnable = self.speed >= 2 and self.copies > 0
+        if not counted or not possible or not sum(counts) or (self.thinned and not thinnable):
+            raise InputError(
+                f"expected 1 copy or more in all, a speed of 1 or more, dead in [0, 1), offset, gain and noise of 0 or "
+                f"more, and to be thinned a copy and a speed of 2 or more; came {self}"
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it in JSON's types, as a memory keeps it.
+
+        `thinned` only where it is asked for: memories from before it was there are of the same making as without it.
+        """
+        return {name: one for name, one in asdict(self).items() if name != "thinned" or one}
+
+    def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> tuple[list[Image], list[Image]]:
+        """The copies of a touch and its noisy copies, each float32 of shape (C, T') in [-1, 1], T' ≤ T.
+
+        The same for the same key. image: the tactile image of the touch, shape (C, T). key: its content hash, see
+        `Stream.key`.
+        """
+        rng = np.random.default_rng([1, int.from_bytes(key, "little")])
+        copies = [self._copy(image, at, rng) for at in range(self.copies)]
+        amplitudes = self.noise * (0.1 + 0.9 * rng.random(self.noisy))
+        return copies, [hiss(image, float(amplitude), rng) for amplitude in amplitudes]
+
+    def _copy(self, image: Image, at: int, rng: np.random.Generator) -> Image:
+        pace = (at + rng.random()) / self.copies
+        dead, offset, gain = rng.random(3)
+        copy = self._paced(image, pace) if at + 1 < self.copies or not self.thinned else self._thinned(image)
+        copy = wander(copy, offset * self.offset, gain * self.gain, rng)
+        return silence(copy, dead * self.dead, rng)
+
+    def _paced(self, image: Image, pace: float) -> Image:
+        much = (3 * pace - 1) / 2 if pace > 1 / 3 else 3 * pace
+        factor = 1 + much * (self.speed - 1)
+        columns = image.shape[1]
+        copy = resize(image, max(1 / factor if pace > 1 / 3 else factor, FEWEST / columns))
+        return crop(copy, 0, min(columns, copy.shape[1]))
+
+    def _thinned(self, image: Image) -> Image:
+        step = min(math.floor(self.speed), max(1, image.shape[1] // FEWEST))
+        return np.ascontiguousarray(image[:, ::step])

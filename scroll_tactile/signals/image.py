@@ -1,0 +1,79 @@
+"""From a stream to its tactile image: channels × time, in [-1, 1], what every embedding reads."""
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["scaled_down", "tactile_image", "three_planes"]
+
+# A frame is averaged down to this: finer than the relief that tells materials apart.
+_FRAME_ROWS, _FRAME_COLUMNS = 120, 160
+
+
+def tactile_image(stream: Stream, rest: npt.NDArray[np.float32] | None = None) -> npt.NDArray[np.float32]:
+    """Lay a stream out as an image of shape (C, T): float32, C-contiguous, without unit.
+
+    The sensor's range [low, high] is mapped to [-1, 1]. A sensor's n channels are the rows, its T readings
+    the columns.
+
+    A camera's frames are scanned as if they slid past: each is reduced by area averaging to at most 120 × 160,
+    its columns follow one another on the time axis, frame after frame, and its rows × 3 colours are the
+    channels. So C = 360 and T = 160 a frame for a GelSight, and an embedding that reads along time reads
+    texture across the frame. With a resting image, shape (height, width, 3), what is shown is the difference from it:
+    half the range brighter is 1, half darker −1.
+    """
+    readings = _scan(stream.readings) if stream.sensor.camera else stream.readings
+    low, high = np.float32(stream.sensor.low), np.float32(stream.sensor.high)
+    if rest is None:
+        # Low goes first, so that a narrow range far from zero keeps its digits.
+        image = np.subtract(readings.T, low, order="C")
+    else:
+        image = np.subtract(readings.T, np.tile(_scan(rest[None]).T, len(stream)), order="C")
+    image /= (high - low) / np.float32(2)
+    if rest is None:
+        image -= np.float32(1)
+    # Rounding may pass 1 by a unit in the last place.
+    return np.clip(image, np.float32(-1), np.float32(1), out=image)
+
+
+def three_planes(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Repeat a tactile image of shape (C, T) as three equal colour planes, shape (3, C, T), for `vision`.
+
+    Raises InputError if the image has not two axes.
+    """
+    if image.ndim != 2:
+        raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
+    return np.stack([image, image, image])
+
+
+def scaled_down(frames: npt.NDArray[np.float32], rows: int, columns: int) -> npt.NDArray[np.float32]:
+    """Frames (T, height, width, 3) averaged to at most so many rows and columns: (T, rows, columns, 3)."""
+    rows, columns = min(frames.shape[1], rows), min(frames.shape[2], columns)
+    small = np.empty((len(frames), rows, columns, 3), dtype=np.float32)
+    for at, frame in enumerate(frames):  # one by one: a second of frames in double precision is 180 MB
+        small[at] = _average(_average(frame, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
+    return small
+
+
+def _scan(frames: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Frames of shape (T, height, width, 3) as readings of shape (T · columns, rows · 3)."""
+    small = scaled_down(frames, _FRAME_ROWS, _FRAME_COLUMNS)
+    count, rows, columns = small.shape[:3]
+    return small.swapaxes(1, 2).reshape(count * columns, rows * 3)
+
+
+def _average(pixels: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floating]:
+    """Average the first axis down to `size` equal areas; a pixel that an edge divides counts in part.
+
+    Plain sums in a fixed order: the result depends on no thread count.
+    """
+    length = len(pixels)
+    if length == size:
+        return pixels
+    whole, rest = np.divmod(np.arange(size + 1) * length, size)
+    share = (rest / size).reshape(-1, *[1] * (pixels.ndim - 1))
+    divided = share * pixels[np.minimum(whole, length - 1)]  # of each edge's pixel, the part before the edge
+    sums = np.add.reduceat(pixels, whole[:-1], axis=0, dtype=np.float64)
+    return (sums - divided[:-1] + divided[1:]) * (size / length)

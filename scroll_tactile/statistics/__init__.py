@@ -1,0 +1,1 @@
+"""Exact statistics: integers on a fixed grid, with an algebra of +, − and ==."""

@@ -1,0 +1,157 @@
+"""The exact second moment of codes, and the scatter within classes formed from it without cancellation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg.blas import dsyrk
+from threadpoolctl import ThreadpoolController
+
+from scroll_tactile.errors import CapacityError
+from scroll_tactile.statistics.grid import BITS
+
+__all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "require_room", "within_scatter"]
+
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float64]
+
+MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
+BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
+LIMB = 22  # bits
+PIECE = 2**13  # entries of a triangle
+
+
+@lru_cache(maxsize=1)
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run BLAS on one thread: on busy cores two made a 2 ms Cholesky take up to 439 ms."""
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
+
+
+@lru_cache(maxsize=4)
+def _lower(dimension: int) -> npt.NDArray[np.intp]:
+    return np.flatnonzero(np.tri(dimension, dtype=bool))
+
+
+def require_room(rows: int, more: int) -> None:
+    """Raise CapacityError where a sum over `rows` rows and `more` of them might not be exact."""
+    if rows + more > MOST_ROWS:
+        raise CapacityError(
+            f"int64 sums of {BITS}-bit codes are exact for {MOST_ROWS} rows; there are {rows} and {more} came. "
+            "Start a new memory"
+        )
+
+
+class SecondMoment:
+    """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
+
+    Rows wait in a block of at most 512, whose product is formed by BLAS in float64: products of integers below
+    2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads.
+    """
+
+    def __init__(self, dimension: int) -> None:
+        self.dimension = dimension
+        self.rows = 0
+        self._packed: IntArray | None = None
+        self._waiting: npt.NDArray[np.int32] | None = None
+        self._count = 0
+
+    def add(self, codes: npt.NDArray[np.int32]) -> None:
+        """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
+        require_room(self.rows, len(codes))
+        for first in range(0, len(codes), BLOCK):
+            self._wait(codes[first : first + BLOCK])
+        self.rows += len(codes)
+
+    def _wait(self, codes: npt.NDArray[np.int32]) -> None:
+        if self._count + len(codes) > BLOCK:
+            self._flush()
+        if self._waiting is None:
+            self._waiting = np.empty((BLOCK, self.dimension), dtype=np.int32)
+        self._waiting[self._count : self._count + len(codes)] = codes
+        self._count += len(codes)
+
+    def remove(self, codes: npt.NDArray[np.int32]) -> None:
+        """Take rows out again that were added, shape (rows, d): as if they had never been."""
+        packed = self.packed()
+        for first in range(0, len(codes), BLOCK):
+            _add_product(packed, codes[first : first + BLOCK], np.subtract)
+        self.rows -= len(codes)
+
+    def _flush(self) -> None:
+        if self._packed is None:
+            self._packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
+        if self._count:
+            assert self._waiting is not None
+            _add_product(self._packed, self._waiting[: self._count], np.add)
+            self._count = 0
+
+    def packed(self) -> IntArray:
+        """The lower triangle of A, row after row, shape (d·(d+1)/2,): the memory itself, not a copy."""
+        self._flush()
+        assert self._packed is not None
+        return self._packed
+
+    @property
+    def empty(self) -> bool:
+        """Whether no row was ever added; then `packed` would only make zeros."""
+        return self._packed is None and not self._count
+
+    @classmethod
+    def of(cls, packed: IntArray, rows: int, dimension: int) -> SecondMoment:
+        """A second moment of a given lower triangle, which it takes over, and number of rows."""
+        moment = cls(dimension)
+        moment._packed, moment.rows = packed, rows
+        return moment
+
+
+def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) -> None:
+    """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
+    # The transposed view is Fortran's order, and its upper triangle our lower one. With BLAS's own threads: exact
+    # all the same, and switching to one and back took longer than the product.
+    upper = dsyrk(1.0, codes.astype(np.float64).T, lower=0)
+    flat, lower = upper.T.reshape(-1), _lower(codes.shape[1])
+    # Piece by piece, in the processor's cache: the whole triangle at once took twice as long, in fresh pages.
+    for first in range(0, len(packed), PIECE):
+        piece = packed[first : first + PIECE]
+        put(piece, np.take(flat, lower[first : first + PIECE]).astype(np.int64), out=piece)
+
+
+def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+    """S_w = A − Σ_y c_y c_yᵀ / n_y, shape (d, d), in units of codes²: the upper triangle, in Fortran's order.
+
+    What stands below the diagonal means nothing. packed: A as in SecondMoment; counts: n_y, shape (C,); sums: c_y,
+    shape (C, d). With m_y the integer next to c_y / n_y and r_y = c_y − n_y m_y, c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ +
+    r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is rounded is the scatter itself, whatever the
+    distance of the means from zero. Classes of no rows are left out.
+    """
+    felt = counts > 0
+    counts, sums = counts[felt], sums[felt]
+    dimension = sums.shape[1]
+    means = (2 * sums + counts[:, None]) // (2 * counts[:, None])
+    rests = sums - counts[:, None] * means
+    # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
+    centred = np.zeros((dimension, dimension), dtype=np.int64)
+    centred.reshape(-1)[_lower(dimension)] = packed
+    with one_thread():
+        for first in range(0, len(counts), 1024):  # so many products of two limbs stay below 2⁵³
+            some = slice(first, first + 1024)
+            high = sums[some] >> LIMB
+            low = sums[some] - (high << LIMB)
+            mean, rest = means[some].astype(np.float64), rests[some].astype(np.float64)
+            product = (high.astype(np.float64).T @ mean).astype(np.int64)
+            product <<= LIMB
+            centred -= product
+            centred -= (low.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
+        scaled = rests / np.sqrt(np.maximum(counts, 1))[:, None]
+        scatter = centred - scaled.T @ scaled
+    return scatter.T

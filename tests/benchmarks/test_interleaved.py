@@ -1,0 +1,36 @@
+"""The benchmark of observing and asking in turns measures what it says."""
+
+import json
+
+import pytest
+from commands import run
+
+from examples.benchmarks.interleaved import AsIs, run_interleaved
+from scroll_tactile.embeddings import check_embedding
+
+
+def test_its_embedding_keeps_the_promises_of_one():
+    check_embedding(AsIs(), columns=(8,))
+
+
+def test_every_learner_is_taught_and_timed(tmp_path):
+    pytest.importorskip("sklearn")
+    result = run(
+        "bench", "interleaved", "--streams", 120, "--pairs", 10, "--interleavings", 200, "--json", tmp_path / "r"
+    )
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "r").read_text())
+    assert [record["measured"] for record in found["records"]] == [True] * 9
+    assert all(record["milliseconds"] > 0 and record["times_ours"] > 0 for record in found["records"])
+    assert found["drift"]["largest_relative_difference"] < 1e-10
+    assert 0 < found["drift"]["of_the_recursion"] < 1e-8
+    assert {"date", "versions", "machine", "seed"} <= found.keys()
+    assert "pseudo-inverse" in result.output
+
+
+def test_what_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "sklearn", None)
+    found = run_interleaved(streams=100, pairs=10, interleavings=100)
+    missing = [record for record in found["records"] if not record["measured"]]
+    assert len(missing) == 2
+    assert all(record["why"] == "scikit-learn is not installed" for record in missing)

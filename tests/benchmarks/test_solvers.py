@@ -1,0 +1,239 @@
+"""Every solver of the ridge regression against fifty digits, and what each does with bad input."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from examples.benchmarks.solvers.exact import Exact
+from examples.benchmarks.solvers.solver_protocol import Solver
+from examples.benchmarks.solvers.solvers import SOLVERS
+from scroll_tactile.errors import InputError, ScrollTactileError, SingularError
+
+# What each reaches where nothing is hard: the covariance form starts from 1 / λ and loses as many digits as λ is
+# small; a grid of 20 or 24 bits rounds the rows.
+REACHED = {
+    "covariance": 1e-10,
+    "covariance-symmetric": 1e-10,
+    "qr": 1e-13,
+    "gram64": 1e-13,
+    "gram32": 1e-4,
+    "exact": 2.0**-52,
+    "exact24": 1e-6,
+    "exact20": 1e-5,
+}
+NAMES = list(SOLVERS)
+
+
+def problem(rows=40, dimension=6, outputs=3, seed=0):
+    rng = np.random.default_rng([rows, dimension, outputs, seed])
+    return rng.uniform(-1, 1, size=(rows, dimension)), rng.normal(size=(rows, outputs))
+
+
+def truth(x, y, penalty):
+    with mpmath.workdps(60):
+        rows, targets = mpmath.matrix(x.tolist()), mpmath.matrix(y.tolist())
+        system = rows.T * rows + mpmath.mpf(penalty) * mpmath.eye(rows.cols)
+        right = rows.T * targets
+        columns = [mpmath.lu_solve(system, right[:, c]) for c in range(targets.cols)]
+        return np.array([[float(column[j]) for column in columns] for j in range(rows.cols)])
+
+
+def started(name, dimension=6, outputs=3, penalty=1e-3):
+    solver = SOLVERS[name]()
+    solver.start(dimension, outputs, penalty)
+    return solver
+
+
+def distance(found, true):
+    return np.linalg.norm(found - true) / np.linalg.norm(true)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("rows", "dimension", "outputs"), [(40, 6, 3), (1, 1, 1), (30, 1, 2), (5, 9, 2), (1200, 4, 1)])
+def test_all_agree_with_the_truth_where_nothing_is_hard(name, rows, dimension, outputs):
+    x, y = problem(rows, dimension, outputs)
+    solver = started(name, dimension, outputs, 0.5)
+    for first in range(0, rows, 7):
+        solver.update(x[first : first + 7], y[first : first + 7])
+    assert distance(solver.weights(), truth(x, y, 0.5)) < REACHED[name]
+    assert solver.weights().shape == (dimension, outputs)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_a_solver(name):
+    solver = started(name)
+    assert isinstance(solver, Solver)
+    assert solver.diagnosis == ""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_in_between_change_nothing_and_are_of_the_rows_so_far(name):
+    x, y = problem()
+    solver = started(name)
+    for at in range(0, 40, 10):
+        solver.update(x[at : at + 10], y[at : at + 10])
+        found = solver.weights()
+        assert distance(found, truth(x[: at + 10], y[: at + 10], 1e-3)) < 10 * REACHED[name]
+        found[:] = 77  # a copy
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=15, deadline=None)
+@given(cuts=st.lists(st.integers(0, 40), max_size=5), order=st.permutations(range(40)))
+def test_any_order_and_split_comes_to_the_same_but_for_rounding(name, cuts, order):
+    x, y = problem()
+    solver = started(name)
+    for some in np.split(np.array(order), np.sort(np.array(cuts, dtype=int))):
+        solver.update(x[some], y[some])
+    assert distance(solver.weights(), truth(x, y, 1e-3)) < 10 * REACHED[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_rows_at_all(name):
+    solver = started(name)
+    assert not solver.weights().any()
+    solver.update(np.zeros((0, 6)), np.zeros((0, 3)))
+    assert not solver.weights().any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_starting_again_forgets(name):
+    x, y = problem()
+    solver = started(name)
+    solver.update(y @ np.ones((3, 6)) / 100, y)
+    solver.start(6, 3, 1e-3)
+    solver.update(x, y)
+    assert distance(solver.weights(), truth(x, y, 1e-3)) < 10 * REACHED[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_read_only_integer_or_a_list_is_taken(name):
+    x = np.arange(12).reshape(6, 2) % 5 / 4
+    x.setflags(write=False)
+    solver, other = started(name, 2, 1), started(name, 2, 1)
+    solver.update(x, np.ones((6, 1), dtype=np.int8))
+    other.update(x.tolist(), [[1]] * 6)
+    assert np.array_equal(solver.weights(), other.weights())
+
+
+BAD = {
+    "too narrow": (np.ones((3, 5)), np.ones((3, 3)), r"\(n, 6\); came \(3, 5\)"),
+    "one row, not a table": (np.ones(6), np.ones((1, 3)), r"\(n, 6\); came \(6,\)"),
+    "other targets": (np.ones((3, 6)), np.ones((3, 2)), r"targets of shape \(n, 3\)"),
+    "more rows than targets": (np.ones((3, 6)), np.ones((2, 3)), "3 rows and 2 targets"),
+    "NaN": (np.where(np.arange(18).reshape(3, 6) == 8, np.nan, 1), np.ones((3, 3)), "row 1, column 2 is nan"),
+    "infinite target": (np.ones((3, 6)), np.full((3, 3), np.inf), "targets; row 0, column 0 is inf"),
+    "words": ([["a"] * 6], [[0] * 3], "real numbers"),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("case", BAD.values(), ids=BAD)
+def test_bad_rows_are_refused_and_leave_it_as_it_was(name, case):
+    rows, targets, said = case
+    x, y = problem()
+    solver = started(name)
+    solver.update(x, y)
+    before = solver.weights()
+    with pytest.raises(InputError, match=said):
+        solver.update(rows, targets)
+    assert np.array_equal(solver.weights(), before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [((0, 1, 1.0), "one feature"), ((2, 0, 1.0), "one output"), ((2, 1, -1e-9), "λ ≥ 0"), ((2, 1, np.nan), "λ ≥ 0")],
+)
+def test_bad_beginnings_are_refused(name, arguments, said):
+    with pytest.raises(InputError, match=said):
+        SOLVERS[name]().start(*arguments)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_was_not_started_says_so(name):
+    solver = SOLVERS[name]()
+    for call in (lambda: solver.update(np.ones((1, 1)), np.ones((1, 1))), solver.weights):
+        with pytest.raises(InputError, match="start"):
+            call()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_penalty_on_a_singular_system_is_never_answered_in_silence(name):
+    x, y = problem()
+    x[:, 4] = 0.0  # whatever the arithmetic, a column of zeros stays one
+    if name.startswith("covariance"):
+        with pytest.raises(InputError, match="λ > 0"):
+            started(name, penalty=0.0)
+        return
+    solver = started(name, penalty=0.0)
+    solver.update(x, y)
+    with pytest.raises(SingularError) as caught:
+        solver.weights()
+    assert "4" in str(caught.value)
+    assert isinstance(caught.value, ScrollTactileError)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("covariance")])
+def test_no_penalty_on_a_sound_system(name):
+    x, y = problem()
+    solver = started(name, penalty=0.0)
+    solver.update(x, y)
+    assert distance(solver.weights(), truth(x, y, 0.0)) < 10 * REACHED[name]
+
+
+def test_the_covariance_form_says_when_it_is_lost():
+    """Random features that depend on each other, and a small λ: what the report shows, in small."""
+    rng = np.random.default_rng(0)
+    x = np.maximum((4 + rng.normal(size=(300, 8))) @ rng.normal(size=(8, 60)), 0)
+    y = np.eye(2)[rng.integers(2, size=300)]
+    lost, exact = started("covariance", 60, 2, 1e-10), started("exact", 60, 2, 1e-10)
+    for at in range(0, 300, 5):
+        lost.update(x[at : at + 5], y[at : at + 5])
+        exact.update(x[at : at + 5], y[at : at + 5])
+    assert distance(lost.weights(), exact.weights()) > 0.1
+    assert "not positive definite" in lost.diagnosis
+    assert exact.solve()[1].converged
+
+
+def test_float32_cannot_hold_what_float64_can():
+    x, y = problem()
+    for name in ("gram32", "gram64", "exact"):
+        solver = started(name, penalty=0.0)
+        solver.update(x * 1e30, y)
+        if name == "gram32":
+            with pytest.raises(SingularError):
+                solver.weights()
+        else:
+            assert distance(solver.weights() * 1e30, truth(x, y, 0.0)) < 1e-12
+
+
+def test_qr_and_the_exact_form_are_all_that_is_left_on_laeuchlis_matrix():
+    small = 1e-9
+    x = np.concatenate([np.ones((1, 5)), small * np.eye(5)])
+    y = x @ np.arange(1.0, 6.0)[:, None]
+    for name in ("qr", "exact", "gram64"):
+        solver = started(name, 5, 1, 0.0)
+        solver.update(x, y)
+        if name == "gram64":
+            with pytest.raises(SingularError):
+                solver.weights()
+        else:
+            assert distance(solver.weights(), truth(x, y, 0.0)) < (1e-15 if name == "exact" else 1e-6)
+
+
+def test_ten_thousand_updates_of_one_row_leave_no_drift():
+    """The error after 10⁴ is what it was after 10³; the million is measured by `bench numerics`."""
+    rng = np.random.default_rng(3)
+    x = np.rint(rng.uniform(0, 1, size=(1000, 8)) * 2**20) / 2**20
+    y = np.eye(2)[rng.integers(2, size=1000)]
+    solver = Exact()
+    solver.start(8, 2, 1000 * 2.0**-20)
+    for rounds in range(1, 11):
+        for at in range(1000):
+            solver.update(x[at : at + 1], y[at : at + 1])
+        if rounds in (1, 10):
+            true = truth(x, y, 1000 / rounds * 2.0**-20)
+            assert np.abs(solver.weights() / true - 1).max() <= 2.0**-52

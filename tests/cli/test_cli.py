@@ -1,0 +1,238 @@
+"""The commands, as they are typed."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from scroll_tactile import sensors
+from scroll_tactile.datasets.simulator import Scene
+
+SCENE = Scene(sensors.ROBOSKIN)
+SMALL = ["--materials", "5", "--touches", "3", "--held-out", "2", "--features", "64"]
+
+
+def digest_of(output: str) -> str:
+    found = re.search(r"digest: ([0-9a-f]{64})", output)
+    assert found, output
+    return found[1]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One .npy of each of two materials, and a .csv of a third touch."""
+    folder = tmp_path_factory.mktemp("streams")
+    for name in ("silk", "wool"):
+        np.save(folder / f"{name}.npy", SCENE.touch(name, 0).readings)
+        np.save(folder / f"{name}-again.npy", SCENE.touch(name, 1).readings)
+    np.savetxt(folder / "silk.csv", SCENE.touch("silk", 2).readings, delimiter=",")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def memory(files: Path) -> Path:
+    folder = files / "memory"
+    for at, file in enumerate(("silk", "silk-again", "wool", "wool-again")):
+        options = ["--sensor", "roboskin"] if at == 0 else []
+        result = run("observe", folder, file.removesuffix("-again"), files / f"{file}.npy", *options)
+        assert result.exit_code == 0, result.output
+    assert "felt 2 times" in result.output
+    return folder
+
+
+class TestMemory:
+    def test_predict_says_what_it_feels_like(self, memory: Path, files: Path) -> None:
+        result = run("predict", memory, files / "silk.csv")
+        assert result.exit_code == 0, result.output
+        assert "silk" in result.output.splitlines()[0]
+        answer = json.loads(run("predict", memory, files / "silk.csv", "--json").stdout)
+        assert answer["material"] == "silk"
+        assert [name for name, _ in answer["ranking"]] == ["silk", "wool"]
+        only = json.loads(run("predict", memory, files / "silk.csv", "--scene", "wool", "--json").stdout)
+        assert (only["material"], only["probability"]) == ("wool", 1.0)
+
+    def test_inspect_shows_what_it_holds(self, memory: Path) -> None:
+        found = json.loads(run("inspect", memory, "--json").stdout)
+        assert found["materials"] == {"silk": 2, "wool": 2}
+        assert found["sensor"]["name"] == "roboskin"
+        assert found["bytes"] > 0
+        text = run("inspect", memory).stdout
+        assert digest_of(text) == found["digest"]
+        assert "4 of 2 materials" in text
+
+    def test_what_it_is_made_of_is_told_and_asked(self, memory: Path, files: Path) -> None:
+        assert "nothing was described yet" in run("compose", memory, files / "silk.csv").output
+        told = run("describe", memory, "silk", "silk=1.0")
+        assert told.exit_code == 0, told.output
+        assert "silk: made of silk; felt 2 times" in told.stdout
+        run("describe", memory, "wool", "wool=0.75", "dye=0.25")
+        run("describe", memory, "tweed", "wool=1", "soft=unknown")
+        answer = json.loads(run("compose", memory, files / "silk.csv", "--json").stdout)
+        found = {one["constituent"]: one for one in answer["constituents"]}
+        assert answer["material"] == "silk" and list(found) == ["dye", "silk", "soft", "wool"]
+        assert found["silk"]["presence"] > 0.5 > found["wool"]["presence"]
+        assert found["soft"]["presence"] is None and found["soft"]["unlearned"]
+        text = run("compose", memory, files / "silk.csv").stdout
+        assert "constituent" in text and "a material never felt" in text
+        for wrong, said in (("wool", "came 'wool'"), ("wool=much", "NAME=SHARE"), ("wool=0.7", "sum to one")):
+            refused = run("describe", memory, "silk", wrong)
+            assert refused.exit_code != 0 and said in refused.output
+        assert "taken back; felt 2 times" in run("describe", memory, "silk").stdout
+
+    def test_an_empty_memory_answers_unknown(self, tmp_path: Path, files: Path) -> None:
+        from scroll_tactile import TactileLearner
+
+        TactileLearner.open(tmp_path / "m", sensor=sensors.ROBOSKIN).close()
+        assert "never felt anything" in run("predict", tmp_path / "m", files / "silk.csv").stdout
+        answer = json.loads(run("predict", tmp_path / "m", files / "silk.csv", "--json").stdout)
+        assert (answer["material"], answer["known"], answer["novelty"]) == (None, False, None)
+
+    def test_a_sensor_of_ones_own(self, tmp_path: Path) -> None:
+        mine = {"name": "mine", "channels": 3, "rate": 50, "low": 0, "high": 1, "unit": "V", "duration": 1}
+        (tmp_path / "mine.json").write_text(json.dumps(mine))
+        np.save(tmp_path / "t.npy", np.random.default_rng(0).random((50, 3)))
+        result = run("observe", tmp_path / "m", "tin [can]", tmp_path / "t.npy", "--sensor", tmp_path / "mine.json")
+        assert result.exit_code == 0, result.output
+        assert "tin [can]: 1 s" in result.stdout
+
+    def test_errors_are_one_line(self, memory: Path, files: Path, tmp_path: Path) -> None:
+        silk = files / "silk.npy"
+        assert "--sensor" in refused("observe", tmp_path / "new", "silk", silk)
+        assert not (tmp_path / "new").exists()
+        assert "one of biotac" in refused("observe", tmp_path / "new", "silk", silk, "--sensor", "skin")
+        assert "biotac" in refused("observe", memory, "silk", silk, "--sensor", "biotac")
+        assert "1 to 200 characters" in refused("observe", memory, "", silk)
+        assert "'oak'" in refused("predict", memory, silk, "--scene", "oak,silk")
+        assert "at least one material" in refused("predict", memory, silk, "--scene", ",")
+        assert "not there" in refused("predict", memory, files / "none.npy")
+        assert "no store" in refused("predict", tmp_path / "none", silk)
+        assert "file" in refused("inspect", silk)
+        (tmp_path / "bad.csv").write_text("1,2\n1,two\n")
+        assert "row 2, column 2" in refused("predict", memory, tmp_path / "bad.csv")
+        np.save(tmp_path / "wide.npy", np.zeros((75, 61)))
+        assert "(T, 60)" in refused("predict", memory, tmp_path / "wide.npy")
+
+    def test_two_writers_are_refused_and_readers_not(self, memory: Path, files: Path) -> None:
+        from scroll_tactile import TactileLearner
+
+        with TactileLearner.open(memory):
+            assert "being written by process" in refused("observe", memory, "silk", files / "silk.npy")
+            assert run("inspect", memory).exit_code == 0
+
+
+class TestDemo:
+    def test_it_tells_all_it_promises(self, tmp_path: Path) -> None:
+        result = run("demo", *SMALL, "--sensor", "contactile", "--plot", tmp_path / "p.png")
+        assert result.exit_code == 0, result.output
+        for words in (
+            "Simulated",
+            "not",
+            "result",
+            "worst confusions:",
+            "forgot:",
+            "never touched",
+            "0.3 s",
+            "digest:",
+        ):
+            assert words in result.stdout
+        pytest.importorskip("matplotlib")
+        assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG"
+
+    def test_without_matplotlib_it_says_so_and_goes_on(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("examples.paper.plots.drawing.available", lambda: False)
+        result = run("demo", *SMALL, "--plot", tmp_path / "p.png")
+        assert result.exit_code == 0, result.output
+        assert 'pip install "scroll-tactile[plots]"' in result.stdout
+        assert "5 cork" in result.stdout
+        assert not (tmp_path / "p.png").exists()
+
+    def test_errors_are_one_line(self, tmp_path: Path) -> None:
+        assert "camera" in refused("demo", "--sensor", "gelsight")
+        assert "one of" in refused("demo", "--sensor", "nose")
+        assert "seed" in refused("demo", "--seed", "-1")
+        assert "folder that exists" in refused("demo", "--plot", tmp_path / "none" / "p.png")
+        (tmp_path / "file").write_text("")
+        assert "is a file" in refused("demo", "--memory", tmp_path / "file")
+
+    @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT], ids=lambda stop: stop.name)
+    def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path, stop: signal.Signals) -> None:
+        kept = tmp_path / "kept"
+        options = [*SMALL, "--materials", "12"]  # long enough to be stopped in
+        words = [sys.executable, "-m", "scroll_tactile.cli", "demo", "--memory", str(kept), *options]
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        try:
+            until = time.monotonic() + 60
+            while not _finished(kept) and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.005)
+            process.send_signal(stop)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+        if stop is signal.SIGINT:
+            assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
+        assert len(_finished(kept)) < 12, "it was not stopped in time"
+        resumed = run("demo", "--memory", kept, *options)
+        assert resumed.exit_code == 0, resumed.output
+        observed = re.search(r"observed now: (\d+)", resumed.stdout)
+        assert observed
+        assert int(observed[1]) < 36
+        assert digest_of(resumed.stdout) == digest_of(run("demo", *options).stdout)
+        assert digest_of(resumed.stdout) == digest_of(run("inspect", kept / "memory").stdout)
+
+
+def _finished(kept: Path) -> list[str]:
+    file = kept / "demo.json"
+    return list(json.loads(file.read_text())["notes"]) if file.exists() else []
+
+
+def test_schedules_give_one_memory() -> None:
+    result = run("schedules", "--count", "3", "--touches", "2", "--materials", "4", "--features", "64")
+    assert result.exit_code == 0, result.output
+    assert "1 digest, predictions for 4 others the same to the bit" in result.stdout
+    assert "no such folder" in refused("schedules", "--data", "/nowhere")
+    assert "biotac or roboskin" in refused("schedules", "--data", "/nowhere", "--sensor", "contactile")
+
+
+class TestReplay:
+    def test_a_fold_of_real_touches(self, real_data: Path, tmp_path: Path) -> None:
+        options = ["--data", real_data, "--folds", "0", "--materials", "4", "--memory", tmp_path / "kept"]
+        result = run("replay", "roboskin-20", *options, "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
+        assert result.exit_code == 0, result.output
+        assert "equals offline training: yes" in result.stdout
+        found = json.loads((tmp_path / "r.json").read_text())
+        assert found["command"].startswith("scroll-tactile replay roboskin-20 --data")
+        assert set(found["versions"]) >= {"scroll-tactile", "torch", "numpy", "python"}
+        assert (found["sensor"]["name"], found["schedule"], found["seed"]) == ("roboskin", "class-by-class", 0)
+        assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.9
+        assert len(found["folds"][0]["digest"]) == 64
+        again = run("replay", "roboskin-20", *options)
+        assert found["folds"][0]["digest"][:16] in again.stdout
+        assert "another run" in refused("replay", "roboskin-20", *options, "--schedule", "shuffled")
+
+    def test_errors_are_one_line(self, tmp_path: Path) -> None:
+        assert "no such folder" in refused("replay", "biotac-20", "--data", tmp_path / "none")
+        assert "it is and does not" in refused("replay", "roboskin-20", "--data", tmp_path)
+        missing = tmp_path / "none" / "r.json"
+        assert "folder that exists" in refused("replay", "biotac-20", "--data", tmp_path, "--json", missing)
+        assert run("replay", "nose-20", "--data", tmp_path).exit_code == 2
+
+    def test_folds_are_numbers(self, real_data: Path) -> None:
+        options = ["--data", real_data, "--materials", "2"]
+        assert "--folds" in refused("replay", "roboskin-20", *options, "--folds", "first")
+        assert "folds out of" in refused("replay", "roboskin-20", *options, "--folds", "7")
+        assert "order of recording" in refused("replay", "roboskin-20", *options, "--blocked")
+
+
+def test_help_is_there_for_every_command() -> None:
+    assert run("--help").exit_code == 0
+    for command in ("demo", "observe", "predict", "inspect", "replay", "schedules"):
+        result = run(command, "--help")
+        assert result.exit_code == 0
+        assert "Usage" in result.stdout

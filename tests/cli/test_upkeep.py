@@ -1,0 +1,206 @@
+"""`scroll-tactile memory …`, as its user sees it."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from commands import refused, run
+from test_learner_machine import PAD, SETTINGS, fed, require_same, stream
+
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.embeddings import ModuleEmbedding
+from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.memory.plain import export_plain
+from scroll_tactile.pipelines.memories import open_for_upkeep
+from store import Store
+
+FELT = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
+
+
+@pytest.fixture
+def path(tmp_path):
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+        for name, touch in FELT:
+            learner.observe(name, stream(touch))
+    return tmp_path / "m"
+
+
+def words(result):
+    assert result.exit_code == 0, result.output
+    return " ".join(result.output.split())
+
+
+def damage(path):
+    """Change a character of a material's name in the journal; its file."""
+    journal = path / "journal.sqlite"
+    data = bytearray(journal.read_bytes())
+    at = data.rindex("b/ü".encode())
+    data[at] ^= 1
+    journal.write_bytes(data)
+    return journal
+
+
+class TestCheckAndRepair:
+    def test_a_sound_memory(self, path):
+        assert "sound: every checksum holds" in words(run("memory", "check", path))
+        assert json.loads(run("memory", "check", path, "--json").output) == {"sound": True, "problems": []}
+        assert "nothing was damaged; rows 1 to 12 verify" in words(run("memory", "repair", path))
+
+    def test_damage_is_named_and_mended(self, path):
+        damage(path)
+        result = run("memory", "check", path)
+        assert result.exit_code == 1
+        assert "row" in result.output
+        assert "1 damaged" in result.output
+        assert f"scroll-tactile memory repair {path}" in " ".join(result.output.split())
+        found = json.loads(run("memory", "check", path, "--json").output)
+        assert not found["sound"]
+        assert found["problems"][0]["path"] == str(path / "journal.sqlite")
+        repaired = words(run("memory", "repair", path))
+        assert "lost:" in repaired
+        assert "damaged journal was put aside" in repaired
+        assert run("memory", "check", path).exit_code == 0
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            require_same(learner, FELT)  # the generation holds what the row had
+
+    def test_what_no_generation_holds_is_lost_up_to_there(self, tmp_path):
+        learner = TactileLearner.open(tmp_path / "m", **SETTINGS)
+        for name, touch in FELT:
+            learner.observe(name, stream(touch))
+        learner._ledger.store.close()  # as if the power failed: no generation is written
+        damage(tmp_path / "m")
+        result = words(run("memory", "repair", tmp_path / "m"))
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+            kept = sum(learner.materials.values())
+            require_same(learner, FELT[:kept])
+        assert f"kept up to row {kept}" in result
+        assert 0 < kept < 12
+
+    @pytest.mark.parametrize("command", ["check", "repair", "compact", "export", "retract", "forget", "merge"])
+    def test_what_is_no_memory_is_refused(self, tmp_path, command):
+        more = {
+            "compact": ["--yes"],
+            "export": [tmp_path / "out"],
+            "retract": [1],
+            "forget": ["a"],
+            "merge": [tmp_path, "--shared", "once"],
+        }
+        assert "holds no store" in refused("memory", command, tmp_path / "none", *more.get(command, []))
+        assert not (tmp_path / "none").exists()
+
+
+class TestTakingBack:
+    def test_retract_and_forget(self, path):
+        assert "observation 2 was taken back; 11 are left" in words(run("memory", "retract", path, 2))
+        assert "b/ü: 3 observations were taken back; 2 materials are left" in words(
+            run("memory", "forget", path, "b/ü")
+        )
+        assert "was taken back already" in refused("memory", "retract", path, 2)
+        assert "'b/ü' was never felt" in refused("memory", "forget", path, "b/ü")
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            require_same(learner, [one for one in FELT if one[0] != "b/ü"])
+
+    def test_merge(self, path, tmp_path):
+        with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
+            for name, touch in [("a", (0, 60)), ("d", (1, 60))]:
+                other.observe(name, stream(touch))
+        result = words(run("memory", "merge", path, tmp_path / "other", "--shared", "once"))
+        assert "1 observations came in; 1 streams were felt by both; 13 are there now" in result
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            require_same(learner, [*FELT, ("d", (1, 60))])
+            assert f"digest: {learner.digest()}" in result
+
+    def test_compact_asks_first(self, path):
+        result = run("memory", "compact", path, "--keep", "2")
+        assert result.exit_code == 1
+        assert "Of 12 observations only the newest 2 can be retracted or forgotten afterwards" in result.output
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            learner.retract(1)
+        assert "rows up to 10 are compacted; on disk" in words(run("memory", "compact", path, "--keep", "2", "--yes"))
+        assert "were compacted" in refused("memory", "retract", path, 4)
+
+
+class TestExport:
+    def test_all_of_it_is_read_without_this_library(self, path, tmp_path):
+        run("memory", "retract", path, 3)
+        run("memory", "compact", path, "--keep", "4", "--yes")
+        run("memory", "retract", path, 12)
+        assert "written" in words(run("memory", "export", path, tmp_path / "out"))
+        out, left = tmp_path / "out", [one for at, one in enumerate(FELT) if at not in (2, 11)]
+        whole = fed(left)
+        about = json.loads((out / "memory.json").read_text())
+        assert (about["digest"], about["materials"]) == (whole.digest(), whole.materials)
+        with (out / "observations.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [row["material"] for row in rows] == [name for name, _ in FELT]
+        states = ["compacted"] * 8 + ["kept"] * 3 + ["retracted"]
+        states[2] = "retracted"
+        assert [row["state"] for row in rows] == states
+        with np.load(out / "statistics.npz") as arrays:
+            assert arrays["materials"].tolist() == ["a", "b/ü", "c"]
+            for scale in whole._memory.statistics.scales:
+                rows = [whole._perception.features(whole_image(touch))[scale] for _, touch in left]
+                codes = np.concatenate([np.rint(np.asarray(one, float) * 2**20) for one in rows]).astype(np.int64)
+                assert np.array_equal(arrays[f"second-{scale}"], codes.T @ codes)
+                assert np.array_equal(arrays[f"sums-{scale}"].sum(axis=0), codes.sum(axis=0))
+                assert arrays[f"counts-{scale}"].sum() == len(codes)
+        with (out / "exemplars.csv").open(newline="") as file:
+            index = list(csv.DictReader(file))
+        found = {}
+        for row in index:
+            found.setdefault(row["material"], []).append(bytes.fromhex(row["key"]))
+            readings = np.load(out / row["file"], allow_pickle=False)
+            assert readings.shape == (60, 2)
+        assert found == whole.exemplars
+
+    def test_a_memory_without_a_path_has_no_list_of_observations(self, tmp_path):
+        export_plain(fed(FELT), tmp_path / "out")
+        assert not (tmp_path / "out" / "observations.csv").exists()
+        assert (tmp_path / "out" / "memory.json").is_file()
+
+    def test_nothing_is_written_over(self, path, tmp_path):
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "mine").write_text("x")
+        assert "holds something already" in refused("memory", "export", path, tmp_path / "out")
+        assert [one.name for one in (tmp_path / "out").iterdir()] == ["mine"]
+        with pytest.raises(InputError, match="cannot be written"):
+            export_plain(fed(FELT), tmp_path / "out" / "mine")
+
+
+class TestAnyEmbedding:
+    def test_a_memory_of_a_module_is_looked_after_without_it(self, tmp_path):
+        import torch
+
+        module = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d((1, 8)), torch.nn.Flatten(), torch.nn.Tanh())
+        embedding = ModuleEmbedding(module, name="means", dimension=8, channels=[2])
+        with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=embedding) as learner:
+            for name, touch in FELT:
+                learner.observe(name, stream(touch))
+            learner.forget("c")
+            digest = learner.digest()
+        with TactileLearner.open(tmp_path / "n", sensor=PAD, embedding=embedding) as learner:
+            for name, touch in FELT:
+                learner.observe(name, stream(touch))
+        assert "c: 4 observations" in words(run("memory", "forget", tmp_path / "n", "c"))
+        assert words(run("memory", "compact", tmp_path / "n", "--yes"))
+        with TactileLearner.open(tmp_path / "n", sensor=PAD, embedding=embedding) as learner:
+            assert learner.digest() == digest
+        with open_for_upkeep(tmp_path / "n") as learner, pytest.raises(MismatchError, match="without its embedding"):
+            learner.observe("a", stream((0, 60)))
+
+    def test_another_programs_store_is_refused(self, tmp_path):
+        Store.open(tmp_path / "s", identity={"for": "other things"}).close()
+        assert "holds no memory of touch" in refused("memory", "forget", tmp_path / "s", "a")
+
+    def test_other_kernels_than_usual_are_no_matter(self, tmp_path):
+        with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Kernels(seed=3, dimension=64)) as learner:
+            learner.observe("a", stream((0, 60)))
+        assert "1 observations were taken back" in words(run("memory", "forget", tmp_path / "m", "a"))
+
+
+def whole_image(touch):
+    from scroll_tactile.signals.image import tactile_image
+    from scroll_tactile.signals.stream import validate
+
+    return tactile_image(validate(stream(touch), PAD))

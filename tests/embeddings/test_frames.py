@@ -1,0 +1,278 @@
+"""The embedding for cameras, and memories of what it sees."""
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, check_embedding, sensors
+from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.surfaces import LIGHT, STRENGTHS, SURFACE, light, surface
+from scroll_tactile.errors import (
+    ChannelCountError,
+    EmbeddingMismatchError,
+    EmptyStreamError,
+    InputError,
+    NoContactError,
+    NotFiniteError,
+    ReadingsTypeError,
+)
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import validate
+
+GEL = Gel()
+NETWORK = ResNet.random(0).state_dict()
+SEEING = Frames(NETWORK)
+
+
+def camera(height, width):
+    size = {"channels": height * width * 3, "layout": (height, width, 3)}
+    return sensors.GELSIGHT.model_copy(update=size)
+
+
+def taught(repetitions=4, **settings):
+    learner = TactileLearner(sensor=SMALL, **settings)
+    for at in range(repetitions):
+        for name in GEL.materials:
+            learner.observe(name, GEL.touch(name, at))
+    return learner
+
+
+def test_it_keeps_the_promises_of_an_embedding():
+    check_embedding(Frames(), channels=(3, 180, 360), columns=(1, 9, 80, 160))
+    check_embedding(Frames(cosines=64), channels=(3, 180), columns=(1, 80))
+    check_embedding(SEEING, channels=(3, 180), columns=(1, 80))
+
+
+def test_light_is_the_mean_colour_of_cells():
+    frame = np.random.default_rng(0).integers(-2048, 2049, (3, 12, 24))
+    expected = frame.reshape(3, 6, 2, 8, 3).mean(axis=(2, 4)).ravel() / 2048
+    assert light(frame) == pytest.approx(expected, abs=1e-6)
+    assert light(np.full((3, 1, 1), -2048)).tolist() == [-1] * LIGHT
+
+
+def test_slopes_are_counted_by_direction_and_strength():
+    """A ramp to the right, of 10/255 of the range in two pixels: one octant, the strength from 8 to 16."""
+    ramp = np.broadcast_to(np.arange(16) * 5 * 4096 / 255, (3, 12, 16)).round().astype(np.int64)
+    counts = surface(ramp)[: 3 * 48].reshape(3, 8, len(STRENGTHS) + 1)
+    inside = 2 / np.pi * np.arcsin(np.sqrt(14 / 16))
+    assert counts[:, 0, 3] == pytest.approx(inside, abs=1e-5)
+    assert counts[:, 1:].max() == 0
+    turned = surface(ramp[:, :, ::-1].copy())[: 3 * 48].reshape(3, 8, -1)
+    assert turned[:, 4, 3] == pytest.approx(inside, abs=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 3), (33, 40)])
+def test_frames_of_any_size_are_read(shape):
+    frame = np.random.default_rng(1).integers(-2048, 2049, (3, *shape))
+    assert surface(frame).shape == (SURFACE,)
+    flat = surface(np.full((3, *shape), 77))
+    assert sorted(set(flat.tolist())) == [0.0, 1.0]
+    assert flat.sum() == 15  # of each colour at each scale: all in the first octant, none with any strength
+
+
+def test_a_constant_offset_changes_the_light_alone():
+    frame = np.random.default_rng(2).integers(-1000, 1000, (3, 30, 40))
+    assert np.array_equal(surface(frame), surface(frame + 500))
+    assert light(frame + 512) == pytest.approx(light(frame) + 0.25, abs=1e-6)
+
+
+def test_the_network_sees_relief_and_no_level():
+    image = np.random.default_rng(3).uniform(-0.2, 0.2, (90, 40)).astype(np.float32)
+    one, other = SEEING.embed(image), SEEING.embed(image + np.float32(0.25))
+    assert one.shape == (LIGHT + 2 * (64 + 128 + 256),)
+    assert one[LIGHT:] == pytest.approx(other[LIGHT:], abs=1e-4)
+    assert np.linalg.norm(one[LIGHT : LIGHT + 64]) == pytest.approx(1, abs=1e-5)
+
+
+def test_cosines_approximate_a_kernel_of_the_surface_alone():
+    """The mean product of two frames' cosines is half of exp(−‖s − s'‖² / (2 · 1.2²)), of their counts s and s'."""
+    embedding = Frames(cosines=4000)
+    frames = [GEL.touch(name, 0).readings[-1] for name in MATERIALS[:3]]
+    images = [tactile_image(validate(frame[None], SMALL)) for frame in frames]
+    waves = [embedding.embed(image).astype(np.float64) for image in images]
+    counts = [Frames().embed(image)[LIGHT:].astype(np.float64) for image in images]
+    for one in range(3):
+        for other in range(3):
+            near = np.exp(-np.square(counts[one] - counts[other]).sum() / (2 * 1.2**2))
+            assert 2 * np.mean(waves[one] * waves[other]) == pytest.approx(near, abs=0.08)
+    assert np.array_equal(embedding.embed(images[0] + np.float32(0.25)), embedding.embed(images[0]))
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ({"cosines": -1}, "cosines and a seed as whole numbers"),
+        ({"cosines": 1.5}, "came 1.5 and 1"),
+        ({"cosines": "a"}, "came 'a'"),
+        ({"seed": -1}, "came 0 and -1"),
+        ({"seed": np.nan}, "came 0 and nan"),
+        ({"cosines": 9, "weights": NETWORK}, "with weights"),
+        ({"runtime": "onnxruntime"}, "expected a runtime with weights"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(bad, said):
+    with pytest.raises(InputError, match=said):
+        Frames(**bad)
+
+
+def test_the_fingerprint_tells_rests_and_networks_apart():
+    rest = np.zeros(SMALL.shape)
+    kinds = [Frames(), Frames(rest=None), Frames(rest=rest), Frames(rest=rest + 1), SEEING, Frames(NETWORK, rest=None)]
+    kinds += [Frames(cosines=64), Frames(cosines=64, seed=2)]
+    assert len({one.fingerprint for one in kinds}) == len(kinds)
+    assert Frames(rest=rest).fingerprint == Frames(rest=rest.astype(int).tolist()).fingerprint
+
+
+@pytest.mark.parametrize("rest", ["last", np.zeros((4, 5)), np.full((2, 2, 3), np.nan), [], "", 3, np.zeros((0, 2, 3))])
+def test_a_resting_image_that_is_none_is_refused(rest):
+    with pytest.raises(InputError, match="expected the gel at rest as 'first', None, or one picture"):
+        Frames(rest=rest)
+
+
+def test_images_of_channels_are_refused():
+    with pytest.raises(InputError, match=r"expected the tactile image of a camera's frame.*came \(19, 400\)"):
+        Frames().embed(np.zeros((19, 400), np.float32))
+    with pytest.raises(InputError, match="expected an embedding of channels"):
+        Robust(Frames())
+    with pytest.raises(InputError, match="one resting image"):
+        Joined(Frames(), Frames(rest=None))
+
+
+# Memories
+
+
+@pytest.fixture(scope="module")
+def memory():
+    return taught()
+
+
+def test_a_memory_of_a_camera_knows_what_was_pressed_into_it(memory):
+    assert isinstance(memory.embedding, Frames)
+    right = [memory.predict(GEL.touch(name, at)).material == name for at in range(10, 13) for name in MATERIALS]
+    assert np.mean(right) >= 0.9
+
+
+def test_frames_without_contact_change_nothing(memory):
+    touch = GEL.touch("cord", 20).readings
+    padded = np.concatenate([touch[:1], touch[:1], touch[:1], touch[1:3], touch[:1], touch[3:]])
+    one, other = memory.predict(touch), memory.predict(padded)
+    assert one == other
+    assert one.seconds <= len(touch) / SMALL.rate
+
+
+@pytest.mark.parametrize("embedding", [Frames(), SEEING], ids=["counts", "network"])
+def test_any_order_gives_the_same_memory(embedding):
+    touches = [(name, GEL.touch(name, at)) for at in range(2) for name in MATERIALS[:3]]
+    one, other = (TactileLearner(sensor=SMALL, embedding=embedding) for _ in range(2))
+    for name, touch in touches:
+        one.observe(name, touch)
+    with other.batch():
+        for name, touch in touches[::-1]:
+            other.observe(name, touch.readings.astype(np.uint8))
+    assert one.digest() == other.digest()
+    assert one.predict(touches[0][1]) == other.predict(touches[0][1])
+
+
+def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
+    with TactileLearner.open(tmp_path / "eye", sensor=SMALL, exemplars=9) as learner:
+        for name in MATERIALS[:2]:
+            learner.observe(name, GEL.touch(name, 0))
+        before = learner.digest()
+        learner.retract(learner.observe("cord", GEL.touch("cord", 1)))
+        assert learner.digest() == before
+    with TactileLearner.open(tmp_path / "eye") as learner:
+        assert learner.digest() == before
+        assert {len(one.readings) for those in learner._ranked().values() for one in those} <= {3, 4, 5}  # of 5
+    with TactileLearner.open(tmp_path / "other", sensor=SMALL) as learner:
+        learner.observe("cord", GEL.touch("cord", 0))
+        assert learner.exemplars == {}  # a camera's frames are large: none are kept unless asked for
+    with pytest.raises(EmbeddingMismatchError):
+        TactileLearner.open(tmp_path / "eye", embedding=Frames(rest=None))
+
+
+def test_the_commands_read_frames(tmp_path):
+    (tmp_path / "eye.json").write_text(SMALL.model_dump_json())
+    for name in MATERIALS[:2]:
+        np.save(tmp_path / f"{name}.npy", GEL.touch(name, 0).readings.astype(np.uint8))
+        words = ("observe", tmp_path / "memory", name, tmp_path / f"{name}.npy")
+        assert run(*words, "--sensor", tmp_path / "eye.json").exit_code == 0
+    assert "cord" in run("predict", tmp_path / "memory", tmp_path / "cord.npy").output
+    np.save(tmp_path / "rest.npy", np.full((3, *SMALL.shape), 90, np.uint8))
+    assert "none differs from the resting image" in refused("predict", tmp_path / "memory", tmp_path / "rest.npy")
+
+
+@pytest.mark.parametrize("size", [(240, 320), (480, 640), (37, 51)])
+def test_pictures_of_any_size(size):
+    gel = Gel(camera(*size))
+    learner = TactileLearner(sensor=gel.sensor, exemplars=0)
+    for name in MATERIALS[:2]:
+        for at in range(2):
+            learner.observe(name, gel.touch(name, at, frames=3))
+    assert learner.predict(gel.touch("cord", 7, frames=2)).material in MATERIALS[:2]
+
+
+def test_a_memory_of_single_frames_takes_no_resting_image():
+    learner = TactileLearner(sensor=SMALL, embedding=Frames(rest=None))
+    for at in range(3):
+        for name in MATERIALS[:3]:
+            learner.observe(name, GEL.touch(name, at).readings[-1:])
+    assert learner.predict(GEL.touch("cord", 9).readings[-1:]).material == "cord"
+    assert learner.predict(np.full((1, *SMALL.shape), 9, np.uint8)).material in MATERIALS  # constant: no error
+
+
+def test_a_resting_image_given_once_serves_every_stream(memory):
+    rest = GEL.touch("cord", 0, force=0).readings[0]
+    given = TactileLearner(sensor=SMALL, embedding=Frames(rest=rest))
+    for at in range(4):
+        for name in MATERIALS[:3]:
+            given.observe(name, GEL.touch(name, at).readings[1:])
+    assert given.predict(GEL.touch("gravel", 9).readings[3:]).material == "gravel"
+    with pytest.raises(NoContactError, match="the one given"):
+        given.predict(rest[None])
+
+
+def test_bad_streams_of_frames_are_refused_and_nothing_is_kept(memory):
+    good = GEL.touch("cord", 0).readings
+    before = memory.digest()
+    broken = good.copy()
+    broken[1, 2, 3, 1] = np.nan
+    bad = [
+        (NoContactError, "none differs", good[:1]),
+        (NoContactError, "none differs", np.full_like(good, 7)),
+        (NotFiniteError, r"reading 1, channel 2, 3, 1 is nan", broken),
+        (ReadingsTypeError, "real numbers", good.astype(complex)),
+        (ReadingsTypeError, "numbers", good.astype(str)),
+        (ChannelCountError, r"\(T, 60, 80, 3\); came \(60, 80, 3\): one frame", good[0]),
+        (ChannelCountError, r"came \(5, 80, 60, 3\)", good.swapaxes(1, 2)),
+        (ChannelCountError, r"came \(5, 60, 80\)", good[..., 0]),
+        (EmptyStreamError, "came none", good[:0]),
+    ]
+    for error, words, readings in bad:
+        with pytest.raises(error, match=words):
+            memory.observe("cord", readings)
+        with pytest.raises(error, match=words):
+            memory.predict(readings)
+    assert memory.digest() == before
+
+
+def test_constituents_are_told_of_frames(memory):
+    for name in MATERIALS:
+        memory.describe(name, {"woven": name in ("burlap", "mesh", "cord")})
+    told = memory.compose(GEL.touch("mesh", 30))["woven"]
+    assert told.presence > 0.5
+    assert told.evidence[0][0] == "mesh"
+
+
+def test_f_star_reads_what_f_reads():
+    learner = taught(3, exemplars=18)
+    report = learner.fine_tune(epochs=1)
+    assert report.exemplars == 18
+    assert learner.tuned_digest() is not None
+
+
+def test_a_sensor_of_channels_takes_no_frames():
+    with pytest.raises(InputError, match="take Kernels"):
+        TactileLearner(sensor=sensors.BIOTAC, embedding=Frames())
+    assert isinstance(TactileLearner(sensor=sensors.BIOTAC).embedding, Kernels)
+    assert Sensor.model_validate(SMALL.model_dump()) == SMALL

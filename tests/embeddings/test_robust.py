@@ -1,0 +1,228 @@
+"""Short, noisy and half-broken touches are known by statistics of their own, as exact as the others."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+from test_copies import contents
+from test_learner_machine import PAD, stream
+
+from scroll_tactile import Augmented, Kernels, TactileLearner, sensors
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import Robust, check_embedding
+from scroll_tactile.embeddings.noisy import is_noisy, noisy_statistics
+from scroll_tactile.errors import EmbeddingMismatchError, InputError
+from scroll_tactile.pipelines.robustness import dead, noise
+from scroll_tactile.prediction.filling import Filling, sampled_readings
+from scroll_tactile.signals.copies import hiss
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISY
+from scroll_tactile.statistics.grid import to_codes
+from scroll_tactile.statistics.statistics import Statistics
+
+SMALL = Robust(Kernels(seed=0, dimension=64))
+SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4, "augmentation": Augmented(copies=1, noisy=2)}
+FELT = [(name, (seed, readings)) for seed, readings in enumerate((60, 25)) for name in "ab"]
+NAMES = ("felt", "denim", "cork", "oak")
+
+
+def fed(felt, **settings):
+    learner = TactileLearner(**SETTINGS | settings)
+    for name, touch in felt:
+        learner.observe(name, stream(touch))
+    return learner
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene(sensor=sensors.BIOTAC)
+
+
+@pytest.fixture(scope="module")
+def robust(scene):
+    learner = TactileLearner(
+        sensor=sensors.BIOTAC,
+        embedding=Robust(Kernels(dimension=256)),
+        augmentation=Augmented(copies=1, speed=1.1, noisy=6, noise=0.7),
+        exemplars=0,
+    )
+    for name in NAMES:
+        for at in range(8):
+            learner.observe(name, scene.touch(name, at, seconds=2))
+    return learner
+
+
+def share(learner, scene, change):
+    asked = [(name, change(scene.touch(name, at, seconds=2))) for name in NAMES for at in range(50, 55)]
+    return np.mean([learner.predict(touch).material == name for name, touch in asked])
+
+
+class TestEmbedding:
+    def test_it_keeps_the_promises_of_an_embedding(self):
+        check_embedding(SMALL, columns=(9, 60))
+
+    def test_its_windows_are_those_of_the_inner_one(self):
+        image = np.random.default_rng(0).uniform(-1, 1, (3, 90)).astype(np.float32)
+        windows = {30: [0, 7], 60: [0]}
+        for width, rows in SMALL.embed_windows(image, windows).items():
+            assert rows.tobytes() == SMALL.inner.embed_windows(image, windows)[width].tobytes()
+
+    def test_another_inner_one_or_seed_is_another(self):
+        others = (Robust(Kernels(seed=1, dimension=64)), Robust(Kernels(seed=0, dimension=64), seed=2))
+        assert len({SMALL.fingerprint, SMALL.inner.fingerprint, *(one.fingerprint for one in others)}) == 4
+
+    @pytest.mark.parametrize("columns", [1, 2, 5, 400])
+    @pytest.mark.parametrize("channels", [1, 19])
+    def test_noisy_features_of_any_size_and_of_extremes(self, channels, columns):
+        rng = np.random.default_rng([channels, columns])
+        for image in (
+            np.full((channels, columns), -1),
+            np.ones((channels, columns)),
+            rng.uniform(-1, 1, (channels, columns)),
+        ):
+            features = SMALL.embed_noisy([image.astype(np.float32)])
+            assert features.shape == (2, 1, 64)
+            assert np.abs(features).max() <= 1
+            statistics = noisy_statistics(image.astype(np.float32), 4)
+            assert statistics.shape == (28, channels)
+            assert (statistics == np.rint(statistics)).all()
+            assert np.abs(statistics).max() < 2**15
+
+    def test_noisy_features_are_the_same_bits_in_any_company(self):
+        images = [np.random.default_rng(at).uniform(-1, 1, (3, 40 + at)).astype(np.float32) for at in range(5)]
+        alone = np.concatenate([SMALL.embed_noisy([image]) for image in images], axis=1)
+        assert SMALL.embed_noisy(images).tobytes() == alone.tobytes()
+        assert not np.array_equal(*SMALL.embed_noisy(images))  # the second set says other things
+
+    def test_more_noise_says_the_same_of_the_touch_beneath(self):
+        rest, pressed = np.full((6, 4000), -1, np.float32), np.full((2, 4000), -0.6, np.float32)
+        touch = np.concatenate([rest, pressed])  # two channels at a fifth of the range
+        rng = np.random.default_rng(0)
+        little, much = (noisy_statistics(hiss(touch, amplitude, rng)) for amplitude in (0.25, 0.5))
+        spread = noisy_statistics(hiss(touch, 0.5, rng)) - much
+        told = np.r_[0:4, 6]  # how often the edge is passed by margins below a fifth, and how often all is lost
+        assert np.abs(little - much)[told].max() <= 200 + 3 * np.abs(spread)[told].max()
+        assert (much[told, 6:].min(axis=1) - much[told, :6].max(axis=1) > 300).all()
+
+    def test_noise_is_told_from_touch(self, scene):
+        for name in NAMES:
+            touch = scene.touch(name, 0)
+            assert not is_noisy(tactile_image(touch))
+            assert is_noisy(tactile_image(noise(touch, 0.2)))
+            assert is_noisy(tactile_image(noise(touch, 1.0)))
+        assert not is_noisy(np.zeros((3, 1), np.float32))
+
+
+class TestMemory:
+    def test_what_each_observation_adds(self):
+        learner = fed(FELT[:2])
+        statistics = learner._memory.statistics
+        assert statistics.scales[:4] == (NOISY[0], BEGINNING, CHANNELS, NOISY[1])
+        rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISY, BEGINNING, CHANNELS)]
+        assert rows == [2 * 2, 2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
+        assert learner.materials == {"a": 1, "b": 1}
+
+    def test_every_order_gives_the_same_bytes(self):
+        assert len({fed(order).digest() for order in permutations(FELT)}) == 1
+
+    def test_retracted_merged_compacted_and_opened_again(self, tmp_path):
+        one, other = (TactileLearner.open(tmp_path / name, **SETTINGS) for name in "ab")
+        with one, other:
+            receipts = [one.observe(name, stream(touch)) for name, touch in [*FELT[:2], ("c", (5, 60))]]
+            other.observe(FELT[2][0], stream(FELT[2][1]))
+            other.observe(FELT[3][0], stream(FELT[3][1]))
+            one.retract(receipts[2])
+            one.merge(other, shared="once")
+            assert contents(one) == contents(fed(FELT))
+            one.compact()
+        with TactileLearner.open(tmp_path / "a", embedding=SMALL) as again:
+            assert contents(again) == contents(fed(FELT))
+        with pytest.raises(EmbeddingMismatchError):
+            TactileLearner.open(tmp_path / "a", embedding=SMALL.inner)
+
+    def test_it_follows_as_another_does(self):
+        learner, fresh = fed(FELT, refit=1.0), fed([*FELT, ("a", (8, 60))])
+        learner.predict(stream((9, 60)))
+        learner.observe("a", stream((8, 60)))
+        assert learner.predict(stream((9, 60))).material == fresh.predict(stream((9, 60))).material
+        assert learner._present() is not learner.model()  # followed, and not fitted again
+
+    def test_f_star_is_refused(self):
+        with pytest.raises(InputError, match="windows alone"):
+            fed(FELT).fine_tune()
+
+
+class TestAnswers:
+    def test_clean_touches(self, robust, scene):
+        assert share(robust, scene, lambda touch: touch) == 1
+
+    def test_through_noise(self, robust, scene):
+        plain = TactileLearner(sensor=sensors.BIOTAC, embedding=Kernels(dimension=256), exemplars=0)
+        for name in NAMES:
+            for at in range(8):
+                plain.observe(name, scene.touch(name, at, seconds=2))
+        noisy, before = (share(one, scene, lambda touch: noise(touch, 0.3)) for one in (robust, plain))
+        assert noisy >= before + 0.2
+        answer = robust.predict(noise(scene.touch("cork", 60), 0.3), scene=["cork", "oak"])
+        assert sorted(name for name, _ in answer.ranking) == ["cork", "oak"]
+        assert sum(chance for _, chance in answer.ranking) == pytest.approx(1)
+
+    def test_what_a_noisy_touch_is_made_of_is_told_by_what_it_feels_like(self, robust, scene):
+        for name in NAMES:
+            robust.describe(name, {f"{name}'s": 1.0})
+        try:
+            for name in NAMES:
+                touch = noise(scene.touch(name, 50, seconds=2), 0.3)
+                answer, made_of = robust.predict(touch), robust.compose(touch)
+                assert made_of.prediction.ranking == answer.ranking
+                chances = dict(answer.ranking)
+                for other in NAMES:
+                    assert made_of[f"{other}'s"].presence == pytest.approx(chances.get(other, 0))
+        finally:
+            for name in NAMES:
+                robust.describe(name, None)
+
+    def test_with_broken_wires(self, robust, scene):
+        assert share(robust, scene, lambda touch: dead(touch, 0.2)) >= 0.9
+
+    def test_without_noisy_copies_noise_is_judged_as_the_rest(self, scene):
+        learner = TactileLearner(sensor=sensors.BIOTAC, embedding=SMALL, exemplars=0)
+        for name in NAMES[:2]:
+            learner.observe(name, scene.touch(name, 0))
+        assert learner.predict(noise(scene.touch("felt", 1), 0.5)).material in NAMES
+        assert learner.model().noisy is None
+
+
+class TestFilling:
+    def taught(self, readings):
+        """By readings of shape (N, C) in [-1, 1]."""
+        statistics = Statistics(8, (CHANNELS,))
+        image = np.ascontiguousarray(readings.T, dtype=np.float32)
+        for at in range(0, image.shape[1], 32):
+            statistics.add("m", at % 3, {CHANNELS: to_codes(sampled_readings(image[:, at : at + 32], 8), 2.0)})
+        return Filling.of(statistics, len(image), 2.0)
+
+    def test_mean_and_covariance_are_those_of_the_readings(self):
+        readings = np.random.default_rng(0).uniform(-0.9, 0.9, (64, 3)) @ np.array(
+            [[0.5, 0.4, 0], [0, 0.1, 0], [0, 0, 1]]
+        )
+        filling = self.taught(readings)
+        np.testing.assert_allclose(filling.mean, readings.mean(axis=0), atol=1e-3)
+        np.testing.assert_allclose(filling.covariance, np.cov(readings.T, bias=True), atol=1e-3)
+
+    def test_a_silent_channel_is_what_the_others_say(self):
+        half = np.random.default_rng(0).uniform(-0.9, 0.9, (96, 1))
+        filling = self.taught(np.concatenate([half, half / 2, -half], axis=1))
+        image = np.ascontiguousarray(np.concatenate([half, half / 2, -half], axis=1).T, dtype=np.float32)
+        silent = image.copy()
+        silent[1] = -1
+        np.testing.assert_allclose(filling.fill(silent), image, atol=2e-3)
+        assert silent[1, 0] == -1  # the image that came is left as it was
+
+    def test_none_or_all_silent_are_left_as_they_are(self):
+        filling = self.taught(np.random.default_rng(0).uniform(-0.9, 0.9, (64, 3)))
+        for image in (np.zeros((3, 5), np.float32), np.full((3, 5), -1, np.float32)):
+            assert filling.fill(image) is image
+
+    def test_a_memory_that_felt_nothing_fills_nothing(self):
+        assert Filling.of(Statistics(8, (CHANNELS,)), 3, 1.0) is None

@@ -1,0 +1,278 @@
+"""The vision embedding: bytes that repeat, windows, normalisation, and its differentiable twin."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scroll_tactile import TactileLearner, sensors
+from scroll_tactile.datasets.biotac_slide import load
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import Embedding, Vision, check_embedding
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.vision import TOGETHER, pool_windows, to_planes
+from scroll_tactile.errors import EmbeddingMismatchError, InputError, WeightsError
+from scroll_tactile.signals.image import tactile_image, three_planes
+
+REAL = Path.home() / ".cache" / "scroll-tactile" / "weights" / "resnet18_imagenet_vq.safetensors"
+RANDOM = Vision(None, seed=0)
+
+
+@pytest.fixture(scope="module")
+def real_weights():
+    if not REAL.exists():
+        pytest.skip(f"no weights: {REAL} does not exist, and the project ships none")
+    return REAL
+
+
+def image(channels, columns, seed=0):
+    rng = np.random.default_rng([channels, columns, seed])
+    walk = np.cumsum(rng.normal(size=(channels, columns)), axis=1)
+    return np.clip(rng.uniform(-1, 1, (channels, 1)) + 0.05 * walk, -1, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize("vision", [RANDOM, Vision(None, seed=1, stages=(0, 4), precision="bfloat16")], ids=repr)
+def test_it_keeps_the_promises_of_an_embedding(vision):
+    assert isinstance(vision, Embedding)
+    assert "one image gives the same bytes again" in check_embedding(vision, channels=(1, 19), columns=(1, 30, 100))
+
+
+def test_real_weights_keep_them_too(real_weights):
+    check_embedding(Vision(real_weights, stages=(0, 1, 2, 3, 4)), columns=(30, 400))
+
+
+def test_features_are_the_definition(real_weights):
+    """Each stage averaged over rows and columns and scaled to length 1, by NumPy, from the unfolded network."""
+    vision, picture = Vision(real_weights, stages=(1, 3, 4)), image(19, 60)
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    planes = ((three_planes(picture) + 1) / 2 - mean[:, None, None]) / deviation[:, None, None]
+    with torch.no_grad():
+        maps = vision.network().net(torch.from_numpy(planes[None].astype(np.float32)))
+    parts = [maps[stage][0].double().numpy().mean(axis=(1, 2)) for stage in (1, 3, 4)]
+    expected = np.concatenate([part / np.linalg.norm(part) for part in parts])
+    assert vision.embed(picture).dtype == np.float32
+    assert np.abs(vision.embed(picture) - expected).max() < 1e-6
+
+
+def test_dimension_is_the_sum_of_the_stages_widths():
+    assert RANDOM.dimension == 64 + 128 + 256
+    assert Vision(None, seed=0, stages=(4,)).dimension == 512
+    assert Vision(None, seed=0, stages=(0, 4), depth=50).dimension == 64 + 2048
+    assert len(Vision(None, seed=0, stages=(0, 1, 2, 3, 4)).embed(image(3, 20))) == 1024
+
+
+@settings(max_examples=15, deadline=None)
+@given(data=st.data(), channels=st.integers(1, 30), columns=st.integers(1, 150))
+def test_windows_repeat_whatever_else_is_asked_for(data, channels, columns):
+    whole = image(channels, columns)
+    widths = data.draw(st.lists(st.integers(1, columns), min_size=1, max_size=3, unique=True))
+    asked = {w: data.draw(st.lists(st.integers(0, columns - w), min_size=1, max_size=2)) for w in widths}
+    together = RANDOM.embed_windows(whole, asked)
+    for width, starts in asked.items():
+        for row, start in zip(together[width], starts, strict=True):
+            assert row.tobytes() == RANDOM.embed_windows(whole, {width: [start]})[width][0].tobytes()
+            if width < TOGETHER:
+                assert row.tobytes() == RANDOM.embed(whole[:, start : start + width]).tobytes()
+
+
+def test_a_narrow_window_sees_nothing_of_what_comes_later():
+    early, late = image(19, 200), image(19, 200)
+    late[:, 30:] = 1.0
+    asked = {30: [0], 150: [0]}
+    one, other = RANDOM.embed_windows(early, asked), RANDOM.embed_windows(late, asked)
+    assert one[30].tobytes() == other[30].tobytes()
+    assert one[150].tobytes() != other[150].tobytes()
+
+
+def test_a_window_wider_than_the_image_is_the_image():
+    picture = image(19, 60)
+    for width in (60, 61, 300):
+        assert RANDOM.embed_windows(picture, {width: [0]})[width][0].tobytes() == RANDOM.embed(picture).tobytes()
+    short = image(19, 9)
+    assert RANDOM.embed_windows(short, {30: [0]})[30][0].tobytes() == RANDOM.embed(short).tobytes()
+
+
+def test_a_very_long_touch_is_read_window_by_window():
+    long = image(2, 5000)
+    row = RANDOM.embed_windows(long, {300: [4000]})[300][0]
+    assert row.tobytes() == RANDOM.embed(long[:, 4000:4300]).tobytes()
+
+
+@settings(max_examples=200, deadline=None)
+@given(columns=st.integers(1, 500), shrink=st.integers(1, 32), data=st.data())
+def test_a_window_covers_the_columns_of_a_map_that_it_should(columns, shrink, data):
+    across = -(-columns // shrink)
+    start = data.draw(st.integers(0, columns - 1))
+    width = data.draw(st.integers(1, columns))
+    place = torch.arange(across, dtype=torch.float64)
+    # Planes that say which columns were averaged: their mean place, against ones that keep its length in sight.
+    stage = torch.stack([place, torch.ones_like(place)])[None, :, None, :]
+    first = int(np.floor(start / columns * across + 1e-12))
+    after = max(first + 1, int(np.ceil(min(start + width, columns) / columns * across - 1e-12)))
+    assert 0 <= first < after <= across
+    pooled = pool_windows([stage], columns, [(start, width)])[0, 0].numpy()
+    expected = np.array([np.arange(first, after).mean(), 1.0])
+    assert np.allclose(pooled, expected / np.linalg.norm(expected))
+
+
+def test_a_part_without_any_response_stays_zero():
+    stage = torch.zeros(1, 4, 2, 6)
+    assert pool_windows([stage, stage + 1], 12, [(0, 12)]).tolist() == [[[0.0] * 4 + [0.5] * 4]]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("hostile", ["threads", "autocast", "gradients", "precision"])
+def test_the_callers_program_changes_no_bit(threads, hostile):
+    vision = Vision(None, seed=0, stages=(1, 4))
+    picture, before = image(60, 75), vision.embed(image(60, 75)).tobytes()
+    kept, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    try:
+        torch.set_num_threads(threads)
+        if hostile == "precision":
+            torch.set_float32_matmul_precision("medium")
+        with torch.set_grad_enabled(hostile == "gradients"), torch.autocast("cpu", enabled=hostile == "autocast"):
+            assert vision.embed(picture).tobytes() == before
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(kept)
+        torch.set_float32_matmul_precision(precision)
+
+
+def test_bulk_is_the_same_but_for_the_last_bits():
+    pictures = [image(19, columns, seed) for seed in range(3) for columns in (40, 60)]
+    pictures[0].flags.writeable = False
+    bulk = RANDOM.embed_bulk(pictures)
+    assert bulk.shape == (6, RANDOM.dimension)
+    assert np.abs(bulk - np.stack([RANDOM.embed(one) for one in pictures])).max() < 1e-5
+    assert RANDOM.embed_bulk([]).shape == (0, RANDOM.dimension)
+
+
+def test_the_fingerprint_is_of_all_that_features_depend_on():
+    state = ResNet.random(0).state_dict()
+    same = [RANDOM, Vision(None, seed=0), Vision(state)]
+    assert len({one.fingerprint for one in same}) == 1
+    touched = {name: tensor.clone() for name, tensor in state.items()}
+    touched["layer4.1.bn2.bias"][0] += 1e-6  # not even used by the default stages
+    others = [
+        Vision(touched),
+        Vision(None, seed=1),
+        Vision(None, seed=0, stages=(1, 2)),
+        Vision(None, seed=0, precision="bfloat16"),
+    ]
+    assert len({one.fingerprint for one in [RANDOM, *others]}) == 5
+    assert len(RANDOM.fingerprint) == 64
+    int(RANDOM.fingerprint, 16)
+
+
+def test_a_memory_is_refused_to_other_weights(tmp_path):
+    scene = Scene(sensor=sensors.ROBOSKIN)
+    with TactileLearner.open(tmp_path / "memory", sensor=scene.sensor, embedding=RANDOM) as learner:
+        for name in scene.materials[:2]:
+            learner.observe(name, scene.touch(name, 0))
+    with pytest.raises(EmbeddingMismatchError, match="vision"):
+        TactileLearner.open(tmp_path / "memory", embedding=Vision(None, seed=1))
+
+
+def test_the_network_gives_what_the_embedding_gives(real_weights):
+    vision = Vision(real_weights, stages=(0, 2, 4))
+    pictures = [image(60, 75, seed) for seed in range(2)]
+    windows = [(0, 56), (10, 56), (0, 75)]
+    batch = torch.from_numpy(np.stack(pictures))
+    features = vision.network()(batch, windows)
+    assert features.shape == (2, 3, vision.dimension)
+    for row, picture in zip(features, pictures, strict=True):
+        alone = vision.embed_windows(picture, {56: [0, 10], 75: [0]})
+        assert np.abs(row.detach().numpy() - np.concatenate([alone[56], alone[75]])).max() < 1e-4
+
+
+def test_training_the_network_changes_neither_the_embedding_nor_its_statistics():
+    vision, picture = Vision(None, seed=0, stages=(2,)), image(19, 60)
+    before, tuned = vision.embed(picture).tobytes(), vision.network()
+    mean = tuned.net.bn1.running_mean.clone()
+    assert tuned.train().training is False
+    optimizer = torch.optim.SGD(tuned.parameters(), lr=0.1)
+    for _ in range(2):
+        features = tuned(torch.from_numpy(picture)[None].repeat(4, 1, 1), [(0, 60), (0, 48)])
+        features[..., 0].sum().backward()
+        assert all(torch.isfinite(p.grad).all() for p in tuned.parameters() if p.grad is not None)
+        optimizer.step()
+    assert torch.equal(tuned.net.bn1.running_mean, mean)
+    assert vision.embed(picture).tobytes() == before
+    again = Vision(tuned.net.state_dict(), stages=(2,))
+    assert (
+        np.abs(again.embed(picture) - tuned(torch.from_numpy(picture)[None], [(0, 60)])[0, 0].detach().numpy()).max()
+        < 1e-5
+    )
+    assert again.fingerprint != vision.fingerprint
+    assert vision.network().net.conv1.weight.data_ptr() != vision.network().net.conv1.weight.data_ptr()
+
+
+def test_a_zero_map_gives_gradients_that_are_finite():
+    stage = torch.zeros(1, 3, 2, 4, requires_grad=True)
+    pool_windows([stage], 8, [(0, 8)]).sum().backward()
+    assert torch.isfinite(stage.grad).all()
+
+
+def test_planes_are_scaled_as_in_the_networks_training():
+    planes = to_planes(torch.tensor([[[-1.0, 1.0]]]))
+    assert planes.shape == (1, 3, 1, 2)
+    assert planes[0, 0, 0].tolist() == pytest.approx([-0.485 / 0.229, 0.515 / 0.229])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stages": ()},
+        {"stages": (2, 1)},
+        {"stages": (1, 1)},
+        {"stages": (5,)},
+        {"runtime": "tensorrt"},
+        {"precision": "int8"},
+        {"seed": None},
+        {"depth": 19},
+    ],
+    ids=str,
+)
+def test_settings_that_do_not_fit_are_refused(wrong):
+    with pytest.raises(InputError, match=r"expected|needs a seed"):
+        Vision(None, **({"seed": 0} | wrong))
+
+
+def test_a_seed_beside_weights_is_refused():
+    with pytest.raises(InputError, match="needs a seed"):
+        Vision(ResNet.random(0).state_dict(), seed=0)
+
+
+def test_weights_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(WeightsError, match="none at"):
+        Vision(tmp_path / "none.pth")
+
+
+@pytest.mark.parametrize("shape", [(19,), (0, 5), (19, 0), (3, 4, 5)])
+def test_what_is_no_image_is_refused(shape):
+    with pytest.raises(InputError, match=r"expected a tactile image of shape \(C, T\)"):
+        RANDOM.embed(np.zeros(shape, np.float32))
+
+
+def test_the_universal_stem_says_what_is_too_small_for_it():
+    vision = Vision(ResNet.random(0, 18, "universal").state_dict())
+    assert vision.embed(image(3, 3)).shape == (448,)
+    assert vision.fingerprint
+    with pytest.raises(InputError, match="at least 3 channels"):
+        vision.embed(image(2, 30))
+
+
+def test_real_streams_of_a_material_lie_together(real_data, real_weights):
+    recordings = load(real_data, "roboskin")
+    vision = Vision(real_weights)
+    chosen = [at for at, name in enumerate(recordings.materials) if name in ("mat1", "mat2")][:60:2]
+    features = vision.embed_bulk([tactile_image(recordings.streams[at]) for at in chosen])
+    names = np.array([recordings.materials[at] for at in chosen])
+    features -= features.mean(axis=0)
+    likeness = features @ features.T
+    np.fill_diagonal(likeness, -np.inf)
+    nearest = names[likeness.argmax(axis=1)]
+    assert np.mean(nearest == names) > 0.8

@@ -1,0 +1,364 @@
+"""f*: from exemplars alone, the same bytes whatever the schedule, durable, and never in f's way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import scroll_tactile.learner as learner_module
+from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.vision import TOGETHER
+from scroll_tactile.finetune import fine_tune as finetune
+from scroll_tactile.finetune import training
+from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.windows import Reading
+from store import StoreError
+
+PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
+SCENE = Scene(sensor=PAD)
+NAMES = SCENE.materials[:4]
+EMBEDDINGS = {
+    "kernels": lambda: Kernels(dimension=64),
+    "vision": lambda: Vision(None, seed=0, stages=(1, 2)),
+    "kernels+vision": lambda: Joined(Kernels(dimension=64), Vision(None, seed=0, stages=(1,))),
+}
+kinds = pytest.mark.parametrize("kind", EMBEDDINGS)
+touches = [(name, SCENE.touch(name, at)) for at in range(6) for name in NAMES]
+
+
+def taught(kind, order=None, path=None, **settings):
+    settings = {"sensor": PAD, "embedding": EMBEDDINGS[kind](), "exemplars": 12} | settings
+    learner = TactileLearner.open(path, **settings) if path else TactileLearner(**settings)
+    for at in range(len(touches)) if order is None else order:
+        learner.observe(*touches[at])
+    return learner
+
+
+@kinds
+def test_any_schedule_gives_the_same_buffer_and_with_the_same_seed_the_same_f_star_byte_for_byte(kind):
+    orders = [np.random.default_rng(seed).permutation(len(touches)) for seed in range(2)]
+    first, second = (taught(kind, order) for order in orders)
+    assert first.exemplars == second.exemplars
+    reports = [learner.fine_tune(epochs=2, seed=5) for learner in (first, second)]
+    assert reports[0].digest == reports[1].digest == first.tuned_digest() == second.tuned_digest()
+    assert reports[0].held_out == reports[1].held_out
+    assert first.digest() == second.digest()
+    assert first.fine_tune(epochs=2, seed=6).digest != reports[0].digest
+
+
+def test_the_buffer_has_its_size_and_is_shared_evenly():
+    learner = taught("kernels")
+    assert {name: len(keys) for name, keys in learner.exemplars.items()} == dict.fromkeys(sorted(NAMES), 3)
+    felt = {learner.observe(name, stream).key for name, stream in touches}
+    assert {key for keys in learner.exemplars.values() for key in keys} <= felt
+    assert taught("kernels", exemplars=0).exemplars == {}
+    small = taught("kernels", exemplar_bytes=20_000)
+    kept = sum(one.readings.nbytes for one in small._memory.exemplars)
+    assert 0 < kept <= 20_000
+
+
+@kinds
+def test_f_stays_as_it_was_and_f_star_answers_only_where_it_did_better(kind):
+    learner = taught(kind)
+    probe = SCENE.touch(NAMES[1], 50)
+    before, digest = learner.predict(probe), learner.digest()
+    report = learner.fine_tune(epochs=2)
+    assert (learner.predict(probe), learner.digest()) == (before, digest)
+    assert learner.predict(probe, tuned=True).tuned is report.kept
+    assert report.mode == ("head" if kind == "kernels" else "adapters")
+    assert report.kept == (
+        report.held_out["f*"]["loss"] + report.held_out["f*"]["margin"] < report.held_out["f"]["loss"]
+        and report.held_out["f*"]["wrong"] <= report.held_out["f"]["wrong"]
+    )
+    assert ("f* is better" in report.reason) is report.kept
+
+
+def kept(learner):
+    """Make the learner answer with its f*, whatever came of it."""
+    learner._memory.tuned = dataclasses.replace(learner._memory.tuned, kept=True)
+    return learner
+
+
+@kinds
+def test_an_f_star_that_is_kept_gives_the_probabilities(kind):
+    learner = taught(kind)
+    learner.fine_tune(epochs=1)
+    kept(learner)
+    probe = SCENE.touch(NAMES[2], 60)
+    answer = learner.predict(probe, tuned=True)
+    reader = TunedReader(learner.embedding, learner._reading, learner._memory.tuned)
+    logits = reader.logits(tactile_image(probe))
+    chances = np.exp(np.array([logits[name] for name in sorted(NAMES)]))
+    expected = dict(zip(sorted(NAMES), chances / chances.sum(), strict=True))
+    assert answer.tuned
+    assert dict(answer.ranking) == pytest.approx(expected)
+    assert answer.novelty == learner.predict(probe).novelty  # of f, always
+    two = learner.predict(probe, tuned=True, scene=NAMES[:2])
+    assert two.tuned
+    assert sum(chance for _, chance in two.ranking) == pytest.approx(1)
+
+
+def test_what_f_star_does_not_know_or_is_too_short_for_is_answered_by_f():
+    learner = taught("kernels")
+    learner.fine_tune(epochs=1)
+    kept(learner)
+    probe = SCENE.touch(NAMES[0], 50)
+    short = probe.first(0.35)
+    assert not learner.predict(short, tuned=True).tuned
+    assert learner.predict(short, tuned=True) == learner.predict(short)
+    for at in range(6):
+        learner.observe(SCENE.materials[7], SCENE.touch(SCENE.materials[7], at))
+    assert not learner.predict(probe, tuned=True).tuned
+    assert learner.predict(probe, tuned=True, scene=NAMES).tuned
+
+
+@pytest.mark.parametrize("kind", ["kernels", "kernels+vision"])
+def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
+    learner = taught(kind, path=tmp_path / "m")
+    digest = learner.fine_tune(epochs=1).digest
+    for at in range(6, 8):  # after the generation: in the journal alone
+        learner.observe(NAMES[0], SCENE.touch(NAMES[0], at))
+    expected = (learner.exemplars, learner.digest(), digest)
+    answer = kept(learner).predict(SCENE.touch(NAMES[1], 70), tuned=True)
+    learner._ledger.store.close()  # as if the power failed: no generation is written
+    for _ in range(2):
+        with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS[kind]()) as again:
+            assert (again.exemplars, again.digest(), again.tuned_digest()) == expected
+            kept(again)
+            assert again.predict(SCENE.touch(NAMES[1], 70), tuned=True) == answer
+
+
+def test_one_exemplar_is_one_read_of_the_store(tmp_path):
+    with taught("kernels", path=tmp_path / "m") as learner:
+        learner.fine_tune(epochs=1)
+        stored, lengths = learner._ledger.store.latest(), []
+        for one in learner._memory.exemplars:
+            first = sum(lengths)
+            rows = learner._ledger.store.read_rows(
+                "exemplar-readings", first, first + len(one.readings), generation=stored.number
+            )
+            assert rows.tobytes() == one.readings.tobytes()
+            lengths.append(len(one.readings))
+
+
+def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
+    with taught("kernels", path=tmp_path / "m") as learner:
+        before = learner.fine_tune(epochs=1, seed=1).digest
+
+        def interrupt(what, done, of):
+            if what.startswith("held out 2"):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            learner.fine_tune(epochs=1, seed=2, progress=interrupt)
+        assert learner.tuned_digest() == before
+
+        def full(*args, **kwargs):
+            raise StoreError("no space left")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(learner._ledger.store, "commit", full)
+            with pytest.raises(StoreError, match="space"):
+                learner.fine_tune(epochs=1, seed=2)
+        assert learner.tuned_digest() == before
+    with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"]()) as again:
+        assert again.tuned_digest() == before
+
+
+def test_a_loss_that_is_not_finite_stops_and_says_where(monkeypatch):
+    learner = taught("kernels")
+    before = learner.fine_tune(epochs=1).digest
+    monkeypatch.setattr(training, "HEAD_RATE", float("inf"))
+    for epochs, where in (
+        (8, r"loss became nan in held out 1/3, epoch 2"),
+        (1, "weights .* not finite after held out 1/3"),
+    ):
+        with pytest.raises(errors.FineTuneError, match=where):
+            learner.fine_tune(epochs=epochs)
+    assert learner.tuned_digest() == before
+
+
+def test_a_device_without_memory_left_is_told_as_such(monkeypatch):
+    learner = taught("kernels")
+
+    def full(*args, **kwargs):
+        raise torch.OutOfMemoryError("tried to allocate 2 GiB")
+
+    monkeypatch.setattr(training.functional, "cross_entropy", full)
+    with pytest.raises(errors.FineTuneError, match=r"cpu is out of memory.*device='cpu'"):
+        learner.fine_tune(epochs=1)
+    assert learner.tuned_digest() is None
+
+
+def test_what_cannot_be_fine_tuned_says_why(tmp_path):
+    learner = TactileLearner(sensor=PAD, embedding=EMBEDDINGS["kernels"]())
+    with pytest.raises(errors.InputError, match="buffer is empty"):
+        learner.fine_tune()
+    learner.observe(*touches[0])
+    with pytest.raises(errors.InputError, match="at least two materials"):
+        learner.fine_tune()
+    learner.observe(NAMES[1], SCENE.touch(NAMES[1], 3).first(0.4))
+    with pytest.raises(errors.InputError, match="Observe longer touches"):
+        learner.fine_tune()
+    with pytest.raises(errors.InputError, match=r"buffer has none of .*exemplars=3.*room for 4 or more"):
+        taught("kernels", exemplars=3).fine_tune()
+    with pytest.raises(errors.InputError, match="with exemplars > 0"):
+        taught("kernels", exemplars=0).fine_tune()
+    full = taught("kernels")
+    for settings in (
+        {"epochs": 0},
+        {"epochs": 1.5},
+        {"epochs": True},
+        {"seed": -1},
+        {"seed": None},
+        {"device": "warp"},
+        {"device": "meta"},
+        {"device": None},
+    ):
+        with pytest.raises(errors.InputError, match="expected"):
+            full.fine_tune(**settings)
+    for settings in ({"exemplars": -1}, {"exemplars": 2.5}, {"exemplar_bytes": -3}):
+        with pytest.raises(errors.InputError, match="whole number"):
+            TactileLearner(sensor=PAD, **settings)
+    closed = taught("kernels", path=tmp_path / "m")
+    closed.close()
+    with pytest.raises(StoreError, match="closed"):
+        closed.fine_tune()
+
+
+def test_a_memory_is_opened_with_the_buffer_that_it_was_made_with(tmp_path):
+    taught("kernels", path=tmp_path / "m").close()
+    embedding = EMBEDDINGS["kernels"]()
+    with pytest.raises(errors.MismatchError, match="made with exemplars=12"):
+        TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=20)
+    with TactileLearner.open(tmp_path / "m", embedding=embedding) as again:
+        assert sum(map(len, again.exemplars.values())) == 12
+
+
+@pytest.mark.parametrize("kind", ["vision", "kernels+vision"])
+def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
+    embedding = EMBEDDINGS[kind]()
+    reading = Reading.of(PAD, embedding)
+    features = TouchFeatures(embedding, reading)
+    image = tactile_image(touches[0][1])
+    means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
+    codes = embedding.embed_windows(image, reading.extent(image.shape[1]))
+    for width, mean in means.items():
+        expected = codes[width][reading.places(image.shape[1])[width]].mean(axis=0)
+        assert np.abs(mean[0].numpy() - expected).max() < 1e-5
+    net = adapted(features.network())
+    assert all("alpha" in name for name, p in net.named_parameters() if p.requires_grad)
+    near = features.means(net, [Lesson("", b"", image, features.frozen(image))])
+    for width, mean in means.items():  # narrow windows stay as the embedding reads them
+        change = float((near[width] - mean).abs().max().detach())
+        assert 0 < change < 1e-2 if width >= TOGETHER else change == 0
+
+
+def test_ridge_can_be_fine_tuned_too_and_the_whole_network(monkeypatch):
+    learner = taught("kernels", readout="ridge")
+    assert learner.fine_tune(epochs=1).mode == "head"
+    monkeypatch.setattr(finetune, "WHOLE_NETWORK_FROM", 1)
+    whole = taught("kernels+vision")
+    report = whole.fine_tune(epochs=1)
+    assert report.mode == "network"
+    probe = SCENE.touch(NAMES[1], 70)
+    assert kept(whole).predict(probe, tuned=True).tuned
+    assert whole.embedding.fingerprint == EMBEDDINGS["kernels+vision"]().fingerprint  # a copy was trained
+
+
+def test_the_start_is_f_itself():
+    for readout in ("lda", "ridge"):
+        learner = taught("kernels", readout=readout)
+        model = learner.model()
+        start = training.start_of(model, model.names)
+        features = TouchFeatures(learner.embedding, learner._reading)
+        image = tactile_image(SCENE.touch(NAMES[3], 40))
+        frozen = features.frozen(image)
+        logits = start.bias + sum(frozen[width] @ start.heads[width] for width in start.heads)
+        chances = np.exp(logits - logits.max())
+        said = dict(learner.predict(SCENE.touch(NAMES[3], 40)).ranking)
+        assert said == pytest.approx(dict(zip(model.names, chances / chances.sum(), strict=True)), abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["kernels", "vision"])
+def test_touches_that_are_all_too_short_say_so(kind):
+    learner = TactileLearner(sensor=PAD, embedding=EMBEDDINGS[kind](), exemplars=12)
+    for name, stream in touches:
+        learner.observe(name, stream.first(0.4))
+    with pytest.raises(errors.InputError, match="Observe longer touches"):
+        learner.fine_tune()
+    assert learner.predict(touches[0][1].first(0.4)).material in NAMES
+
+
+def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):
+    taught("kernels", path=tmp_path / "m").close()
+    with (
+        TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"](), mode="read") as reader,
+        pytest.raises(StoreError, match="open it to write"),
+    ):
+        reader.fine_tune(progress=lambda *told: pytest.fail("it trained"))
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, StoreError("no space left")])
+def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, monkeypatch, stop):
+    learner = taught("kernels", path=tmp_path / "m")
+    before = learner.fine_tune(epochs=1, seed=1).digest
+    commit = learner._ledger.store.commit
+
+    def late(*args, **kwargs):
+        commit(*args, **kwargs)
+        raise stop
+
+    with monkeypatch.context() as patched:
+        patched.setattr(learner._ledger.store, "commit", late)
+        with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else StoreError):
+            learner.fine_tune(epochs=1, seed=2)
+    assert learner.tuned_digest() == before
+    learner.close()
+    with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"]()) as again:
+        assert again.tuned_digest() == before
+
+
+def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path, monkeypatch):
+    embedding = EMBEDDINGS["kernels"]()
+    made = learner_module.identity_of
+    without = lambda *given: {name: one for name, one in made(*given).items() if name != "exemplars"}  # noqa: E731
+    with monkeypatch.context() as patched:
+        patched.setattr(learner_module, "identity_of", without)
+        TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=embedding).close()
+    with TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=8) as learner:
+        for name, stream in touches:
+            learner.observe(name, stream)
+        exemplars = learner.exemplars
+    with pytest.raises(errors.MismatchError, match="exemplars=8"):
+        TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=0)
+    with TactileLearner.open(tmp_path / "m", embedding=embedding) as again:
+        assert again.exemplars == exemplars
+        assert sum(map(len, exemplars.values())) == 8
+
+
+@pytest.mark.parametrize(("rate", "duration"), [(100.0, 1.0), (50.0, 1.0), (30.0, 1.5), (100.0, 0.4)])
+def test_the_judged_windows_are_read_as_the_embedding_reads_them_whatever_their_width(rate, duration):
+    sensor = PAD.model_copy(update={"rate": rate, "duration": duration})
+    embedding = EMBEDDINGS["vision"]()
+    reading = Reading.of(sensor, embedding)
+    features = TouchFeatures(embedding, reading)
+    image = tactile_image(Scene(sensor=sensor).touch(NAMES[0], 1))
+    columns = image.shape[1]
+    means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
+    rows = embedding.embed_windows(image, reading.extent(columns))
+    for width, mean in means.items():
+        expected = rows[width][reading.places(columns)[width]].mean(axis=0)
+        assert np.abs(mean[0].detach().numpy() - expected).max() < 1e-5
+    assert features.tunable is (max(means) >= TOGETHER)
+
+
+def test_touches_of_many_columns_are_left_to_f():
+    features = TouchFeatures(EMBEDDINGS["vision"](), Reading.of(PAD, EMBEDDINGS["vision"]()))
+    assert features.reads(4096)
+    assert not features.reads(4097)
+    assert TouchFeatures(Kernels(dimension=64), Reading.of(PAD, Kernels())).reads(10**6)

@@ -1,0 +1,383 @@
+"""The buffer: herded exactly, spread evenly, and a function of what was felt, not of when."""
+
+from collections import Counter
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from examples.benchmarks.buffers import compare
+from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarPool, herd, mean_code, quotas, rank
+from scroll_tactile.statistics.sample import LARGEST_SHARE
+
+few = settings(max_examples=150, deadline=None)
+LARGEST = 2**20
+
+
+def keys_of(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return [rng.bytes(8) for _ in range(count)]
+
+
+def herded_in_fractions(candidates, keys, mean, count):
+    """Algorithm 4 of iCaRL as it is written, in rational numbers."""
+    left = sorted(range(len(keys)), key=lambda at: keys[at])
+    total, chosen = [Fraction(0)] * len(mean), []
+    for step in range(1, min(count, len(keys)) + 1):
+
+        def distance(at, step=step, total=total):
+            return sum((m - (x + s) / step) ** 2 for m, x, s in zip(mean, candidates[at], total, strict=True))
+
+        best = min(left, key=distance)  # the first of equal ones
+        left.remove(best)
+        total = [s + x for s, x in zip(total, candidates[best], strict=True)]
+        chosen.append(best)
+    return chosen
+
+
+@st.composite
+def classes(draw):
+    size, width = draw(st.integers(1, 7)), draw(st.integers(1, 3))
+    # Few values, so that distances tie; or the largest that there are.
+    value = draw(
+        st.sampled_from([st.integers(-2, 2), st.integers(-LARGEST, LARGEST), st.sampled_from([-LARGEST, LARGEST])])
+    )
+    rows = draw(st.lists(st.lists(value, min_size=width, max_size=width), min_size=size, max_size=size))
+    mean = draw(st.lists(value, min_size=width, max_size=width))
+    keys = draw(st.lists(st.binary(min_size=2, max_size=2), min_size=size, max_size=size, unique=True))
+    return rows, keys, mean, draw(st.integers(0, size + 1))
+
+
+@few
+@given(classes())
+def test_herding_is_the_papers_in_exact_numbers(given):
+    rows, keys, mean, count = given
+    expected = herded_in_fractions([[Fraction(x) for x in row] for row in rows], keys, mean, count)
+    assert herd(np.array(rows), keys, np.array(mean), count) == expected
+
+
+@few
+@given(classes(), st.randoms(use_true_random=False))
+def test_herding_depends_on_no_order_and_fewer_are_a_beginning_of_more(given, random):
+    rows, keys, mean, count = given
+    all_of_them = herd(np.array(rows), keys, np.array(mean), len(keys))
+    assert sorted(all_of_them) == list(range(len(keys)))
+    assert herd(np.array(rows), keys, np.array(mean), count) == all_of_them[:count]
+    order = list(range(len(keys)))
+    random.shuffle(order)
+    again = herd(np.array(rows)[order], [keys[at] for at in order], np.array(mean), len(keys))
+    assert [order[at] for at in again] == all_of_them
+
+
+def test_scores_beyond_64_bits_are_still_compared_exactly():
+    # All candidates lie opposite the mean. From the 342nd step on the score of the far one exceeds 2⁶³; it comes last.
+    # The others differ by single steps of the grid, which float64 would not see in such scores.
+    width, count = 8192, 400
+    rows = np.full((count + 1, width), LARGEST // 2, dtype=np.int32)
+    rows[np.arange(count), np.arange(count)] -= np.arange(count) % 7
+    rows[count] = LARGEST
+    keys = keys_of(count + 1)
+    expected = sorted(range(count), key=lambda at: (-(at % 7), keys[at]))
+    assert herd(rows, keys, np.full(width, -LARGEST), count + 1) == [*expected, count]
+
+
+def test_herding_stays_nearer_to_the_mean_than_chance():
+    rng = np.random.default_rng(0)
+    rows = rng.integers(-LARGEST, LARGEST, (60, 20))
+    mean = mean_code(rows.sum(axis=0), 60)
+    gap = np.linalg.norm(rows[herd(rows, keys_of(60), mean, 10)].mean(axis=0) - mean)
+    assert gap < 0.8 * min(np.linalg.norm(rng.permutation(rows)[:10].mean(axis=0) - mean) for _ in range(20))
+
+
+WRONG = {
+    "floats": ((np.zeros((2, 3)), keys_of(2), np.zeros(3, int), 1), "float64"),
+    "a mean of floats": ((np.zeros((2, 3), int), keys_of(2), np.zeros(3), 1), "float64"),
+    "another dimension": ((np.zeros((2, 3), int), keys_of(2), np.zeros(4, int), 1), r"\(4,\)"),
+    "one axis": ((np.zeros(3, int), keys_of(3), np.zeros(3, int), 1), r"\(3,\)"),
+    "too many features": ((np.zeros((1, 8193), int), keys_of(1), np.zeros(8193, int), 1), "at most 8192"),
+    "too few keys": ((np.zeros((2, 3), int), keys_of(1), np.zeros(3, int), 1), "1 keys"),
+    "equal keys": ((np.zeros((2, 3), int), [b"a", b"a"], np.zeros(3, int), 1), "1 differ"),
+    "a negative count": ((np.zeros((2, 3), int), keys_of(2), np.zeros(3, int), -1), "-1"),
+    "a large code": ((np.full((2, 3), LARGEST + 1), keys_of(2), np.zeros(3, int), 1), str(LARGEST + 1)),
+    "the least integer": ((np.full((1, 3), -(2**63)), keys_of(1), np.zeros(3, int), 1), str(2**63)),
+    "a large mean": ((np.zeros((2, 3), int), keys_of(2), np.full(3, -LARGEST - 1), 1), str(LARGEST + 1)),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), WRONG.values(), ids=WRONG.keys())
+def test_what_cannot_be_herded_exactly_is_refused(arguments, said):
+    with pytest.raises(InputError, match=said):
+        herd(*arguments)
+
+
+def test_the_mean_code_is_rounded_to_the_next_integer():
+    assert mean_code(np.array([-5, -3, 3, 4, 5, 6]), 4).tolist() == [-1, -1, 1, 1, 1, 2]
+
+
+counts = st.dictionaries(st.sampled_from("abcdefg"), st.integers(0, 20))
+
+
+@few
+@given(counts, st.integers(0, 90))
+def test_quotas_fill_the_buffer_evenly(available, capacity):
+    places = quotas(available, capacity)
+    assert list(places) == sorted(available)
+    assert sum(places.values()) == min(capacity, sum(available.values()))
+    for name, count in places.items():
+        assert 0 <= count <= available[name]
+        if count < available[name]:
+            assert count >= max(places.values()) - 1
+
+
+@few
+@given(counts, st.integers(0, 90))
+def test_a_larger_buffer_takes_a_place_from_nobody(available, capacity):
+    less, more = quotas(available, capacity), quotas(available, capacity + 1)
+    assert all(less[name] <= more[name] for name in available)
+
+
+@pytest.mark.parametrize(("available", "capacity"), [({"a": 1}, -1), ({"a": -1}, 1)])
+def test_negative_numbers_are_refused(available, capacity):
+    with pytest.raises(InputError, match="-1"):
+        quotas(available, capacity)
+
+
+# --- candidates ---
+
+
+def exemplar(material, number, length, scale=1):
+    """A stream of `length` readings of four bytes; number gives its key."""
+    code = np.random.default_rng([number, ord(material[0])]).integers(-LARGEST, LARGEST, 3).astype(np.int32)
+    return Exemplar(material, bytes([number]), np.full((length, 1), number, np.float32), code, scale)
+
+
+def pool_of(felt, **limits):
+    pool = ExemplarPool(**limits)
+    for material, number, length in felt:
+        one = exemplar(material, number, length)
+        before = state(pool)
+        wanted = pool.wants(material, one.key, one.readings.nbytes)
+        assert state(pool) == before
+        pool.add(one)
+        assert wanted == (state(pool) != before)
+    return pool
+
+
+def state(pool):
+    arrays, attributes = pool.to_arrays()
+    return {name: (array.shape, array.tobytes()) for name, array in arrays.items()}, attributes
+
+
+def held(pool):
+    return [(one.material, one.key[0]) for one in pool]
+
+
+def expected(felt, capacity, capacity_bytes, ratio):
+    """The definition, from the whole set: the longest beginning that fits, in numbers and in counted bytes."""
+    sizes = {(material, number): 4 * length for material, number, length in felt}
+    if capacity_bytes is not None:
+        sizes = {who: size for who, size in sizes.items() if size <= capacity_bytes // LARGEST_SHARE}
+    numbers = {name: sorted(number for other, number in sizes if other == name) for name, _ in sizes}
+    order = sorted((at, number, name) for name, those in numbers.items() for at, number in enumerate(those))
+    largest = {name: max(size for (other, _), size in sizes.items() if other == name) for name in numbers}
+    kept, counted = [], 0
+    for _, number, name in order:
+        counted += largest[name]
+        if capacity is not None and len(kept) == ratio * capacity:
+            break
+        if capacity_bytes is not None and counted > capacity_bytes:
+            break
+        kept.append((name, number))
+    return sorted(kept)
+
+
+def length_of(name, number, salt):
+    """A key belongs to one content, so length follows from it: equal ones, or each material with lengths of its own."""
+    least = {"a": 1, "b": 6, "c": 1, "d": 3, "e": 6, "f": 1}[name]
+    return 2 if salt == 0 else least + (7 * number + salt) % (1 + salt)
+
+
+streams = st.tuples(
+    st.lists(st.tuples(st.sampled_from("abcdef"), st.integers(0, 25)), max_size=40), st.integers(0, 3)
+).map(lambda drawn: [(name, number, length_of(name, number, drawn[1])) for name, number in drawn[0]])
+limits = st.one_of(
+    st.fixed_dictionaries({"capacity": st.integers(1, 8), "ratio": st.integers(1, 3)}),
+    st.fixed_dictionaries({"capacity_bytes": st.integers(150, 350)}),
+    st.fixed_dictionaries({"capacity": st.integers(1, 8), "capacity_bytes": st.integers(8, 350), "ratio": st.just(2)}),
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(streams, limits, st.randoms(use_true_random=False))
+def test_any_order_keeps_what_the_definition_says(felt, limits, random):
+    pool = pool_of(felt, **limits)
+    asked = {"capacity": None, "capacity_bytes": None, "ratio": CANDIDATES} | limits
+    assert held(pool) == expected(felt, **asked)
+    assert pool.nbytes == sum(one.readings.nbytes for one in pool) <= (pool.capacity_bytes or pool.nbytes)
+    shuffled = felt.copy()
+    random.shuffle(shuffled)
+    assert state(pool_of(shuffled, **limits)) == state(pool)
+
+
+@few
+@given(streams, streams, limits)
+def test_a_pool_of_two_pools_is_the_pool_of_all(ours, theirs, limits):
+    known = {(name, number): length for name, number, length in ours}
+    theirs = [(name, number, known.get((name, number), length)) for name, number, length in theirs]
+    joint = pool_of(ours, **limits)
+    joint.update(pool_of(theirs, **limits))
+    assert state(joint) == state(pool_of(ours + theirs, **limits))
+
+
+@few
+@given(streams, streams, limits)
+def test_a_pool_that_was_kept_goes_on_as_if_it_had_not_been(before, after, limits):
+    pool = pool_of(before, **limits)
+    again = ExemplarPool.from_arrays(*pool.to_arrays(), **limits)
+    assert state(again) == state(pool)
+    known = {(name, number): length for name, number, length in before}
+    for name, number, length in after:
+        for one in (pool, again):
+            one.add(exemplar(name, number, known.setdefault((name, number), length)))
+    assert state(again) == state(pool)
+
+
+@few
+@given(streams, st.integers(1, 6))
+def test_a_pool_of_less_capacity_is_the_beginning_of_it(felt, capacity):
+    large = pool_of(felt, capacity=6)
+    assert held(ExemplarPool.from_arrays(*large.to_arrays(), capacity)) == held(pool_of(felt, capacity=capacity))
+
+
+def test_a_short_stream_in_place_of_a_long_one_lets_nothing_back_in():
+    # While b's fifth stream is the first that finds no room, a's two are long; the short one that takes the first
+    # rank from them would make room for it, in the order in which b's is felt last.
+    felt = [("a", 5, 12), ("a", 6, 12), *[("b", number, 12) for number in range(7, 15)]]
+    short = ("a", 1, 1)
+    first, last = pool_of([short, *felt], capacity_bytes=400), pool_of([*felt, short], capacity_bytes=400)
+    assert state(first) == state(last)
+    assert ("a", 1) in held(last)
+
+
+def test_behind_a_stream_that_found_no_room_there_is_none_for_a_shorter_one():
+    # b's fourth stream finds no room; c's fourth would, but comes after it.
+    long = [*[("a", number, 10) for number in range(1, 5)], *[("b", number, 10) for number in range(5, 9)]]
+    short = [("c", number, 1) for number in range(20, 24)]
+    for order in (long + short, short + long, short[2:] + long + short[:2]):
+        pool = pool_of(order, capacity_bytes=330)
+        assert held(pool) == expected(order, None, 330, CANDIDATES)
+        assert ("b", 8) not in held(pool)
+        assert ("c", 23) not in held(pool)
+
+
+def test_one_very_long_stream_pushes_out_nothing():
+    felt = [("a", number, 10) for number in range(1, 9)]
+    assert held(pool_of([("b", 0, 1000), *felt], capacity_bytes=320)) == held(pool_of(felt, capacity_bytes=320))
+
+
+def test_pools_of_other_limits_are_not_merged():
+    with pytest.raises(MismatchError, match="came one of 3, None"):
+        ExemplarPool(2).update(ExemplarPool(3))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{}, {"capacity": 0}, {"capacity": -1}, {"capacity_bytes": 0}, {"capacity": 1, "ratio": 0}]
+)
+def test_a_pool_that_could_hold_nothing_or_everything_is_refused(wrong):
+    with pytest.raises(InputError, match="expected"):
+        ExemplarPool(**wrong)
+
+
+def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
+    codes = {
+        5: np.zeros((9, 2), np.int32),
+        20: np.array([[1, 2**20], [2, 2**20]], np.int32),
+        50: np.zeros((0, 2), np.int32),
+    }
+    one = Exemplar.of("wool", b"k", np.zeros((30, 4), np.float32), codes)
+    assert (one.scale, one.code.tolist(), one.code.dtype) == (20, [2, 2**20], np.int32)
+
+
+# --- the buffer ---
+
+
+@few
+@given(streams, st.integers(1, 10), st.randoms(use_true_random=False))
+def test_the_buffer_depends_on_no_order_and_is_even(felt, capacity, random):
+    def buffer(felt, capacity=capacity):
+        ranked = rank(pool_of(felt, capacity=capacity, ratio=3), lambda material, _: np.full(3, ord(material)))
+        return {name: [one.key for one in those] for name, those in ranked.items()}
+
+    found = buffer(felt)
+    shuffled = felt.copy()
+    random.shuffle(shuffled)
+    assert list(buffer(shuffled).items()) == list(found.items())
+    assert list(found) == sorted(found)
+    there = Counter(name for name, _ in {(name, number) for name, number, _ in felt})
+    assert sum(map(len, found.values())) == min(capacity, sum(there.values()))
+    for name, count in there.items():
+        if len(found.get(name, [])) < count:
+            assert len(found.get(name, [])) >= max(map(len, found.values())) - 1
+
+
+def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind():
+    pool = ExemplarPool(6)
+    near, far, brief, briefer = (exemplar("a", number, 2) for number in (9, 1, 7, 8))
+    scales, codes = (20, 20, 5, 5), ([1, 0, 0], [90, 0, 0], [0, 0, 0], [0, 0, 0])
+    for one, scale, code in zip((near, far, brief, briefer), scales, codes, strict=True):
+        pool.add(Exemplar("a", one.key, one.readings, np.array(code, np.int32), scale))
+    asked = []
+
+    def means(material, scale):
+        asked.append((material, scale))
+        return np.zeros(3, np.int64)
+
+    assert [one.key[0] for one in rank(pool, means)["a"]] == [9, 1, 7, 8]
+    assert asked == [("a", 20)]
+
+
+def test_no_candidates_make_no_buffer():
+    pool = ExemplarPool(3)
+    assert rank(pool, lambda *_: np.zeros(3, np.int64)) == {}
+    assert len(ExemplarPool.from_arrays(*pool.to_arrays(), 3)) == 0
+
+
+def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
+    rng = np.random.default_rng(0)
+    centres = rng.integers(-LARGEST // 2, LARGEST // 2, (4, 12))
+    codes = np.concatenate([c + rng.integers(-LARGEST // 4, LARGEST // 4, (60, 12)) for c in centres]).astype(np.int32)
+    found = compare(codes, keys_of(240), [f"m{at // 60}" for at in range(240)], 40, seed=1)
+    assert list(found) == ["full", "pooled-2", "pooled-3", "pooled-4", "live", "random"]
+    assert found["full"].shared == found[f"pooled-{CANDIDATES}"].shared == 1
+    assert found["live"].shared < 0.9
+    assert found[f"pooled-{CANDIDATES}"].gap < 0.5 * found["random"].gap
+    assert found["full"].to_full == 1 <= found[f"pooled-{CANDIDATES}"].to_full < 1.6
+
+
+def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
+    from examples.benchmarks.buffer_study import run_buffers
+    from scroll_tactile import Kernels
+    from scroll_tactile.datasets import Recordings
+    from scroll_tactile.datasets.simulator import Scene
+    from scroll_tactile.sensors import Sensor
+
+    pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
+    scene = Scene(sensor=pad)
+    labelled = [(name, at) for at in range(6) for name in scene.materials[:3]]
+    recordings = Recordings(
+        name="simulated",
+        sensor=pad,
+        streams=[scene.touch(name, at) for name, at in labelled],
+        materials=[name for name, _ in labelled],
+        repetition=np.array([at for _, at in labelled]),
+        fold=np.array([at % 3 for _, at in labelled]),
+        ordered=True,
+    )
+    result = run_buffers(recordings, Kernels(dimension=64), (6,))
+    ways = {record["way"]: record for record in result["records"]}
+    assert set(ways) == {"full", "pooled-2", "pooled-3", "pooled-4", "live", "random"}
+    assert ways["pooled-3"]["overlap"] == 1
+    assert all(0 <= record["tuned"] <= 1 and record["gap"] > 0 for record in ways.values())

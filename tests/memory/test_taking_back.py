@@ -1,0 +1,648 @@
+"""What was observed is taken back, brought together, made small and made durable in bulk: exactly."""
+
+import sqlite3
+import threading
+from contextlib import closing
+
+import numpy as np
+import pytest
+from test_learner_machine import PAD, SETTINGS, SMALL, SmallPool, fed, require_same, stream
+
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.errors import (
+    FineTuneError,
+    InputError,
+    MismatchError,
+    ObservationError,
+    StreamError,
+    UnknownMaterialError,
+)
+from scroll_tactile.signals.stream import validate
+from store import (
+    CompactedError,
+    DamageError,
+    LockedError,
+    ReadOnlyError,
+    Store,
+    StoreError,
+    StoreFullError,
+    repair_store,
+)
+
+FELT = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "m"
+
+
+def filled(path, felt=FELT, **settings):
+    learner = TactileLearner.open(path, **SETTINGS | settings)
+    return learner, [learner.observe(name, stream(touch)) for name, touch in felt]
+
+
+def without(*places):
+    return [one for at, one in enumerate(FELT) if at not in places]
+
+
+class TestRetract:
+    def test_a_receipt_is_taken_back_for_good(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.retract(receipts[4])
+            require_same(learner, without(4))
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, without(4))
+            again.retract(receipts[0].sequence)
+            require_same(again, without(0, 4))
+
+    def test_it_is_in_the_journal_when_it_returns(self, path):
+        learner, receipts = filled(path)
+        learner.retract(receipts[4])
+        with TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+            require_same(reader, without(4))
+        learner.close()
+
+    def test_of_a_stream_felt_twice_one_stays(self, path):
+        learner, receipts = filled(path, [*FELT, FELT[1]])
+        with learner:
+            learner.retract(receipts[1])
+            require_same(learner, FELT)
+            learner.retract(receipts[-1])
+            require_same(learner, without(1))
+
+    @pytest.mark.parametrize("wrong", [0, -1, 99, True, 1.5, None])
+    def test_what_is_not_there_is_refused(self, path, wrong):
+        learner, _ = filled(path)
+        with learner:
+            with pytest.raises(ObservationError, match="there is no observation"):
+                learner.retract(wrong)
+            require_same(learner, FELT)
+
+    def test_twice_is_refused(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.retract(receipts[2])
+            with pytest.raises(ObservationError, match=r"observation 3 .* was taken back already"):
+                learner.retract(receipts[2])
+            with pytest.raises(ObservationError, match=r"row 13 .* is no observation, but of kind 'retract'"):
+                learner.retract(13)
+            require_same(learner, without(2))
+
+    def test_a_receipt_of_another_memory_is_refused(self, path, tmp_path):
+        learner, _ = filled(path)
+        other, receipts = filled(tmp_path / "other", FELT[::-1])
+        with learner, other:
+            with pytest.raises(ObservationError, match=r"receipt is of another memory: .* of 'c'.* it is of 'a'"):
+                learner.retract(receipts[0])
+            require_same(learner, FELT)
+
+    def test_without_a_journal_nothing_can_be_taken_back(self):
+        learner = fed(FELT)
+        for call in (lambda: learner.retract(1), lambda: learner.forget("a"), learner.compact):
+            with pytest.raises(InputError, match="a memory without a path keeps no journal"):
+                call()
+
+    def test_a_reader_cannot(self, path):
+        learner, receipts = filled(path)
+        learner.close()
+        with TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+            for call in (lambda: reader.retract(receipts[0]), lambda: reader.forget("a"), reader.compact):
+                with pytest.raises(ReadOnlyError):
+                    call()
+            require_same(reader, FELT)
+
+    def test_a_full_disk_changes_nothing(self, path, monkeypatch):
+        learner, receipts = filled(path)
+        with learner:
+
+            def full(*_, **__):
+                raise StoreFullError("no space left")
+
+            with monkeypatch.context() as broken:
+                broken.setattr(learner._ledger.store, "append", full)
+                with pytest.raises(StoreFullError):
+                    learner.retract(receipts[0])
+                with pytest.raises(StoreFullError):
+                    learner.forget("b")
+            require_same(learner, FELT)
+            learner.retract(receipts[0])
+            require_same(learner, without(0))
+
+
+class TestForget:
+    def test_a_material_was_never_felt(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.retract(receipts[1])
+            assert learner.forget("b") == 3
+            left = [one for one in FELT if one[0] != "b"]
+            require_same(learner, left)
+            with pytest.raises(UnknownMaterialError, match="'b' was never felt"):
+                learner.forget("b")
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, left)
+
+    def test_all_of_them_leave_an_empty_memory(self, path):
+        learner, _ = filled(path)
+        with learner:
+            for name in "abc":
+                learner.forget(name)
+            assert learner.materials == {}
+            assert learner.predict(stream((1, 60))).material is None
+            assert learner.digest() == fed([]).digest()
+            learner.observe("a", stream((0, 60)))
+            require_same(learner, [("a", (0, 60))])
+
+
+class TestTuned:
+    def test_what_it_was_made_from_takes_it_along(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.fine_tune(epochs=1)
+            made = learner.tuned_digest()
+            later = learner.observe("a", stream((9, 60)))
+            learner.retract(later)  # felt after it was made
+            assert learner.tuned_digest() == made
+            learner.retract(receipts[3])
+            assert learner.tuned_digest() is None
+        with TactileLearner.open(path, **SETTINGS) as again:
+            assert again.tuned_digest() is None
+            again.fine_tune(epochs=1)
+            whole = fed(without(3))
+            whole.fine_tune(epochs=1)
+            assert again.tuned_digest() == whole.tuned_digest()
+
+    def test_taken_back_while_it_is_being_made(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            taken = []
+
+            def progress(what, done, of):
+                if not taken:
+                    taken.append(learner.retract(receipts[0]))
+
+            with pytest.raises(FineTuneError, match="was taken back meanwhile"):
+                learner.fine_tune(epochs=1, progress=progress)
+            assert learner.tuned_digest() is None
+
+    def test_it_stays_over_a_compaction(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.fine_tune(epochs=1)
+            made = learner.tuned_digest()
+            learner.compact(keep=2)
+            assert learner.tuned_digest() == made
+        with TactileLearner.open(path, **SETTINGS) as again:
+            assert again.tuned_digest() == made
+            again.retract(receipts[-1])
+            assert again.tuned_digest() is None
+
+
+class TestBatch:
+    def test_all_are_there_at_its_end_and_none_before(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            reader = TactileLearner.open(path, mode="read", **SETTINGS)
+            with learner.batch():
+                receipts = [learner.observe(name, stream(touch)) for name, touch in FELT]
+                learner.retract(receipts[5])
+                require_same(learner, without(5))
+                assert not any(receipt.durable for receipt in receipts)
+                assert not reader.refresh()
+            assert reader.refresh()
+            require_same(reader, without(5))
+            reader.close()
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, without(5))
+
+    def test_what_came_before_an_error_is_kept(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            with pytest.raises(StreamError), learner.batch():
+                for name, touch in FELT[:3]:
+                    learner.observe(name, stream(touch))
+                learner.observe("a", [])
+            require_same(learner, FELT[:3])
+            with pytest.raises(FileNotFoundError), learner.batch():
+                (path / "nothing").read_bytes()
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, FELT[:3])
+
+    def test_one_that_cannot_be_made_durable_never_was(self, path, monkeypatch):
+        learner, _ = filled(path, FELT[:3])
+        with learner:
+            journal = learner._ledger.store._journal
+            insert, calls = journal.insert, []
+
+            def full(*row):
+                calls.append(row)
+                if len(calls) == 3:
+                    journal._connection.execute("ROLLBACK")  # as SQLite does when the disk is full
+                    raise StoreFullError("no space left")
+                return insert(*row)
+
+            with monkeypatch.context() as broken:
+                broken.setattr(journal, "insert", full)
+                with pytest.raises(StoreError), learner.batch():
+                    for name, touch in FELT[3:]:
+                        learner.observe(name, stream(touch))
+            require_same(learner, FELT[:3])
+            learner.observe(*[FELT[3][0], stream(FELT[3][1])])
+            require_same(learner, FELT[:4])
+
+    def test_within_it_nothing_that_needs_a_generation(self, path):
+        learner, _ = filled(path)
+        with learner:
+            with learner.batch():
+                for call in (learner.compact, learner.fine_tune, learner.close):
+                    with pytest.raises(InputError, match="end it first"):
+                        call()
+                with pytest.raises(InputError, match="end the batch"):
+                    learner.merge(path, shared="once")
+                with learner.batch():  # a batch in a batch is the same batch
+                    learner.observe("a", stream((9, 60)))
+            require_same(learner, [*FELT, ("a", (9, 60))])
+
+    def test_other_threads_wait_for_its_end(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            receipts = []
+            with learner.batch():
+                learner.observe("a", stream((0, 60)))
+                thread = threading.Thread(target=lambda: receipts.append(learner.observe("b", stream((1, 60)))))
+                thread.start()
+                thread.join(0.1)
+                assert receipts == []
+            thread.join()
+            assert receipts[0].durable
+
+    def test_without_a_path_it_is_nothing(self):
+        learner = TactileLearner(**SETTINGS)
+        with learner.batch():
+            learner.observe("a", stream((0, 60)))
+        require_same(learner, [("a", (0, 60))])
+
+
+class TestMerge:
+    def test_two_memories_become_the_one_that_felt_all(self, path, tmp_path):
+        ours, _ = filled(path, FELT[:7])
+        theirs, _ = filled(tmp_path / "other", FELT[5:])
+        steps = []
+        with ours, theirs:
+            merged = ours.merge(theirs, shared="once", progress=lambda *step: steps.append(step))
+            assert (merged.observations, merged.shared) == (5, 2)
+            require_same(ours, FELT)
+            require_same(theirs, FELT[5:])
+            assert steps[-1] == ("merging", 5, 5)
+            assert ours.merge(theirs, shared="once").observations == 0
+            assert ours.merge(theirs, shared="twice").observations == 7
+            require_same(ours, FELT + FELT[5:])
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, FELT + FELT[5:])
+            assert again.forget("a") == 4 + 2
+
+    def test_a_compacted_memory_comes_in_as_a_whole(self, path, tmp_path):
+        ours, _ = filled(path, FELT[:4])
+        theirs, _ = filled(tmp_path / "other", FELT[4:])
+        with ours, theirs:
+            theirs.compact(keep=2)
+            ours.merge(tmp_path / "other", shared="once")
+            require_same(ours, FELT)
+            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 2 of its 4"):
+                ours.forget("a")
+            with pytest.raises(ObservationError, match=r"6 streams that both .* cannot be counted once"):
+                ours.merge(theirs, shared="once")
+            ours.compact()
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, FELT)
+            third = TactileLearner.open(tmp_path / "third", **SETTINGS)
+            with third:
+                third.merge(again, shared="once")
+                require_same(third, FELT)
+
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({"embedding": Kernels(seed=3, dimension=64)}, "their embeddings differ.* fingerprint"),
+            ({"embedding": Kernels(seed=0, dimension=128)}, "their embeddings differ.* dimension 64.* dimension 128"),
+            (
+                {"sensor": Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=2.0, unit="N", duration=1.0)},
+                "their sensors differ.* high 1.0.* high 2.0",
+            ),
+        ],
+    )
+    def test_memories_of_another_making_are_refused(self, path, tmp_path, settings, said):
+        ours, _ = filled(path)
+        theirs, _ = filled(tmp_path / "other", FELT[:3], **settings)
+        with ours, theirs:
+            with pytest.raises(MismatchError, match=said) as caught:
+                ours.merge(theirs, shared="twice")
+            assert str(path) in str(caught.value)
+            assert str(tmp_path / "other") in str(caught.value)
+            require_same(ours, FELT)
+
+    def test_without_readings_its_exemplars_cannot_be_had(self, path, tmp_path):
+        ours, _ = filled(path)
+        theirs, _ = filled(tmp_path / "other", FELT[:3], exemplars=0)
+        with ours, theirs:
+            with pytest.raises(MismatchError, match="kept no readings"):
+                ours.merge(theirs, shared="twice")
+            theirs.merge(ours, shared="once")  # the other way round nothing is missing
+            assert theirs.digest() == fed(FELT).digest()
+            theirs.compact()
+            with pytest.raises(MismatchError, match="was compacted and keeps exemplars"):
+                ours.merge(theirs, shared="twice")
+            require_same(ours, FELT)
+
+    def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
+        ours, _ = filled(path)
+        with ours:
+            with pytest.raises(MismatchError, match="into itself"):
+                ours.merge(path, shared="twice")
+            with pytest.raises(StoreError, match="holds no store"):
+                ours.merge(tmp_path / "none", shared="twice")
+            with pytest.raises(InputError, match="without a path"):
+                ours.merge(fed(FELT), shared="twice")
+            with pytest.raises(InputError, match="'once' or 'twice'"):
+                ours.merge(path, shared="thrice")
+            require_same(ours, FELT)
+
+    def test_cut_off_in_the_middle_it_never_began(self, path, tmp_path):
+        ours, _ = filled(path, FELT[:4])
+        theirs, _ = filled(tmp_path / "other", FELT[4:])
+
+        def stop(what, done, of):
+            if done == 3:
+                raise KeyboardInterrupt
+
+        with ours, theirs:
+            with pytest.raises(KeyboardInterrupt):
+                ours.merge(theirs, shared="once", progress=stop)
+            require_same(ours, FELT[:4])
+            ours.merge(theirs, shared="once")
+            require_same(ours, FELT)
+
+
+class TestCompact:
+    def test_what_was_learned_stays_and_can_no_longer_be_taken_back(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            before = sum(learner._ledger.store.size().values())
+            done = learner.compact(keep=3)
+            assert (done.upto, done.bytes_before) == (9, before)
+            require_same(learner, FELT)
+            with pytest.raises(ObservationError, match="rows 1 to 9 were compacted"):
+                learner.retract(receipts[8])
+            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 3 of its 4"):
+                learner.forget("a")
+            learner.retract(receipts[9])
+            require_same(learner, without(9))
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, without(9))
+            again.compact()
+            require_same(again, without(9))
+
+    def test_what_was_taken_back_before_is_gone_from_the_disk(self, path):
+        learner, receipts = filled(path)
+        with learner:
+            learner.retract(receipts[0])
+            learner.compact()
+            require_same(learner, without(0))
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, without(0))
+            with pytest.raises(ObservationError):
+                again.retract(receipts[0])
+        with Store.open(path, mode="read") as store:
+            assert store.compacted == 13
+            assert [head.label for head in store.heads(kind="observe")] == [name for name, _ in FELT]
+
+    def test_it_shrinks_the_journal(self, path):
+        learner, _ = filled(path, [("a", (seed, 90)) for seed in range(300)], embedding=Kernels(seed=0, dimension=256))
+        with learner:
+            size = learner._ledger.store.size()["journal"]
+            learner.compact()
+            assert learner._ledger.store.size()["journal"] < size / 5
+
+    @pytest.mark.parametrize("keep", [-1, True, 1.5, None])
+    def test_a_keep_that_is_no_number_is_refused(self, path, keep):
+        learner, _ = filled(path)
+        with learner, pytest.raises(InputError, match="expected keep as a whole number"):
+            learner.compact(keep=keep)
+
+    def test_an_empty_memory_has_nothing_to_compact(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            assert learner.compact().upto == 0
+            assert learner.compact(keep=5).upto == 0
+
+
+class TestRefresh:
+    def test_a_reader_takes_in_all_that_a_writer_does(self, path, tmp_path):
+        learner, receipts = filled(path)
+        filled(tmp_path / "other", [("d", (0, 60))])[0].close()
+        reader = TactileLearner.open(path, mode="read", **SETTINGS)
+        with learner, reader:
+            assert not reader.refresh()
+            for change, left in (
+                (lambda: learner.retract(receipts[0]), without(0)),
+                (lambda: learner.compact(keep=5), without(0)),
+                (lambda: learner.retract(receipts[-1]), without(0, 11)),
+                (lambda: learner.merge(tmp_path / "other", shared="once"), [*without(0, 11), ("d", (0, 60))]),
+                (learner.compact, [*without(0, 11), ("d", (0, 60))]),
+            ):
+                change()
+                assert reader.refresh()
+                require_same(reader, left)
+                assert not reader.refresh()
+            learner.fine_tune(epochs=1)
+            assert reader.tuned_digest() is None
+            assert reader.refresh()
+            assert reader.tuned_digest() == learner.tuned_digest() is not None
+
+    def test_a_writer_has_nothing_to_take_in(self, path):
+        learner, _ = filled(path)
+        with learner:
+            assert not learner.refresh()
+            with pytest.raises(LockedError, match="process"):
+                TactileLearner.open(path, **SETTINGS)
+
+    def test_before_it_a_reader_goes_on_as_it_was(self, path):
+        learner, receipts = filled(path)
+        reader = TactileLearner.open(path, mode="read", **SETTINGS)
+        with learner, reader:
+            learner.retract(receipts[0])
+            learner.compact()
+            require_same(reader, FELT)
+
+
+def test_many_retractions_leave_what_was_never_taken_back(path):
+    rng = np.random.default_rng(0)
+    felt = [("abcd"[at % 4], (at, 40)) for at in range(60)]
+    learner, receipts = filled(path, felt, embedding=SMALL)
+    with learner:
+        gone = rng.permutation(60)[:45].tolist()
+        for at in gone:
+            learner.retract(receipts[at])
+        require_same(learner, [one for at, one in enumerate(felt) if at not in gone])
+
+
+def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
+    learner, receipts = filled(path)
+    learner.retract(receipts[1])  # before the base
+    learner.retract(receipts[10])  # behind it
+    learner.compact(keep=4)
+    learner.retract(receipts[11])
+    later = learner.observe("a", stream((9, 60)))
+    expected = [*without(1, 10, 11), ("a", (9, 60))]
+    require_same(learner, expected)
+    learner._ledger.store.close()  # as if the power failed
+    with Store.open(path) as store:
+        newest, base = store.newest, store.base().number
+    assert newest != base
+    (path / "generations" / f"{newest:08d}" / "observations" / "c" / "0" / "0").unlink()
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        assert learner._memory.generation == base
+        require_same(learner, expected)
+        learner.retract(later)
+        require_same(learner, expected[:-1])
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        require_same(learner, expected[:-1])
+
+
+def test_what_damage_keeps_from_being_taken_back_is_named(path, caplog):
+    learner, _ = filled(path)
+    learner.close()
+    learner = TactileLearner.open(path, **SETTINGS)
+    learner.retract(1)
+    learner._ledger.store.close()  # as if the power failed: the row is there, a generation without it is not
+    journal = path / "journal.sqlite"
+    data = bytearray(journal.read_bytes())
+    data[data.index(bytes(FELT[4][0], "ascii") + learner_key(FELT[4]))] ^= 1
+    journal.write_bytes(data)
+    repaired = repair_store(path)
+    assert repaired.kept == 13
+    with TactileLearner.open(path, **SETTINGS) as again:
+        require_same(again, FELT)
+    assert "observation 1 was taken back by row 13, and is still in" in caplog.text
+
+
+def learner_key(one):
+    return validate(stream(one[1]), PAD).key
+
+
+def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkeypatch):
+    learner, receipts = filled(path)
+    with learner:
+
+        def interrupted(_):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as broken:
+            broken.setattr(type(learner._ledger.store._journal), "shrink", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                learner.compact(keep=2)
+        require_same(learner, FELT)
+        with pytest.raises(ObservationError, match="rows 1 to 10 were compacted"):
+            learner.retract(receipts[0])
+        learner.retract(receipts[-1])
+        require_same(learner, without(11))
+
+
+def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(path):
+    learner, receipts = filled(path)
+    with learner:
+        learner.retract(receipts[0])
+        reader = TactileLearner.open(path, mode="read", **SETTINGS)
+        with reader:
+            require_same(reader, without(0))
+            learner.observe("d", stream((9, 60)))
+            learner.retract(receipts[1])
+            memory = reader._memory
+            memory._stale = True  # as when the retraction is replayed while the writer goes on
+            memory.refill(reader._ledger.store)
+            require_same(reader, without(0))
+            learner.compact()
+            memory._stale = True
+            with pytest.raises(CompactedError):
+                memory.refill(reader._ledger.store)
+            reader.refresh()
+            require_same(reader, [*without(0, 1), ("d", (9, 60))])
+
+
+def spoil(path, number):
+    """Damage a generation's array on the disk."""
+    (path / "generations" / f"{number:08d}" / "observations" / "c" / "0" / "0").unlink()
+
+
+def test_with_a_damaged_base_nothing_is_taken_back(path):
+    learner, receipts = filled(path)
+    with learner:
+        learner.compact(keep=6)
+        base = learner._ledger.store.base().number
+        spoil(path, base)
+        for call in (lambda: learner.retract(receipts[-1]), lambda: learner.forget("a")):
+            with pytest.raises((DamageError, ObservationError)):
+                call()
+        require_same(learner, FELT)
+        learner.observe("a", stream((9, 60)))
+    with TactileLearner.open(path, **SETTINGS) as again:
+        require_same(again, [*FELT, ("a", (9, 60))])
+
+
+def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
+    learner, receipts = filled(path)
+    learner.compact(keep=6)
+    learner.retract(receipts[-1])
+    learner.retract(receipts[-4])
+    base = learner._ledger.store.base().number
+    learner._ledger.store.close()  # as if the power failed: the retractions are to be replayed
+    spoil(path, base)
+    with TactileLearner.open(path, **SETTINGS) as again:
+        whole = fed(without(11, 8))
+        assert again.digest() == whole.digest()
+        assert again.materials == whole.materials
+        for at in (11, 8):
+            gone = FELT[at][0], learner_key(FELT[at])
+            assert gone not in {(one.material, one.key) for one in again._memory.exemplars}
+            assert gone not in {(name, key) for name, key, _ in again._memory.pool}
+    assert "pool and exemplars now hold only what they held" in caplog.text
+    assert repair_store(path).lost
+    with TactileLearner.open(path, **SETTINGS) as again:
+        assert again.digest() == whole.digest()
+
+
+def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
+    learner, _ = filled(path)
+    learner.fine_tune(epochs=1)
+    latest, looks = Store.latest, []
+
+    def slow(store):
+        found = latest(store)
+        if store.mode == "read" and not looks:
+            looks.append(1)  # between the reader's two looks the writer goes on
+            learner.observe("a", stream((8, 60)))
+            learner.fine_tune(epochs=1)
+            learner.observe("b", stream((9, 60)))
+        return found
+
+    monkeypatch.setattr(Store, "latest", slow)
+    with learner, TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+        require_same(reader, [*FELT, ("a", (8, 60)), ("b", (9, 60))])
+        assert reader.tuned_digest() == learner.tuned_digest()
+
+
+@pytest.mark.parametrize("at", range(12))
+def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, monkeypatch):
+    monkeypatch.setattr("scroll_tactile.memory.state.Pool", SmallPool)
+    felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]
+    learner, receipts = filled(path, felt)
+    with learner:
+        with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+            connection.execute("UPDATE payload SET bytes = x'00' WHERE sequence > 12")
+        left = felt
+        try:
+            learner.retract(receipts[at])
+            left = felt[:at] + felt[at + 1 :]
+        except DamageError as damage:
+            assert "fail their checksum" in str(damage)
+        require_same(learner, left)
+    with TactileLearner.open(path, **SETTINGS) as again:
+        require_same(again, left)

@@ -1,0 +1,86 @@
+"""The paper's systems in the studies of robustness: what they are taught with and without augmentation."""
+
+import numpy as np
+import pytest
+
+from examples.paper.studies.baselines import BASELINES, COPIES, Sometimes, baseline
+from examples.paper.systems.catalogue import Catalogue
+from examples.paper.systems.descent import Course
+from examples.paper.systems.svm import Svm
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.metrics import accuracy
+from scroll_tactile.pipelines.robustness import noise
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.augmentation import Augmentation
+
+PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
+SCENE = Scene(PATCH, seed=0)
+NAMES = SCENE.materials[:3]
+LESSONS = [(name, SCENE.touch(name, at)) for name in NAMES for at in range(12)]
+EXAM = [(name, SCENE.touch(name, at)) for name in NAMES for at in range(12, 18)]
+
+
+def quiet(what: str, done: int, of: int) -> None:
+    """Nobody listens."""
+
+
+def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatch):
+    taught, held = [], []
+    fit = Svm.fit
+
+    def watched(self, streams, materials, validation, *more):
+        taught.append(list(streams))
+        held.append([stream for _, stream in validation])
+        fit(self, streams, materials, validation, *more)
+
+    monkeypatch.setattr(Svm, "fit", watched)
+    make, settings = baseline("svm", Catalogue(), seed=1)
+    for augmented in (False, True):
+        make(LESSONS, augmented, quiet)
+    assert settings["augmentation"]["copies"] == COPIES
+    felt = {stream.key for _, stream in LESSONS}
+    for streams, validation in zip(taught, held, strict=True):
+        assert {stream.key for stream in validation} <= felt
+        assert len(validation) == 3
+        assert not {stream.key for stream in validation} & {stream.key for stream in streams}
+    assert {stream.key for stream in taught[0]} == felt - {stream.key for stream in held[0]}
+    assert len(taught[1]) == len(taught[0]) * (1 + COPIES)
+    assert len({stream.key for stream in taught[1]}) > 1.5 * len(taught[0])
+
+
+def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
+    catalogue = Catalogue(course=Course(epochs=30, batch=8))
+    make, settings = baseline("conv-lstm", catalogue, augmentation=Augmentation(0, (1, 1), 1, noise=0.3, drift=0))
+    assert settings["epochs"] == 30
+    asked = [noise(stream, 0.4, 0) for _, stream in EXAM]
+    plain, tough = (make(LESSONS, augmented, quiet) for augmented in (False, True))
+    shares = [accuracy([name for name, _ in EXAM], list(system.predict(asked))) for system in (plain, tough)]
+    assert shares[1] > shares[0]
+    clean = [stream for _, stream in EXAM]
+    assert list(make(LESSONS, True, quiet).predict(clean)) == list(tough.predict(clean))
+
+
+def test_some_touches_stay_as_they_were_felt():
+    stream = SCENE.touch("felt", 0)
+
+    def same(one):
+        return len(one) == len(stream) and np.allclose(one.readings, stream.readings, rtol=0, atol=1e-3)
+
+    for share, (least, most) in {0.0: (1, 1), 0.3: (0.5, 0.9), 1.0: (0, 0)}.items():
+        made = Sometimes(share=share).streams([stream] * 60, np.random.default_rng(0))
+        assert least <= np.mean([same(one) for one in made]) <= most
+
+
+def test_the_validation_is_drawn_by_the_seed_alone():
+    first, second = (baseline("svm", Catalogue(), seed=seed)[1] for seed in (0, 1))
+    assert first["seed"] != second["seed"]
+    before = np.random.get_state()[1].copy()  # noqa: NPY002 (it is looked at only)
+    baseline("svm-spikes", Catalogue())[0](LESSONS, True, quiet)
+    assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+
+
+def test_systems_that_are_no_baselines_are_refused():
+    assert BASELINES == ("svm", "svm-spikes", "conv-lstm", "snn", "resnet", "resnet-pretrained")
+    with pytest.raises(InputError, match="came 'kernels-lda'"):
+        baseline("kernels-lda", Catalogue())

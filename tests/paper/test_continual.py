@@ -1,0 +1,268 @@
+"""The continual pipeline and its command, on simulated touches; a tiny part of the real ones where they are at hand."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from examples.paper.commands.continual_command import parse_sizes
+from examples.paper.studies.continual_study import Continual
+from scroll_tactile import Kernels, TactileLearner, sensors
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.continual import accuracy_of, curve, forgetting, forgetting_of, part_ends, summary, tally
+
+SMALL: dict[str, Any] = {"sizes": (0, 8, "all"), "epochs": 1}
+
+
+@pytest.fixture(scope="module")
+def recordings() -> Recordings:
+    """Four materials under a simulated RoboSkin, eight touches each, in two folds."""
+    scene = Scene(sensors.ROBOSKIN)
+    names = scene.materials[:4]
+    return Recordings(
+        name="simulated",
+        sensor=scene.sensor,
+        streams=[scene.touch(name, at) for name in names for at in range(8)],
+        materials=[name for name in names for _ in range(8)],
+        repetition=np.tile(np.arange(8), 4),
+        fold=np.tile(np.arange(8) % 2, 4),
+        ordered=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(recordings: Recordings) -> list[dict[str, Any]]:
+    return list(Continual(recordings, Kernels(dimension=64), **SMALL).run([0, 1]))
+
+
+def figures(folds: Any) -> Any:
+    """Without the times, as JSON has them."""
+    if isinstance(folds, dict):
+        return {name: figures(value) for name, value in folds.items() if not name.endswith("seconds")}
+    return [figures(value) for value in folds] if isinstance(folds, (list, tuple)) else folds
+
+
+class TestForgetting:
+    def test_by_hand(self) -> None:
+        moments = [{"a": 1.0}, {"a": 0.5, "b": 0.75}, {"a": 0.75, "b": 0.25, "c": 1.0}]
+        assert forgetting(moments) == pytest.approx(((1 - 0.75) + (0.75 - 0.25)) / 2)
+
+    def test_what_got_better_counts_below_nothing(self) -> None:
+        assert forgetting([{"a": 0.5}, {"a": 1.0, "b": 0.0}]) == -0.5
+
+    def test_one_moment_has_none(self) -> None:
+        assert forgetting([{"a": 0.5}]) is None
+        with pytest.raises(InputError, match="came none"):
+            forgetting([])
+        with pytest.raises(InputError, match="'a'"):
+            forgetting([{"a": 0.5}, {"b": 0.5}])
+
+    def test_counts_are_put_in_the_order_of_learning(self) -> None:
+        points = {"10": {"a": [1, 2], "b": [2, 2]}, "9": {"a": [2, 2]}}
+        assert forgetting_of(points) == 0.5
+        assert curve(points) == [[1, 1.0], [2, 0.75]]
+        assert accuracy_of(points["10"]) == 0.75
+
+    def test_tally(self) -> None:
+        assert tally(["a", "b", "a"], ["a", None, "b"]) == {"a": [1, 2], "b": [0, 1]}
+        with pytest.raises(InputError, match="as many"):
+            tally(["a"], [])
+
+
+def test_parts_end_with_a_material_or_are_equally_long() -> None:
+    assert part_ends("class-by-class", ["b", "b", "b", "a", "c", "c"]) == [3, 4, 6]
+    assert part_ends("shuffled", ["b", "a", "b", "c", "a", "c", "b"]) == [2, 5, 7]
+
+
+class TestContinual:
+    def test_a_fold_has_all_figures(self, whole: list[dict[str, Any]]) -> None:
+        fold = whole[1]
+        assert (fold["fold"], fold["learned"], fold["tested"]) == (1, 16, 16)
+        assert fold["equals_offline"]
+        assert [met for met, _ in fold["f"]["curve"]] == [1, 2, 3, 4]
+        assert fold["f"]["curve"][-1][1] == fold["f"]["accuracy"] > 0.7
+        assert 0 <= fold["f"]["forgetting"] <= 1
+        assert fold["ridge"] > 0.7
+        assert list(fold["tuned"]) == ["0", "8", "all"]
+        assert json.loads(json.dumps(fold)) == fold
+
+    def test_without_exemplars_f_answers(self, whole: list[dict[str, Any]]) -> None:
+        none = whole[0]["tuned"]["0"]
+        assert (none["kept"], none["exemplars"], none["accuracy"]) == (False, 0, whole[0]["f"]["accuracy"])
+
+    def test_a_buffer_is_of_its_size_and_of_no_order(self, whole: list[dict[str, Any]]) -> None:
+        for fold in whole:
+            small, large = fold["tuned"]["8"], fold["tuned"]["all"]
+            assert (small["exemplars"], large["exemplars"]) == (8, 16)
+            assert small["buffer_of_another_order"] and large["buffer_of_another_order"]
+            assert small["buffer_digest"] != large["buffer_digest"]
+            assert small["bytes_per_exemplar"] == 75 * 60 * 4
+            for part in (small, large):
+                assert part["accuracy"] >= 0.5
+                assert isinstance(part["reason"], str)
+                assert part["kept"] or part["accuracy"] == fold["f"]["accuracy"]
+
+    def test_peers_are_there_for_each_size_and_beat_chance(self, whole: list[dict[str, Any]]) -> None:
+        peers = whole[0]["peers"]
+        assert [(peer["peer"], peer["size"]) for peer in peers] == [
+            ("nearest mean", None),
+            ("streaming LDA", None),
+            ("RanPAC", None),
+            ("naive fine-tuning", None),
+            ("GDumb", "8"),
+            ("experience replay", "8"),
+            ("GDumb", "all"),
+            ("experience replay", "all"),
+        ]
+        for peer in peers:
+            assert [met for met, _ in peer["curve"]] == [1, 2, 3, 4]
+            if peer["peer"] != "naive fine-tuning":
+                assert peer["accuracy"] > 0.4, peer
+
+    def test_an_interrupted_run_goes_on_to_the_same_figures(
+        self, recordings: Recordings, whole: list[dict[str, Any]], tmp_path: Path
+    ) -> None:
+        task = Continual(recordings, Kernels(dimension=64), **SMALL, folder=tmp_path / "kept")
+        told: list[str] = []
+        for stop in ("f: learning", "fine-tuning", "RanPAC"):
+
+            def interrupt(what: str, done: int, of: int, stop: str = stop) -> None:
+                told.append(what)
+                if stop in what and (stop != "f: learning" or done == 10):
+                    raise KeyboardInterrupt
+
+            with pytest.raises(KeyboardInterrupt):
+                list(task.run([0, 1], interrupt))
+        resumed = list(task.run([0, 1], lambda what, done, of: told.append(what)))
+        assert figures(resumed) == figures(whole)
+        assert told.count("offline: learning") == 2 * 16  # once in each fold
+        told.clear()
+        assert figures(list(task.run([0, 1], lambda what, done, of: told.append(what)))) == figures(whole)
+        assert told == []
+        with pytest.raises(InputError, match="seed 0 there, 1 here"):
+            list(Continual(recordings, Kernels(dimension=64), seed=1, **SMALL, folder=tmp_path / "kept").run([0]))
+
+    def test_the_order_changes_neither_f_nor_its_buffer_nor_f_star(
+        self, recordings: Recordings, whole: list[dict[str, Any]]
+    ) -> None:
+        task = Continual(recordings, Kernels(dimension=64), "shuffled", sizes=(8,), epochs=1, peers=False, curve=2)
+        (fold,) = task.run([0])
+        assert fold["digest"] == whole[0]["digest"]
+        for name in ("buffer_digest", "tuned_digest", "accuracy"):
+            assert fold["tuned"]["8"][name] == whole[0]["tuned"]["8"][name]
+        assert fold["peers"] == []
+
+    def test_f_star_can_be_measured_on_the_way(self, recordings: Recordings, whole: list[dict[str, Any]]) -> None:
+        task = Continual(recordings, Kernels(dimension=64), sizes=(8,), epochs=1, peers=False, tuned_curve=True)
+        (fold,) = task.run([0])
+        tuned = fold["tuned"]["8"]
+        assert [met for met, _ in tuned["curve"]] == [1, 2, 3, 4]
+        assert tuned["forgetting"] is not None
+        # What was tuned on the way leaves no trace in the last one.
+        assert tuned["tuned_digest"] == whole[0]["tuned"]["8"]["tuned_digest"]
+
+    def test_what_cannot_be_is_refused(self, recordings: Recordings) -> None:
+        embedding = Kernels(dimension=64)
+        with pytest.raises(InputError, match="each of the 4 materials at least; came 3"):
+            Continual(recordings, embedding, sizes=(0, 3))
+        with pytest.raises(InputError, match="came -1"):
+            Continual(recordings, embedding, sizes=(-1,))
+        with pytest.raises(InputError, match="size"):
+            Continual(recordings, embedding, sizes=())
+        with pytest.raises(InputError, match="curve"):
+            Continual(recordings, embedding, curve=-1)
+        with pytest.raises(InputError, match="folds out of"):
+            list(Continual(recordings, embedding).run([2]))
+
+    def test_a_summary_has_a_row_for_each_method_and_size(self, whole: list[dict[str, Any]]) -> None:
+        rows = summary(whole)
+        assert [(row["method"], row["size"]) for row in rows[:5]] == [
+            ("f", None),
+            ("f*", "0"),
+            ("f*", "8"),
+            ("f*", "all"),
+            ("ridge", None),
+        ]
+        mean = (whole[0]["f"]["accuracy"] + whole[1]["f"]["accuracy"]) / 2
+        assert rows[0]["accuracy"]["mean"] == pytest.approx(mean)
+        assert (rows[2]["forgetting"], rows[2]["exemplars"]["mean"]) == (None, 8)
+        assert summary([]) == []
+
+
+def test_the_ridge_floor_is_the_ridge_readout(recordings: Recordings, whole: list[dict[str, Any]]) -> None:
+    learner = TactileLearner(sensor=recordings.sensor, embedding=Kernels(dimension=64), readout="ridge")
+    touches = list(zip(recordings.materials, recordings.streams, recordings.fold, strict=True))
+    for name, stream, fold in touches:
+        if fold != 0:
+            learner.observe(name, stream)
+    right = [learner.predict(stream).material == name for name, stream, fold in touches if fold == 0]
+    assert whole[0]["ridge"] == np.mean(right)
+
+
+class TestCommand:
+    @pytest.fixture
+    def simulated(self, recordings: Recordings, monkeypatch: pytest.MonkeyPatch) -> list[object]:
+        module = sys.modules[
+            "examples.paper.commands.continual_command"
+        ]  # by its dotted name the command itself is found
+        monkeypatch.setattr(module, "read", lambda dataset, data, seed: recordings)
+        return ["continual", "roboskin-20", "--data", "simulated", "--features", 64, "--sizes", "0,8", "--epochs", 1]
+
+    def test_it_measures_writes_and_draws(self, simulated: list[object], tmp_path: Path) -> None:
+        files = ["--json", tmp_path / "r.json", "--plot", tmp_path / "p.png", "--memory", tmp_path / "kept"]
+        result = run(*simulated, *files)
+        assert result.exit_code == 0, result.output
+        for words in ("streaming LDA", "f*", "ridge", "f equals offline training: yes", "another order: yes"):
+            assert words in result.stdout
+        found = json.loads((tmp_path / "r.json").read_text())
+        assert found["command"].startswith("scroll-tactile continual roboskin-20 --data simulated --embedding kernels")
+        assert {"versions", "date", "machine", "seed", "sensor", "means"} <= set(found)
+        assert found["embedding"]["dimension"] == 64
+        assert len(found["folds"]) == 2
+        pytest.importorskip("matplotlib")
+        assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG"
+        again = run(*simulated, "--memory", tmp_path / "kept", "--no-peers", "--json", tmp_path / "again.json")
+        assert again.exit_code == 0, again.output
+        assert "streaming LDA" not in again.stdout
+        kept = json.loads((tmp_path / "again.json").read_text())["folds"]
+        assert [fold["tuned"] for fold in kept] == [fold["tuned"] for fold in found["folds"]]
+
+    def test_without_matplotlib_it_says_so(self, simulated: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("examples.paper.plots.drawing.available", lambda: False)
+        result = run(*simulated, "--sizes", "0", "--no-peers", "--folds", "0", "--curve", 0, "--plot", "p.png")
+        assert result.exit_code == 0, result.output
+        assert 'pip install "scroll-tactile[plots]"' in result.stdout
+
+    def test_errors_are_one_line(self, simulated: list[object], tmp_path: Path) -> None:
+        assert "each of the 4 materials" in refused(*simulated, "--sizes", "0,3")
+        assert "came '20,many'" in refused(*simulated, "--sizes", "20,many")
+        assert "needs --weights" in refused(*simulated, "--embedding", "vision")
+        assert "has no weights" in refused(*simulated, "--weights", "resnet18")
+        assert "none.pth" in refused(*simulated, "--embedding", "vision", "--weights", tmp_path / "none.pth")
+        assert "folder that exists" in refused(*simulated, "--json", tmp_path / "none" / "r.json")
+        assert "--folds" in refused(*simulated, "--folds", "first")
+        assert run(*simulated, "--schedule", "backwards").exit_code == 2
+
+    def test_help_is_there(self) -> None:
+        result = run("continual", "--help")
+        assert result.exit_code == 0
+        assert "Usage" in result.stdout
+
+    def test_sizes(self) -> None:
+        assert parse_sizes("0, 20,all,20") == (0, 20, "all")
+        for text in ("", "-1", "1.5", "20,", "ALL", "²"):
+            with pytest.raises(InputError, match="--sizes"):
+                parse_sizes(text)
+
+    def test_a_few_real_touches(self, real_data: Path, tmp_path: Path) -> None:
+        options = ["--data", real_data, "--folds", "0", "--materials", 2, "--features", 64, "--sizes", 0, "--curve", 0]
+        result = run("continual", "roboskin-20", *options, "--json", tmp_path / "r.json")
+        assert result.exit_code == 0, result.output
+        (fold,) = json.loads((tmp_path / "r.json").read_text())["folds"]
+        assert (fold["learned"], fold["tested"], fold["equals_offline"]) == (80, 20, True)

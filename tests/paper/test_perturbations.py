@@ -1,0 +1,105 @@
+"""Perturbations change a stream as they say, by a seed and its content alone."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Sensor, sensors
+from scroll_tactile.errors import InputError, StreamTooShortError
+from scroll_tactile.pipelines.robustness import STUDIES, dead, drift, length, noise, speed
+from scroll_tactile.signals.stream import validate
+
+PAD = Sensor(name="pad", channels=10, rate=50.0, low=-2.0, high=6.0, unit="N", duration=2.0)
+DRAWN = (noise, dead, drift)
+
+
+def touch(seed=0, readings=100):
+    return validate(np.random.default_rng(seed).uniform(1, 3, size=(readings, 10)), PAD)
+
+
+@pytest.mark.parametrize("perturb", DRAWN)
+class TestWhatIsDrawn:
+    def test_by_the_seed_and_the_content_alone(self, perturb):
+        first, second = touch(0), touch(1)
+        alone = perturb(second, 0.3, 7)
+        perturb(first, 0.3, 7)
+        assert perturb(second, 0.3, 7) == alone
+        assert perturb(second, 0.3, 8) != alone
+        assert perturb(first, 0.3, 7) != alone
+
+    def test_nothing_is_done_without_strength(self, perturb):
+        stream = touch()
+        assert perturb(stream, 0.0, 7) is stream
+
+    def test_it_stays_a_stream_of_its_sensor_and_leaves_the_one_that_came(self, perturb):
+        stream = touch()
+        before = stream.readings.tobytes()
+        changed = perturb(stream, 1.0, 0)
+        assert (changed.sensor, len(changed), changed.clipped) == (PAD, 100, 0)
+        assert changed.readings.min() >= -2
+        assert changed.readings.max() <= 6
+        assert stream.readings.tobytes() == before
+
+    @pytest.mark.parametrize("strength", [-0.1, np.nan, np.inf])
+    def test_strengths_that_cannot_be_are_refused(self, perturb, strength):
+        with pytest.raises(InputError):
+            perturb(touch(), strength, 0)
+
+
+def test_noise_is_as_wide_as_it_says():
+    stream = validate(np.full((2000, 10), 2.0), PAD)
+    added = noise(stream, 0.25, 0).readings - 2
+    assert 1.98 < np.abs(added).max() <= 2.001  # a quarter of the range of 8
+    assert abs(added.std() - 2 / 3**0.5) < 0.02
+    loud = noise(stream, 1.0, 0).readings
+    assert (loud.min(), loud.max()) == (-2, 6)
+
+
+def test_dead_channels_read_the_low_end_and_the_others_as_before():
+    stream = touch()
+    changed = dead(stream, 0.3, 0).readings
+    gone = (changed == -2).all(axis=0)
+    assert gone.sum() == 3
+    np.testing.assert_allclose(changed[:, ~gone], stream.readings[:, ~gone], atol=1e-5)
+    assert (dead(stream, 1.0, 0).readings == -2).all()
+    with pytest.raises(InputError, match=r"0 to 1; came 1\.5"):
+        dead(stream, 1.5, 0)
+
+
+def test_drift_grows_from_nothing():
+    stream = touch()
+    off = np.abs(drift(stream, 0.1, 0).readings - stream.readings)
+    np.testing.assert_allclose(off[0], 0, atol=1e-5)
+    assert off[-20:].mean() > 3 * off[:20].mean()
+    assert off.max() <= 0.1 * 8 + 0.1 * 5 + 1e-5  # of the range, and of what lies above the low end
+
+
+@pytest.mark.parametrize(("factor", "readings"), [(0.25, 400), (0.5, 200), (2, 50), (4, 25), (100, 5)])
+def test_faster_is_shorter_between_the_same_ends(factor, readings):
+    ramp = validate(np.linspace(0, 4, 100)[:, None].repeat(10, axis=1), PAD)
+    changed = speed(ramp, factor)
+    np.testing.assert_allclose(changed.readings[:, 0], np.linspace(0, 4, readings), atol=1e-5)
+
+
+def test_speed_one_and_the_whole_length_are_the_touch_itself():
+    stream = touch()
+    assert speed(stream, 1.0) is stream
+    assert length(stream, 2.0) is stream
+    assert length(stream, 0.3) == stream.first(0.3)
+
+
+def test_what_cannot_be_is_refused():
+    for factor in (0, -1, np.nan):
+        with pytest.raises(InputError, match="above 0"):
+            speed(touch(), factor)
+    with pytest.raises(StreamTooShortError):
+        length(touch(), 0.05)
+    frame = validate(np.zeros((1, *sensors.GELSIGHT.shape)), sensors.GELSIGHT)
+    with pytest.raises(InputError, match="whole frames"):
+        noise(frame, 0.5, 0)
+
+
+def test_every_study_has_the_strengths_that_are_quoted():
+    for name, strength in (("length", 0.3), ("speed", 0.5), ("speed", 2.0), ("noise", 0.5), ("dead", 0.2)):
+        for quick in (True, False):
+            assert strength in STUDIES[name].of(sensors.BIOTAC, quick=quick)
+    assert STUDIES["length"].of(sensors.ROBOSKIN)[-1] == sensors.ROBOSKIN.duration

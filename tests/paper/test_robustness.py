@@ -1,0 +1,169 @@
+"""Studies ask systems that learned from clean touches about perturbed ones, and go on where they were."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import refused, run
+from test_perturbations import PAD
+
+from examples.paper.plots import drawing as plots
+from examples.paper.plots.plots_robustness import curves, draw_robustness
+from examples.paper.studies.robustness_study import Robustness, ours, summary, worst
+from scroll_tactile import Kernels
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.gel import Gel
+from scroll_tactile.embeddings import Robust
+from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.stream import validate
+
+MATERIALS = ("dull", "loud", "lost")
+
+
+def recordings(*, ordered=True):
+    rng = np.random.default_rng(0)
+    streams, names = [], []
+    for at, name in enumerate(MATERIALS):
+        for _ in range(20):
+            rhythm = np.sin(np.arange(100)[:, None] * (at + 1) / 5 + rng.uniform(0, 6, (1, 10)))
+            streams.append(validate(2 + rhythm + 0.1 * rng.standard_normal((100, 10)), PAD))
+            names.append(name)
+    repetition = np.tile(np.arange(20), 3)
+    return Recordings("made up", PAD, streams, names, repetition, repetition % 2, ordered)
+
+
+class Loudest:
+    """Knows the material by the spread of its readings; `made` counts how often one was taught."""
+
+    made = 0
+
+    def __init__(self, lessons, augmented, progress):
+        type(self).made += 1
+        self.means = {name: np.mean([s.readings.std() for m, s in lessons if m == name]) for name in MATERIALS}
+
+    def predict(self, streams):
+        return [min(self.means, key=lambda m: abs(self.means[m] - s.readings.std())) for s in streams]
+
+
+def study(folder=None, **settings):
+    Loudest.made = 0
+    return Robustness(recordings(), {"loudest": Loudest}, quick=True, folder=folder, **settings)
+
+
+def test_a_system_is_taught_once_a_fold_for_all_studies_and_once_for_another_sitting():
+    task = study(augmented=(False,))
+    (records,) = task.run([0])
+    assert Loudest.made == 2
+    assert [one["study"] for one in records if one["strength"] == 0] == ["noise", "dead", "drift", "sitting"]
+    assert {one["tested"] for one in records} == {30}
+    assert all(0 <= one["accuracy"] <= 1 for one in records)
+
+
+def test_records_are_of_the_perturbed_touches_of_their_fold():
+    task = study(studies=["noise"], augmented=(False,))
+    (records,) = task.run([1])
+    lessons, exam = task._split(1, False)
+    assert len(lessons) + len(exam) == 60
+    system = Loudest(lessons, False, print)
+    for record in records:
+        asked = task._perturbed(exam, "noise", record["strength"])
+        said = system.predict([stream for _, stream in asked])
+        right = np.mean([name == one for (name, _), one in zip(asked, said, strict=True)])
+        assert record["accuracy"] == right
+    assert task._perturbed(exam, "noise", 0.5)[0][1] != exam[0][1]
+
+
+def test_an_interrupted_run_goes_on(tmp_path):
+    def stop(what, done, of):
+        if "dead" in what:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(study(tmp_path / "run").run([0], stop))
+    kept = json.loads((tmp_path / "run" / "robustness.json").read_text())["notes"]
+    assert 0 < len(kept) < len(study().cells(0))
+    asked = []
+    whole = list(study(tmp_path / "run").run([0], lambda what, done, of: asked.append(what)))
+    assert whole == list(study().run([0]))
+    again = study(tmp_path / "run")
+    assert list(again.run([0])) == whole
+    assert Loudest.made == 0  # all was read back
+    with pytest.raises(InputError, match="another run"):
+        list(study(tmp_path / "run", seed=1).run([0]))
+
+
+def test_a_run_is_not_gone_on_with_other_touches(tmp_path):
+    list(study(tmp_path / "run", studies=["dead"]).run([0]))
+    other = recordings()
+    other.streams[0] = other.streams[1]
+    with pytest.raises(InputError, match="begun on other recordings"):
+        list(Robustness(other, {"loudest": Loudest}, studies=["dead"], quick=True, folder=tmp_path / "run").run([0]))
+
+
+def test_a_cameras_frames_are_refused():
+    gel = Gel()
+    streams = [gel.touch(name, at) for name in gel.materials[:2] for at in range(4)]
+    within = np.tile(np.arange(4), 2)
+    frames = Recordings("gel", streams[0].sensor, streams, [*"aaaabbbb"], within, within % 2, ordered=False)
+    with pytest.raises(InputError, match="of camera 'gelsight'"):
+        Robustness(frames, {"loudest": Loudest}, studies=["noise"])
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(InputError, match=r"came \['weather'"):
+        study(studies=["weather"])
+    with pytest.raises(InputError, match=r"folds out of \[0, 1\]"):
+        list(study().run([5]))
+    with pytest.raises(DatasetError, match="blocked"):
+        Robustness(recordings(ordered=False), {"loudest": Loudest})
+
+
+def test_ours_learns_with_its_copies_and_without():
+    make, settings = ours(PAD, Augmented(copies=2, speed=1.05), Robust(Kernels(dimension=64)))
+    assert settings["augmentation"]["copies"] == 2
+    task = Robustness(recordings(), {"ours": make}, {"ours": settings}, studies=["dead"], quick=True)
+    (records,) = task.run([0])
+    found = {(one["strength"], one["augmented"]): one["accuracy"] for one in records}
+    assert found[0.0, False] == 1
+    assert found[0.0, True] == 1
+    assert found[0.2, True] >= found[0.2, False]
+
+
+def test_means_over_folds_and_the_worst_of_a_stretch():
+    base = {"study": "speed", "system": "s", "augmented": True}
+    shares = [(0.5, 0.8), (0.5, 0.6), (1.0, 0.9), (1.0, 0.9), (4.0, 0.1)]
+    rows = summary([base | {"strength": strength, "accuracy": share} for strength, share in shares])
+    assert [(row["strength"], round(row["mean"], 9), row["folds"]) for row in rows] == [
+        (0.5, 0.7, 2),
+        (1, 0.9, 2),
+        (4, 0.1, 1),
+    ]
+    assert worst(rows, "speed", "s", True, 0.5, 2) == pytest.approx(0.7)
+    assert worst(rows, "speed", "s", False, 0.5, 2) is None
+
+
+def test_the_picture(tmp_path):
+    rows = summary([record for fold in study().run([0, 1]) for record in fold])
+    lines = curves(rows)
+    assert list(lines) == ["length", "speed", "noise", "dead", "drift", "sitting"]
+    assert [strength for strength, *_ in lines["speed"]["loudest", True]] == [0.5, 1, 2]
+    if plots.available():
+        draw_robustness(tmp_path / "p.png", rows, title="made up")
+        assert (tmp_path / "p.png").stat().st_size > 10_000
+    with pytest.raises(InputError):
+        draw_robustness(tmp_path / "p.png", [], title="nothing")
+
+
+def test_the_command_says_what_is_missing(tmp_path):
+    assert "biotac_slide_20_50" in refused("robustness", "noise", "biotac-20", "--data", tmp_path)
+
+
+def test_the_command_on_real_touches(real_data, tmp_path):
+    words = ["robustness", "dead", "roboskin-20", "--data", real_data, "--quick", "--materials", 2]
+    result = run(*words, "--json", tmp_path / "r.json", "--plot", tmp_path / "r.png", "--run", tmp_path / "run")
+    assert result.exit_code == 0, result.output
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert {row["strength"] for row in told["means"]} == {0.0, 0.2}
+    assert min(row["mean"] for row in told["means"]) > 0.8
+    assert run(*words, "--run", tmp_path / "run").exit_code == 0

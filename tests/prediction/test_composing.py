@@ -1,0 +1,324 @@
+"""What a touch is made of: by what it feels like, and by heads for materials that were never felt."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
+from scroll_tactile.errors import DescriptionError, MaterialError, SensorMismatchError
+from scroll_tactile.memory.descriptions import checked, targets_of
+from scroll_tactile.readouts.attributes import Curve, fit_curve, solve
+from scroll_tactile.signals.stream import validate
+
+SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
+PARTS = ("cotton", "linen", "silk", "wool")
+RHYTHMS = (3.0, 5.0, 8.0, 13.0)  # Hz: a constituent shakes one channel in its rhythm, as strongly as its share
+
+
+def touch(shares, seed):
+    """A simulated touch: each constituent is felt in a channel of its own, with noise on all."""
+    rng = np.random.default_rng([seed, *(round(1000 * share) for share in shares)])
+    time = np.arange(50) / 50
+    waves = [
+        share * np.sin(2 * np.pi * (hertz * time + rng.uniform())) for share, hertz in zip(shares, RHYTHMS, strict=True)
+    ]
+    return 1.5 * np.stack(waves, axis=1) + rng.normal(0, 0.05, (50, 4))
+
+
+def mixtures(parts=4):
+    """Name → shares, of the even mixtures of some of the constituents."""
+    chosen = [one for count in range(1, parts + 1) for one in itertools.combinations(range(4), count)]
+    return {"".join(PARTS[at][0] for at in one): [(at in one) / len(one) for at in range(4)] for one in chosen}
+
+
+def described(shares):
+    return {name: share for name, share in zip(PARTS, shares, strict=True) if share}
+
+
+def felt(names, touches=8, **settings):
+    learner = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=256), **settings)
+    for at in range(touches):
+        for name in names:
+            learner.observe(name, touch(mixtures()[name], at))
+    return learner
+
+
+@pytest.fixture(scope="module")
+def learner():
+    """All mixtures but two were felt, and described afterwards."""
+    learner = felt([name for name in mixtures() if name not in ("cl", "lsw")])
+    for name, shares in mixtures().items():
+        learner.describe(name, described(shares))
+    return learner
+
+
+def right(composition, shares):
+    return [(one.presence > 0.5) == (share > 0) for one, share in zip(composition.constituents, shares, strict=True)]
+
+
+class TestCompose:
+    @pytest.mark.parametrize("name", ["c", "lw", "csw", "clsw"])
+    def test_a_material_that_was_felt_is_known_by_what_it_is_made_of(self, learner, name):
+        for seed in range(20, 24):
+            said = learner.compose(touch(mixtures()[name], seed))
+            assert all(right(said, mixtures()[name]))
+            shares = [one.share for one in said.constituents]
+            assert np.abs(np.subtract(shares, mixtures()[name])).max() < 0.2
+            assert said.prediction.material == name
+            assert said["cotton"].evidence[0][0] == name or "c" not in name
+
+    @pytest.mark.parametrize("name", ["cl", "lsw"])
+    def test_one_never_felt_is_composed_of_those_that_were(self, learner, name):
+        answers = [learner.compose(touch(mixtures()[name], seed)) for seed in range(20, 28)]
+        assert np.mean([right(one, mixtures()[name]) for one in answers]) > 0.9
+        missed = [[one.share for one in said.constituents] for said in answers] - np.array(mixtures()[name])
+        assert np.abs(missed).mean() < 0.12
+        known = [learner.compose(touch(mixtures()["c"], seed)).unfamiliar for seed in range(20, 28)]
+        assert np.mean([one.unfamiliar for one in answers]) > np.mean(known) + 0.2
+
+    def test_what_is_asked_for_is_answered(self, learner):
+        stream = touch(mixtures()["lw"], 30)
+        whole, part = learner.compose(stream), learner.compose(stream, constituents=["wool", "linen"])
+        assert part.constituents == (whole["linen"], whole["wool"])
+        with pytest.raises(KeyError):
+            part["silk"]
+        for wrong, said in ((["jute"], "'jute'"), ([], "none"), ("wool", "came the string")):
+            with pytest.raises(DescriptionError, match=said):
+                learner.compose(stream, constituents=wrong)
+
+    def test_a_part_of_a_touch_is_judged_at_its_stage(self, learner):
+        whole = validate(touch(mixtures()["w"], 31), SKIN)
+        said = learner.compose(whole.first(0.4))
+        assert said.prediction.seconds == 0.4
+        assert said["wool"].presence > 0.5
+
+    def test_the_wrong_sensors_stream_is_refused(self, learner):
+        other = SKIN.model_copy(update={"name": "other"})
+        with pytest.raises(SensorMismatchError):
+            learner.compose(validate(touch(mixtures()["w"], 31), other))
+
+    def test_shares_are_parts_of_one_even_of_what_is_like_nothing_felt(self, learner):
+        for seed in range(5):
+            for stream in (touch(mixtures()["csw"], 40 + seed), touch([1.3, 0.0, 0.6, 1.3], seed)):
+                said = learner.compose(stream)
+                assert sum(one.share for one in said.constituents) == pytest.approx(1, abs=1e-12)
+                assert all(0 <= one.share <= 1 and 0 <= one.presence <= 1 for one in said.constituents)
+
+
+class TestSharpness:
+    """Where a touch is one row of the statistics, each can be taken out of the readouts that answer."""
+
+    # Its touches are shorter than a wide window, and read as one.
+    SLOW = SKIN.model_copy(update={"duration": 1.4})
+
+    def taught(self, names):
+        taught = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
+        for at in range(6):
+            for number, name in enumerate(names):
+                taught.observe(name, self.shape(number, at))
+        return taught
+
+    def shape(self, number, seed):
+        rng = np.random.default_rng([number, seed])
+        level = np.array([[number % 2, number // 2, 1.0, -0.5]]) + rng.normal(0, 0.35, (1, 4))
+        return np.clip(np.repeat(level, 50, axis=0), -2, 2)
+
+    def test_probabilities_of_known_materials_are_as_sharp_as_touches_taken_out_deserve(self):
+        taught = self.taught("abcd")
+        for name in "abcd":
+            taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
+        composer = taught._fitted_composer(taught.model())
+        assert composer.stages[0].sharpness == 1  # of many windows a touch
+        sharpness = composer.stages[-1].sharpness
+        assert sharpness > 1.1
+        said = taught.compose(self.shape(3, 50), unfamiliar=0.0)
+        chances = {name: chance**sharpness for name, chance in said.prediction.ranking}
+        assert said["hard"].presence == pytest.approx((chances["b"] + chances["d"]) / sum(chances.values()))
+        assert said["hard"].evidence[0][1] == pytest.approx(max(chances.values()) / sum(chances.values()))
+
+    def test_it_is_the_same_whenever_it_was_described(self):
+        before, after = self.taught([]), self.taught([])
+        for name in "dcba":
+            before.describe(name, {"hard": name in "bd"})
+        for learner, order in ((before, range(4)), (after, reversed(range(4)))):
+            for number in order:
+                for at in range(6):
+                    learner.observe("abcd"[number], self.shape(number, at))
+        for name in "abcd":
+            after.describe(name, {"hard": name in "bd"})
+        for seed in range(50, 54):
+            assert repr(before.compose(self.shape(1, seed))) == repr(after.compose(self.shape(1, seed)))
+
+    def test_of_touches_of_many_windows_nothing_is_sharpened(self):
+        taught = felt(["c", "l", "s"], 4)
+        for name in "cls":
+            taught.describe(name, described(mixtures()[name]))
+        assert [stage.sharpness for stage in taught._fitted_composer(taught.model()).stages] == [1.0, 1.0, 1.0]
+
+
+class TestDescribing:
+    def test_after_the_touching_is_as_before_to_the_byte(self):
+        names = ["c", "l", "s", "cl", "ls", "csw"]
+        before = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
+        for name in reversed(names):
+            before.describe(name, described(mixtures()[name]))
+        for at in range(4):
+            for name in names:
+                before.observe(name, touch(mixtures()[name], at))
+        after = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
+        for name in reversed(names):
+            for at in range(4):
+                after.observe(name, touch(mixtures()[name], at))
+        digest = after.digest()
+        for name in names:
+            after.describe(name, described(mixtures()[name]))
+        assert after.digest() == before.digest() == digest
+        for seed in range(4):
+            stream = touch(mixtures()["sw"], 50 + seed)
+            assert repr(after.compose(stream)) == repr(before.compose(stream))
+
+    def test_a_later_description_changes_the_answer_without_a_touch(self, learner):
+        taught = felt(["c", "l", "s"], 4)
+        for name in "cls":
+            taught.describe(name, described(mixtures()[name]))
+        stream = touch(mixtures()["s"], 60)
+        assert taught.compose(stream)["silk"].presence > 0.5
+        taught.describe("s", {"wool": 1.0})
+        said = taught.compose(stream)
+        assert said["wool"].presence > 0.5
+        assert "silk" not in [one.name for one in said.constituents]
+
+    def test_what_is_unknown_of_a_material_takes_no_part(self):
+        names = ["c", "l", "s", "w", "cl"]
+        whole, part = felt(names, 4), felt(names, 4)
+        for name in names:
+            values = {part: share > 0 for part, share in zip(PARTS, mixtures()[name], strict=True)}
+            whole.describe(name, values)
+            part.describe(name, {one: value for one, value in values.items() if (name, one) != ("w", "silk")})
+        stream = touch(mixtures()["lsw"], 70)
+        ours, theirs = whole.compose(stream), part.compose(stream)
+        assert all(ours[name] == theirs[name] for name in ("cotton", "linen", "wool"))
+        assert ours["silk"].presence != theirs["silk"].presence
+        part.describe("w", {"silk": None, "wool": True, "cotton": False, "linen": False})
+        assert part.compose(stream) == theirs
+
+    def test_what_all_or_none_have_is_named_and_not_guessed(self):
+        taught = felt(["c", "l", "s"], 4)
+        for name in "cls":
+            values = {"dyed": True, "woven": False, "soft": name == "s"}
+            taught.describe(name, values | ({"rare": True} if name == "c" else {}))
+        said = taught.compose(touch(mixtures()["s"], 80))
+        assert (said["dyed"].presence, said["woven"].presence, said["rare"].presence) == (None, None, None)
+        assert "every material" in said["dyed"].unlearned
+        assert "no material" in said["woven"].unlearned
+        assert said["rare"].unlearned.startswith("1 material of which it is known was felt")
+        assert said["soft"].presence > 0.5
+        assert said["soft"].unlearned == ""
+        assert [one.share for one in said.constituents] == [None] * 4
+
+    def test_nothing_described_and_nothing_felt(self):
+        taught = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
+        with pytest.raises(DescriptionError, match="nothing was described yet"):
+            taught.compose(touch(mixtures()["s"], 0))
+        taught.describe("s", {"silk": 1.0})
+        said = taught.compose(touch(mixtures()["s"], 0))
+        assert (said["silk"].presence, said["silk"].unlearned) == (None, "nothing was felt yet")
+        assert said.prediction.material is None
+        taught.observe("s", touch(mixtures()["s"], 0))
+        assert taught.compose(touch(mixtures()["s"], 1))["silk"].presence is None
+        taught.observe("w", touch(mixtures()["w"], 0))  # felt, and nothing is known of it
+        assert taught.compose(touch(mixtures()["s"], 1))["silk"].presence is None
+
+    @pytest.mark.parametrize(
+        ("wrong", "said"),
+        [
+            ({"wool": 0.5}, "sum to one; they sum to 0.5"),
+            ({"wool": 0.6, "silk": 0.6}, "sum to one; they sum to 1.2"),
+            ({"wool": 1.2, "silk": -0.2}, "came -0.2"),
+            ({"wool": 65, "silk": 35}, "came 35. Shares are parts of one, not percent"),
+            ({"wool": float("nan")}, "came nan"),
+            ({"wool": float("inf"), "silk": 1.0}, "came inf"),
+            ({"wool": "much"}, "came 'much'"),
+            ({"wool": 0.8, "silk": 0.4, "jute": None}, "at most one"),
+            ({}, "at least one constituent"),
+            ({"": 1.0}, "came ''"),
+            ({3: 1.0}, "came 3"),
+            ([("wool", 1.0)], "came list"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, wrong, said):
+        taught = TactileLearner(sensor=SKIN)
+        taught.describe("felt", {"wool": 1.0})
+        with pytest.raises(DescriptionError, match=said):
+            taught.describe("felt", wrong)
+        with pytest.raises(MaterialError):
+            taught.describe("", {"wool": 1.0})
+        assert taught.descriptions == {"felt": {"wool": 1.0}}
+
+    def test_it_is_kept_plain_and_nobody_elses(self):
+        taught = TactileLearner(sensor=SKIN)
+        mine = {"wool": np.float32(0.25), "silk": np.float64(0.75), "soft": np.True_}
+        taught.describe("felt", mine)
+        mine["wool"] = 9
+        taught.descriptions["felt"]["wool"] = 9
+        assert taught.descriptions == {"felt": {"silk": 0.75, "soft": True, "wool": 0.25}}
+        assert [type(value) for value in taught.descriptions["felt"].values()] == [float, bool, float]
+        taught.describe("felt", None)
+        assert taught.descriptions == {}
+
+    def test_targets_are_zero_where_shares_are_whole_and_missing_where_not(self):
+        targets = targets_of(
+            {
+                "felt": checked("felt", {"viscose": 0.65, "wool": 0.35, "soft": True}),
+                "tweed": checked("tweed", {"wool": 1}),
+                "rag": checked("rag", {"wool": 0.5, "silk": None, "viscose": None}),
+                "stone": checked("stone", {"soft": False}),
+            }
+        )
+        assert targets["wool"].share == {"felt": 0.35, "tweed": 1.0, "rag": 0.5}
+        assert targets["viscose"].presence == {"felt": True, "tweed": False}
+        assert targets["soft"].presence == {"felt": True, "stone": False}
+        assert targets["silk"] == replace(targets["silk"], presence={}, share={})
+
+
+class TestHeads:
+    def test_without_a_material_is_as_if_it_had_never_been(self):
+        rng = np.random.default_rng(0)
+        means, targets = rng.normal(size=(7, 5)), rng.normal(size=7)
+        gram = means @ means.T
+        for place in range(7):
+            left = np.delete(np.arange(7), place)
+            # γ is a share of the diagonal's mean: the same ridge for both.
+            centred = [part - part.mean(axis=0) for part in (means, means[left])]
+            size, smaller = (np.square(part).sum() / len(part) for part in centred)
+            head = solve(gram, 0.1)
+            told = head.without(head.head(targets), place)
+            fresh = solve(gram[np.ix_(left, left)], 0.1 * size / smaller).head(targets[left])
+            np.testing.assert_allclose(np.delete(told, place), fresh, atol=1e-9)
+            assert told[place] == 0
+
+    def test_it_is_ridge_regression_over_the_materials(self):
+        rng = np.random.default_rng(1)
+        means, targets = rng.normal(size=(6, 9)), rng.normal(size=6)
+        centred = means - means.mean(axis=0)
+        ridge = 0.3 * np.square(centred).sum() / 6
+        slope = np.linalg.solve(centred.T @ centred + ridge * np.eye(9), centred.T @ (targets - targets.mean()))
+        head = solve(means @ means.T, 0.3).head(targets)
+        new = rng.normal(size=9)
+        expected = targets.mean() + (new - means.mean(axis=0)) @ slope
+        assert head[:-1] @ (means @ new) + head[-1] == pytest.approx(expected)
+
+    def test_a_curve_follows_the_touches_and_begins_at_its_prior(self):
+        prior = Curve(6.0, -3.0)
+        assert fit_curve([], [], prior) == prior
+        rng = np.random.default_rng(2)
+        at = rng.uniform(-1, 2, 4000)
+        true = rng.uniform(size=4000) < 1 / (1 + np.exp(-(3 * at - 1)))
+        curve = fit_curve(at, true, prior)
+        assert (curve.slope, curve.offset) == pytest.approx((3, -1), abs=0.3)
+        assert fit_curve(at, ~true, prior).slope == pytest.approx(0, abs=1e-6)  # never the wrong way round
+        steady = fit_curve(at, true, prior, turning=False)
+        assert steady(0.5) == pytest.approx(0.5)
+        assert steady.slope < prior.slope

@@ -1,0 +1,96 @@
+"""A memory as an ONNX file that says what `predict` says."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Kernels, Sensor, TactileLearner, Vision, sensors
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import Joined
+from scroll_tactile.errors import InputError
+from scroll_tactile.prediction.onnx_export import export_onnx
+from scroll_tactile.signals.image import tactile_image
+
+pytest.importorskip("onnx", reason="onnx is not installed")
+runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+
+VISION = Vision(None, seed=0, stages=(1, 2))
+SLOW = Sensor(name="slow", channels=8, rate=10.0, low=0.0, high=1.0, unit="N", duration=4.0)
+
+
+def taught(sensor, embedding=VISION, readout="lda", seconds=None):
+    scene = Scene(sensor=sensor)
+    learner = TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
+    for at in range(3):
+        for name in scene.materials[:4]:
+            touch = scene.touch(name, at)
+            learner.observe(name, touch if seconds is None else touch.first(seconds))
+    return learner, scene
+
+
+def exported(learner, path):
+    export_onnx(learner, path)
+    return runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
+@pytest.mark.parametrize("readout", ["lda", "ridge"])
+@pytest.mark.parametrize("sensor", [sensors.BIOTAC, sensors.ROBOSKIN, SLOW], ids=lambda one: one.name)
+def test_it_says_what_predict_says(sensor, readout, tmp_path):
+    learner, scene = taught(sensor, readout=readout)
+    session = exported(learner, tmp_path / "memory.onnx")
+    materials = json.loads(session.get_modelmeta().custom_metadata_map["materials"])
+    assert materials == list(learner.materials)
+    for name in scene.materials[:4]:
+        touch = scene.touch(name, 9)
+        (scores,) = session.run(["scores"], {"image": tactile_image(touch)})
+        assert scores.dtype == np.float32
+        said = dict(learner.predict(touch).ranking)
+        for material, score in zip(materials, scores.tolist(), strict=True):
+            # Two float32 networks: on real touches and full memories 8e-6 was measured, 4e-4 of the scores.
+            assert abs(math.exp(score) - said[material]) < 1e-5
+            if said[material] > 0:
+                assert score == pytest.approx(math.log(said[material]), abs=1e-3)
+
+
+def test_it_reads_no_further_than_was_learned(tmp_path):
+    learner, scene = taught(sensors.ROBOSKIN, seconds=1.2)
+    session = exported(learner, tmp_path / "memory.onnx")
+    touch = scene.touch(scene.materials[1], 9)
+    (scores,) = session.run(None, {"image": tactile_image(touch)})
+    said = dict(learner.predict(touch).ranking)
+    assert np.allclose(np.exp(scores), [said[name] for name in learner.materials], atol=1e-5)
+
+
+def test_the_file_says_where_it_comes_from(tmp_path):
+    learner, _ = taught(sensors.ROBOSKIN)
+    session = exported(learner, tmp_path / "memory.onnx")
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert (metadata["sensor"], metadata["fingerprint"]) == ("roboskin", VISION.fingerprint)
+    (given,), (output,) = session.get_inputs(), session.get_outputs()
+    assert (given.name, given.shape, given.type) == ("image", [60, 75], "tensor(float)")
+    assert (output.name, output.shape) == ("scores", [4])
+
+
+@pytest.mark.parametrize(
+    "embedding",
+    [Kernels(dimension=64), Joined(Kernels(dimension=64), VISION), Vision(None, seed=0, precision="bfloat16")],
+    ids=["kernels", "joined", "bfloat16"],
+)
+def test_other_embeddings_are_refused(embedding, tmp_path):
+    with pytest.raises(InputError, match="only memories of a Vision embedding"):
+        export_onnx(TactileLearner(sensor=sensors.ROBOSKIN, embedding=embedding), tmp_path / "memory.onnx")
+
+
+def test_an_empty_memory_is_refused(tmp_path):
+    with pytest.raises(InputError, match="this one is empty"):
+        export_onnx(TactileLearner(sensor=sensors.ROBOSKIN, embedding=VISION), tmp_path / "memory.onnx")
+    assert not (tmp_path / "memory.onnx").exists()
+
+
+def test_a_material_felt_only_briefly_is_named(tmp_path):
+    learner, scene = taught(sensors.ROBOSKIN)
+    learner.observe("brief", scene.touch(scene.materials[0], 5).first(0.4))
+    with pytest.raises(InputError, match="'brief' was only felt briefly"):
+        export_onnx(learner, tmp_path / "memory.onnx")

@@ -1,0 +1,160 @@
+"""Weights, temperature and thresholds on touches made for it."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile.readouts.calibration import Calibration, calibrate, fit_weights
+from scroll_tactile.readouts.selection import select
+from scroll_tactile.statistics.sample import Pool, Touch
+from scroll_tactile.statistics.statistics import Statistics, fold_of
+
+DIMENSION, SCALES, STAGES = 8, (10, 40), [[10], [10, 40]]
+
+
+def scene(noises=(20_000, 20_000), materials=6, each=20, seed=0, unit=40_000):
+    """A memory of touches with one window a scale; noises: their spread at each scale."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(len(SCALES), materials, DIMENSION)) * unit
+    statistics, pool = Statistics(DIMENSION, SCALES), Pool()
+    for at in range(materials * each):
+        material, key = at % materials, rng.bytes(32)
+        codes = {
+            scale: np.rint(means[place, material] + rng.normal(size=(1, DIMENSION)) * noises[place]).astype(np.int32)
+            for place, scale in enumerate(SCALES)
+        }
+        statistics.add(str(material), fold_of(key), codes)
+        pool.add(str(material), key, Touch.of([{10: [0]}, {10: [0], 40: [0]}], codes))
+    return statistics, pool
+
+
+def calibrated(kind="lda", **settings):
+    statistics, pool = scene(**settings)
+    selections = {scale: select(statistics, scale, kind) for scale in SCALES}
+    return calibrate(pool, STAGES, selections, kind)
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+@pytest.mark.parametrize("noise", [3_000, 40_000, 300_000])
+def test_weights_are_finite_and_not_negative(kind, noise):
+    stages = calibrated(kind, noises=(noise, noise))
+    assert [one.weights.shape for one in stages] == [(1,), (2,)]
+    for one in stages:
+        assert np.isfinite(one.weights).all()
+        assert (one.weights >= 0).all()
+
+
+def logits(touches, classes, seed=0, size=2.0):
+    """Scores whose softmax is the truth, and targets drawn from it."""
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(size=(touches, classes)) * size
+    chances = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
+    targets = [int(rng.choice(classes, p=row)) for row in chances]
+    return [row[None, :] for row in scores], targets
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.3, 1.0, 30.0])
+def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
+    scores, targets = logits(1500, 5)
+    weights = fit_weights([one * factor for one in scores], targets, np.array([1 / factor]))
+    assert weights * factor == pytest.approx(1.0, rel=0.12)
+
+
+def test_overconfident_scores_are_softened_and_timid_ones_sharpened():
+    scores, targets = logits(800, 4)
+    prior = np.array([1.0])
+    assert fit_weights([4 * one for one in scores], targets, prior)[0] < 0.5
+    assert fit_weights([one / 4 for one in scores], targets, prior)[0] > 2
+
+
+def test_scores_that_mislead_get_no_weight():
+    scores, targets = logits(800, 4)
+    assert fit_weights([-one for one in scores], targets, np.array([1.0]))[0] == pytest.approx(0, abs=1e-6)
+
+
+def test_of_two_scales_the_one_that_knows_is_believed():
+    scores, targets = logits(800, 4)
+    noise = np.random.default_rng(9).normal(size=(800, 4)) * 2
+    both = [np.stack([one[0], other]) for one, other in zip(scores, noise, strict=True)]
+    weights = fit_weights(both, targets, np.array([0.5, 0.5]))
+    assert weights[0] == pytest.approx(1, rel=0.15)
+    assert weights[1] < 0.1
+
+
+def test_without_touches_the_prior_stays_and_a_few_move_it_little():
+    prior = np.array([0.05, 0.05])
+    assert fit_weights([], [], prior).tolist() == prior.tolist()
+    one = fit_weights([np.array([[3.0, 0.0], [3.0, 0.0]])], [0], prior)
+    assert (one > prior).all()
+    assert (one < 1000 * prior).all()
+
+
+def test_touches_with_different_numbers_of_classes_count_together():
+    wide, targets = logits(600, 5)
+    narrow, others = logits(600, 3, seed=1)
+    weights = fit_weights(wide + narrow, targets + others, np.array([1.0]))
+    assert weights == pytest.approx(1.0, rel=0.15)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("touches", [99, 256])
+def test_the_threshold_lets_about_the_asked_share_of_known_touches_pass(share, touches):
+    above = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(rng.normal(size=touches)))
+        threshold = calibration.threshold(share)
+        assert (calibration.novelties > threshold).mean() <= share
+        above.append((rng.normal(size=2000) > threshold).mean())
+    # Conformal: never more on average, and less by at most one place among the held-out touches.
+    assert share - 1 / (touches + 1) - 0.01 <= np.mean(above) <= share + 0.01
+
+
+def test_a_smaller_share_means_a_higher_threshold():
+    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(np.random.default_rng(0).normal(size=60)))
+    thresholds = [calibration.threshold(share) for share in (0.001, 0.02, 0.1, 0.5, 0.999)]
+    assert thresholds == sorted(thresholds, reverse=True)
+    assert len(set(thresholds)) == 5
+
+
+def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
+    few = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(3.0))
+    assert few.threshold(0.05) == few.threshold(0.5) > 0
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+def test_the_novelty_of_known_touches_is_standardised(kind):
+    for one in calibrated(kind):
+        assert len(one.novelties) == 120
+        assert np.mean(one.novelties) == pytest.approx(0, abs=1e-6)
+        assert np.std(one.novelties) == pytest.approx(1, abs=1e-6)
+        assert np.array_equal(np.sort(one.novelties), one.novelties)
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+def test_small_and_dull_memories_calibrate_without_a_warning(kind):
+    for settings in ({"materials": 1, "each": 1}, {"materials": 2, "each": 1}, {"noises": (0, 0), "unit": 0}):
+        for one in calibrated(kind, **settings):
+            assert np.isfinite(one.weights).all()
+            assert np.isfinite(one.threshold(0.05))
+            assert np.isfinite(one.novelty(np.array([1.0] * len(one.weights))))
+
+
+def test_a_stage_whose_scale_was_never_felt_has_no_calibration():
+    statistics, pool = scene()
+    selections = {10: select(statistics, 10, "lda")}
+    assert len(calibrate(pool, STAGES, selections, "lda")) == 1
+    assert calibrate(Pool(), STAGES, {}, "lda") == []
+
+
+def test_the_order_of_what_was_felt_changes_no_bit():
+    statistics, pool = scene()
+    turned = Pool()
+    for entry in reversed(list(pool)):
+        turned.add(*entry)
+    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
+    for ours, theirs in zip(
+        calibrate(pool, STAGES, selections, "lda"), calibrate(turned, STAGES, selections, "lda"), strict=True
+    ):
+        assert ours.weights.tobytes() == theirs.weights.tobytes()
+        assert ours.scale_novelty.tobytes() == theirs.scale_novelty.tobytes()
+        assert ours.novelties.tobytes() == theirs.novelties.tobytes()

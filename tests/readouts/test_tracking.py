@@ -1,0 +1,255 @@
+"""Readouts that follow the statistics equal those that are solved anew, however long they have followed."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_learner_machine import PAD, SMALL, stream
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError
+from scroll_tactile.prediction.model import Model
+from scroll_tactile.readouts.readout import Readout, Task, fit_readout
+from scroll_tactile.readouts.recursive import Recursive
+from scroll_tactile.readouts.tracking import Tracked
+from scroll_tactile.statistics.moments import within_scatter
+from scroll_tactile.statistics.statistics import Statistics
+
+SCALE = 7
+
+
+def fitted(statistics, penalty=1e-2):
+    names = statistics.names(SCALE)
+    counts, sums = statistics.counts(SCALE, names).sum(axis=1), statistics.sums(SCALE, names).sum(axis=1)
+    scatter = within_scatter(statistics.total_second(SCALE), counts, sums)
+    return fit_readout(Task.of(scatter, counts, sums), penalty)
+
+
+def dense(statistics, penalties):
+    """(S_w + P) W = N M and what follows from it, in long double where it matters, without any update."""
+    names = statistics.names(SCALE)
+    counts, sums = statistics.counts(SCALE, names).sum(axis=1), statistics.sums(SCALE, names).sum(axis=1)
+    scatter = np.triu(within_scatter(statistics.total_second(SCALE), counts, sums))
+    system = scatter + np.triu(scatter, 1).T + np.diag(penalties)
+    shares = counts / counts.sum()
+    exact = sums.astype(np.longdouble) / counts[:, None]
+    center = shares.astype(np.longdouble) @ exact
+    means = (exact - center).astype(np.float64)
+    weights = counts.sum() * np.linalg.solve(system, means.T)
+    gram = means @ weights
+    ridge = np.linalg.inv(np.diag(1 / shares) + (gram + gram.T) / 2)
+    return Readout(0.0, center.astype(float), weights, (gram + gram.T) / 2, ridge, shares, penalties)
+
+
+def distance(one, other):
+    fields = ("weights", "gram", "ridge", "center")
+    return max(
+        np.abs(getattr(one, name) - getattr(other, name)).max() / np.abs(getattr(other, name)).max() for name in fields
+    )
+
+
+class Source:
+    """Rows of codes of some classes about means of their own."""
+
+    def __init__(self, dimension, classes, seed=0, offset=0):
+        self.random = np.random.default_rng(seed)
+        self.means = self.random.normal(offset, 1e5, (classes, dimension))
+        self.names = [f"class {at:02d}" for at in range(classes)]
+
+    def rows(self, place, count=1):
+        rows = self.means[place] + self.random.normal(0, 5e4, (count, self.means.shape[1]))
+        return np.clip(np.rint(rows), -(2**20), 2**20).astype(np.int32)
+
+    def fill(self, count):
+        statistics = Statistics(self.means.shape[1], [SCALE])
+        for at in range(count):
+            place = at % len(self.names)
+            statistics.add(self.names[place], at % 3, {SCALE: self.rows(place)})
+        return statistics
+
+
+@pytest.mark.parametrize("follower", [Tracked, Recursive])
+def test_it_begins_as_the_readout_that_it_starts_from(follower):
+    statistics = Source(20, 3).fill(60)
+    start = fitted(statistics)
+    assert distance(follower(statistics, SCALE, start).readout(), start) < 1e-12
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([Tracked, Recursive]),
+    st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), max_size=12),
+    st.sampled_from([0, 8 * 10**5]),
+    st.integers(0, 9),
+)
+def test_it_equals_a_fresh_solve_after_any_rows(follower, added, offset, seed):
+    source = Source(24, 4, seed, offset)
+    statistics = source.fill(40)
+    start = fitted(statistics)
+    tracked = follower(statistics, SCALE, start)
+    for place, count in added:
+        rows = source.rows(place, count)
+        statistics.add(source.names[place], place % 3, {SCALE: rows})
+        if not tracked.add(rows, place):
+            tracked.anchor(statistics)
+    assert distance(tracked.readout(), dense(statistics, start.penalties)) < 1e-9
+
+
+def test_nothing_drifts_in_ten_thousand_interleavings():
+    source = Source(32, 5)
+    statistics = source.fill(200)
+    start = fitted(statistics)
+    tracked, worst = Tracked(statistics, SCALE, start), 0.0
+    for at in range(10_000):
+        place = int(source.random.integers(5))
+        rows = source.rows(place)
+        statistics.add(source.names[place], at % 3, {SCALE: rows})
+        if not tracked.add(rows, place):
+            tracked.anchor(statistics)
+        readout = tracked.readout()
+        if at % 500 == 499:
+            worst = max(worst, distance(readout, dense(statistics, start.penalties)))
+    assert worst < 1e-10
+
+
+def test_rounding_adds_up_in_the_recursion_until_it_is_anchored():
+    source = Source(24, 4, offset=8e5)
+    statistics = source.fill(60)
+    start = fitted(statistics, 1e-9)
+    tracked, recursive = Tracked(statistics, SCALE, start), Recursive(statistics, SCALE, start)
+    for at in range(3000):
+        place = at % 4
+        rows = source.rows(place)
+        statistics.add(source.names[place], at % 3, {SCALE: rows})
+        assert recursive.add(rows, place)
+        if not tracked.add(rows, place):
+            tracked.anchor(statistics)
+    truth = dense(statistics, start.penalties)
+    assert distance(recursive.readout(), truth) > 10 * distance(tracked.readout(), truth)
+    recursive.anchor(statistics)
+    assert distance(recursive.readout(), truth) < 1e-9
+
+
+def test_where_it_cannot_follow_it_says_so_and_stays_as_it_was():
+    source = Source(24, 3)
+    statistics = source.fill(30)
+    tracked = Tracked(statistics, SCALE, fitted(statistics))
+    before = tracked.readout()
+    assert not tracked.add(source.rows(1, 40), 1)
+    after = tracked.readout()
+    assert before.weights.tobytes() == after.weights.tobytes()
+    assert before.gram.tobytes() == after.gram.tobytes()
+
+
+def test_a_feature_that_begins_to_vary_is_penalised_like_the_others():
+    source = Source(10, 3)
+    statistics = Statistics(10, [SCALE])
+    for at in range(30):
+        rows = source.rows(at % 3)
+        rows[:, 4] = 1000
+        statistics.add(source.names[at % 3], at % 3, {SCALE: rows})
+    start = fitted(statistics)
+    assert not start.weights[4].any()
+    tracked = Tracked(statistics, SCALE, start)
+    rows = source.rows(1)
+    rows[:, 4] = 2000
+    statistics.add(source.names[1], 0, {SCALE: rows})
+    assert tracked.add(rows, 1)
+    penalties = start.penalties.copy()
+    penalties[4] = np.delete(start.penalties, 4).mean()
+    assert distance(tracked.readout(), dense(statistics, penalties)) < 1e-9
+
+
+class TestLearner:
+    FELT = tuple((name, (seed, 60)) for seed in range(8) for name in "abc")
+
+    def learner(self, refit, felt=FELT, **settings):
+        learner = TactileLearner(sensor=PAD, embedding=SMALL, refit=refit, **settings)
+        for name, touch in felt:
+            learner.observe(name, stream(touch))
+        return learner
+
+    def test_between_fits_only_the_readouts_follow(self, monkeypatch):
+        learner = self.learner(0.5)
+        learner.predict(stream((50, 60)))
+        fits = []
+        monkeypatch.setattr(Model, "of", lambda *_: fits.append(1))
+        for at in range(10):
+            learner.observe("abc"[at % 3], stream((20 + at, 60)))
+            learner.predict(stream((50, 60)))
+        assert fits == []
+        monkeypatch.undo()
+        model, whole = learner._present(), learner.model()
+        for scale, selection in model.selections.items():
+            penalties = selection.readout.penalties
+            counts = learner._memory.statistics
+            names = counts.names(scale)
+            assert selection.names == names
+            assert np.isclose(selection.readout.shares, whole.selections[scale].readout.shares).all()
+            assert np.isclose(selection.readout.center, whole.selections[scale].readout.center).all()
+            assert (penalties > 0).all()
+
+    def test_answers_are_those_of_the_same_lambda_solved_anew(self):
+        learner = self.learner(1.0)
+        learner.predict(stream((50, 60)))
+        for at in range(12):
+            learner.observe("abc"[at % 3], stream((20 + at, 60)))
+        quick = learner._present()
+        for scale, selection in quick.selections.items():
+            anew = Tracked(learner._memory.statistics, scale, learner.model().selections[scale].readout)
+            anew._penalties = selection.readout.penalties
+            anew.anchor(learner._memory.statistics)
+            assert distance(selection.readout, anew.readout()) < 1e-9
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda learner: learner.observe("new", stream((3, 60))),
+            lambda learner: [learner.observe("a", stream((30 + at, 60))) for at in range(9)],
+        ],
+    )
+    def test_a_new_material_or_much_growth_is_fitted_anew(self, change):
+        learner = self.learner(0.25)
+        learner.predict(stream((50, 60)))
+        change(learner)
+        answer = learner.predict(stream((50, 60)))
+        learner.refit = 0.0
+        assert answer == learner.predict(stream((50, 60)))
+
+    def test_what_is_taken_back_is_fitted_anew(self, tmp_path):
+        with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, refit=1.0) as learner:
+            receipts = [learner.observe(name, stream(touch)) for name, touch in self.FELT]
+            learner.predict(stream((50, 60)))
+            learner.observe("a", stream((40, 60)))
+            learner.retract(receipts[0])
+            answer = learner.predict(stream((50, 60)))
+            learner.refit = 0.0
+            assert answer == learner.predict(stream((50, 60)))
+
+    def test_the_papers_recursion_can_be_chosen_and_gives_the_same_answers_while_it_is_well(self):
+        exact, recursive = self.learner(1.0), self.learner(1.0, solver="recursive")
+        for learner in (exact, recursive):
+            learner.predict(stream((50, 60)))
+            for at in range(12):
+                learner.observe("abc"[at % 3], stream((20 + at, 60)))
+        assert exact.digest() == recursive.digest()
+        model = recursive._present()
+        for scale, selection in exact._present().selections.items():
+            found = model.selections[scale].readout
+            assert found.weights.tobytes() != selection.readout.weights.tobytes()
+            assert distance(found, selection.readout) < 1e-8
+        answers = [learner.predict(stream((50, 60))) for learner in (exact, recursive)]
+        assert answers[0].material == answers[1].material
+        assert answers[0].probability == pytest.approx(answers[1].probability, abs=1e-8)
+
+    @pytest.mark.parametrize(
+        ("settings", "said"), [({"solver": "svd"}, "solver must be"), ({"solver": "recursive"}, "refit=1.0")]
+    )
+    def test_a_solver_that_there_is_not_or_that_has_nothing_to_do_is_refused(self, settings, said):
+        with pytest.raises(InputError, match=said):
+            TactileLearner(sensor=PAD, **settings)
+
+    @pytest.mark.parametrize("refit", [-0.1, 1.5, float("nan")])
+    def test_a_share_that_is_none_is_refused(self, refit):
+        with pytest.raises(InputError, match="refit must be a share from 0 to 1"):
+            self.learner(refit)

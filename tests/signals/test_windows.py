@@ -1,0 +1,129 @@
+"""Which windows are read of a touch of any length."""
+
+from itertools import pairwise
+
+import pytest
+
+from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
+from scroll_tactile.signals.windows import MOST_WINDOWS, Reading, extent, fitting, milestones, scales, scored, stages
+
+
+def sensor(rate, duration, **settings):
+    fields = {"name": "mine", "channels": 3, "low": 0.0, "high": 1.0, "unit": "N"} | settings
+    return Sensor(rate=rate, duration=duration, **fields)
+
+
+SLOW, FAST, SHORT = sensor(10.0, 4.0), sensor(2000.0, 4.0), sensor(100.0, 0.5)
+CAMERA = sensor(25.0, 1.0, channels=24 * 32 * 3, layout=(24, 32, 3), camera=True)
+ALL = [BIOTAC, ROBOSKIN, CONTACTILE, GELSIGHT, SLOW, FAST, SHORT, CAMERA, sensor(1.0, 1.0)]
+
+
+def named(one):
+    return f"{one.name} {one.rate:g} Hz"
+
+
+def test_the_shortest_scale_is_a_third_of_a_second_and_a_camera_has_one():
+    assert scales(BIOTAC)[0] == 30
+    assert scales(ROBOSKIN)[0] == 15
+    assert scales(SLOW)[0] == 9  # no fewer than a kernel has taps
+    assert scales(GELSIGHT) == (160,)
+    assert scales(CAMERA) == (32,)
+    assert scales(SHORT) == (30,)
+
+
+@pytest.mark.parametrize("one", ALL, ids=named)
+def test_scales_ascend_and_fit_a_usual_touch(one):
+    widths = scales(one)
+    assert list(widths) == sorted(set(widths))
+    assert all(width > 0 for width in widths)
+    assert all(width <= one.readings for width in widths[1:])
+
+
+@pytest.mark.parametrize("one", ALL, ids=named)
+def test_windows_of_all_lengths_lie_within_begin_at_the_beginning_and_are_few(one):
+    widths = scales(one)
+    for columns in [*range(1, 2001), 10_000, 10**6]:
+        read = extent(columns, widths)
+        assert list(read) == fitting(columns, widths)
+        assert widths[0] in read
+        assert {width for width in widths if width <= columns} <= read.keys()
+        for width, begin in read.items():
+            assert begin[0] == 0
+            assert begin == sorted(set(begin))
+            assert len(begin) <= MOST_WINDOWS == 64
+            assert begin[-1] + min(width, columns) <= columns
+            if columns < width:
+                assert begin == [0]
+
+
+@pytest.mark.parametrize("one", [BIOTAC, ROBOSKIN, SLOW], ids=named)
+def test_a_long_touch_is_read_to_its_end(one):
+    for columns in (one.readings, 3 * one.readings, 10**6):
+        for width, begin in extent(columns, scales(one)).items():
+            assert begin[-1] + 2 * width > columns
+
+
+@pytest.mark.parametrize("one", ALL, ids=named)
+def test_scored_windows_lie_within_what_was_felt(one):
+    widths = scales(one)
+    for columns in [*range(1, 400), 977, 2000]:
+        read = extent(columns, widths)
+        for length in stages(columns, widths):
+            chosen = scored(read, length)
+            assert list(chosen) == fitting(length, widths)
+            for width, places in chosen.items():
+                starts = [read[width][place] for place in places]
+                assert starts[0] == 0
+                assert all(start + width <= length for start in starts[1:])
+                assert starts == sorted(set(starts))
+                if width == widths[0]:
+                    assert all(b - a >= width // 2 for a, b in pairwise(starts))
+
+
+def test_milestones_ascend_from_the_shortest_scale_to_where_the_longest_fits():
+    for widths in ((30, 200), (80,), (9, 20, 1000), (15, 56)):
+        reached = milestones(widths)
+        assert list(reached) == sorted(set(reached))
+        assert reached[0] == widths[0]
+        assert len(reached) == 2 * len(widths) - 1
+        assert fitting(reached[-1], widths) == list(widths) != fitting(reached[-1] - 1, widths) or len(widths) == 1
+
+
+@pytest.mark.parametrize("one", ALL, ids=named)
+def test_the_stages_of_a_touch_end_with_its_own_length(one):
+    widths = scales(one)
+    for columns in range(1, 700):
+        reached = stages(columns, widths)
+        assert reached[-1] == columns
+        assert reached == sorted(set(reached))
+        assert len(reached) == max(1, sum(length <= columns for length in milestones(widths)))
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 33.0, 50.0, 100.0, 240.0])
+def test_at_each_stage_a_touch_has_the_scales_by_which_the_stage_is_judged(rate):
+    """Calibration and model know a stage by its number, and take its scales from its milestone."""
+    for tenths in range(2, 40):
+        widths = scales(sensor(rate, tenths / 10))
+        for columns in range(1, int(rate * tenths / 5)):
+            for stage, length in enumerate(stages(columns, widths)):
+                assert fitting(length, widths) == fitting(milestones(widths)[stage], widths), (widths, columns)
+
+
+def test_a_longer_touch_never_has_fewer_stages_or_scales():
+    before = (0, 0)
+    for columns in range(1, 900):
+        now = (len(stages(columns, (30, 200))), len(extent(columns, (30, 200))))
+        assert now[0] >= before[0]
+        assert now[1] >= before[1]
+        before = now
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])
+def test_the_windows_of_a_camera_are_its_frames(frames):
+    reading = Reading.of(CAMERA, None)
+    starts = reading.extent(32 * frames)[32]
+    assert len(starts) == min(frames, MOST_WINDOWS)
+    assert starts[0] == 0
+    assert starts[-1] == 32 * (frames - 1)
+    assert all(start % 32 == 0 for start in starts)
+    assert reading.scored(32 * frames, 32 * frames) == {32: list(range(len(starts)))}

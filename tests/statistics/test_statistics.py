@@ -1,0 +1,244 @@
+"""Statistics: an algebra of exact integers, compared in bytes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, UnknownMaterialError
+from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
+from scroll_tactile.statistics.statistics import FOLDS, Statistics, fold_of
+
+DIMENSION, SCALES = 3, (5, 20)
+
+
+def touch(seed):
+    """Material, fold and codes: windows at the short scale, and at the long one too for some."""
+    rng = np.random.default_rng(seed)
+    material = "abcdefghijkl"[rng.integers(12)]
+    codes = {5: rng.integers(-(2**BITS), 2**BITS, size=(rng.integers(1, 5), DIMENSION), dtype=np.int32, endpoint=True)}
+    if rng.random() < 0.5:
+        codes[20] = rng.integers(-(2**BITS), 2**BITS, size=(2, DIMENSION), dtype=np.int32)
+    return material, int(rng.integers(FOLDS)), codes
+
+
+def of(touches):
+    statistics = Statistics(DIMENSION, SCALES)
+    for one in touches:
+        statistics.add(*touch(one))
+    return statistics
+
+
+def same(left, right):
+    assert left == right
+    assert left.digest() == right.digest()
+    assert left.materials == right.materials
+    for scale in SCALES:
+        assert left.names(scale) == right.names(scale)
+        names = left.names(scale)
+        assert left.counts(scale, names).tobytes() == right.counts(scale, names).tobytes()
+        assert left.sums(scale, names).tobytes() == right.sums(scale, names).tobytes()
+        assert left.total_second(scale).tobytes() == right.total_second(scale).tobytes()
+        for fold in range(FOLDS):
+            assert left.second(scale, fold).rows == right.second(scale, fold).rows
+            assert left.second(scale, fold).packed().tobytes() == right.second(scale, fold).packed().tobytes()
+
+
+touches = st.lists(st.integers(0, 40), max_size=25)
+few = settings(max_examples=60, deadline=None)
+
+
+@few
+@given(touches, st.randoms(use_true_random=False))
+def test_any_order_is_the_same(felt, random):
+    shuffled = felt.copy()
+    random.shuffle(shuffled)
+    same(of(felt), of(shuffled))
+
+
+@few
+@given(touches, touches, touches)
+def test_a_sum_is_the_union(a, b, c):
+    same(of(a) + of(b), of(a + b))
+    same(of(a) + of(b), of(b) + of(a))
+    same((of(a) + of(b)) + of(c), of(a) + (of(b) + of(c)))
+    same(of(a) + Statistics(DIMENSION, SCALES), of(a))
+
+
+@few
+@given(touches, touches)
+def test_a_difference_takes_out_again(a, b):
+    same((of(a) + of(b)) - of(b), of(a))
+    same((of(a) + of(b)) - of(a), of(b))
+    same(of(a) - of(a), Statistics(DIMENSION, SCALES))
+
+
+@few
+@given(touches, touches)
+def test_what_was_removed_leaves_no_trace_even_when_more_is_felt(a, b):
+    statistics = of(a + b)
+    for one in b:
+        statistics.remove(*touch(one))
+    same(statistics, of(a))
+    for one in b[::-1]:
+        statistics.add(*touch(one))
+    same(statistics, of(b + a))
+
+
+@few
+@given(touches, touches)
+def test_operands_are_left_as_they_were_and_share_nothing(a, b):
+    left, right = of(a), of(b)
+    joint = left + right
+    for one in (1, 2, 3):
+        joint.add(*touch(one))
+        left.add(*touch(one))
+    same(joint, of([*a, *b, 1, 2, 3]))
+    same(left, of([*a, 1, 2, 3]))
+    same(right, of(b))
+
+
+@few
+@given(touches)
+def test_what_a_store_keeps_is_all_of_it(felt):
+    arrays, names = of(felt).to_arrays()
+    assert names == sorted(of(felt).materials)
+    again = Statistics.from_arrays(DIMENSION, SCALES, {name: array.copy() for name, array in arrays.items()}, names)
+    same(again, of(felt))
+    for one in (1, 2, 3, 4, 5):
+        again.add(*touch(one))
+    same(again, of([*felt, 1, 2, 3, 4, 5]))
+    assert of(felt).to_arrays()[0].keys() == arrays.keys()
+
+
+def test_arrays_for_a_store_do_not_change_with_what_is_felt_later():
+    statistics = of(range(10))
+    arrays, _ = statistics.to_arrays()
+    before = {name: array.tobytes() for name, array in arrays.items()}
+    for one in range(10, 20):
+        statistics.add(*touch(one))
+        statistics.total_second(5)
+    assert {name: array.tobytes() for name, array in arrays.items()} == before
+
+
+def test_a_material_taken_out_wholly_is_not_listed_and_not_kept():
+    statistics = of([])
+    statistics.add("wool", 0, {5: np.ones((1, 3), np.int32)})
+    statistics.add("felt", 0, {5: np.ones((2, 3), np.int32)})
+    statistics.remove("wool", 0, {5: np.ones((1, 3), np.int32)})
+    assert statistics.materials == {"felt": 1}
+    assert statistics.names(5) == ["felt"]
+    assert statistics.to_arrays()[1] == ["felt"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s.add("wool", 1, {5: np.zeros((1, 3), np.int32)}),
+        lambda s: s.add("wool", 0, {5: np.array([[0, 0, 1]], np.int32)}),
+        lambda s: s.add("felt", 0, {5: np.zeros((1, 3), np.int32)}),
+        lambda s: s.add("wool", 0, {20: np.zeros((1, 3), np.int32)}),
+        lambda s: s.add("wool", 0, {5: np.zeros((2, 3), np.int32)}),
+        lambda s: None,
+    ],
+)
+def test_any_difference_shows_in_the_digest(change):
+    base = of([])
+    base.add("wool", 0, {5: np.zeros((1, 3), np.int32)})
+    changed = of([])
+    change(changed)
+    assert base != changed
+    assert base.digest() != changed.digest()
+    assert base.digest() != Statistics(4, SCALES).digest() != Statistics(3, (5,)).digest()
+
+
+def test_what_is_not_contained_cannot_be_taken_out():
+    wool = ("wool", 0, {5: np.ones((2, 3), np.int32)})
+    small, large = of([]), of([])
+    small.add(*wool)
+    large.add(*wool)
+    large.add(*wool)
+    for other in (large, of([1]), of([2])):
+        before = small.digest()
+        with pytest.raises(InputError, match="contain"):
+            small - other
+        assert small.digest() == before
+
+
+def test_as_many_touches_of_other_content_cannot_be_taken_out():
+    ours, theirs = of([]), of([])
+    ours.add("wool", 0, {5: np.array([[1, 2, 3]], np.int32)})
+    theirs.add("wool", 0, {5: np.array([[4, 5, 6]], np.int32)})
+    with pytest.raises(InputError, match="contain"):
+        ours - theirs
+    # The sums agree, and yet the rows do not.
+    ours.add("wool", 0, {5: np.array([[-1, -2, -3]], np.int32)})
+    theirs.add("wool", 0, {5: np.array([[-4, -5, -6]], np.int32)})
+    with pytest.raises(InputError, match="contain"):
+        ours - theirs
+
+
+def test_only_what_was_felt_can_be_removed():
+    statistics = of([])
+    statistics.add("wool", 1, {5: np.ones((1, 3), np.int32)})
+    for material, fold in (("felt", 1), ("wool", 0)):
+        with pytest.raises(UnknownMaterialError):
+            statistics.remove(material, fold, {5: np.ones((1, 3), np.int32)})
+    statistics.remove("wool", 1, {5: np.ones((1, 3), np.int32)})
+    with pytest.raises(UnknownMaterialError):
+        statistics.remove("wool", 1, {5: np.ones((1, 3), np.int32)})
+    same(statistics, of([]))
+
+
+def test_statistics_of_other_shapes_do_not_mix():
+    for other in (Statistics(4, SCALES), Statistics(DIMENSION, (5,))):
+        with pytest.raises(MismatchError, match="features"):
+            of([1]) + other
+        with pytest.raises(MismatchError):
+            of([1]) - other
+        assert of([]) != other
+    assert of([]) != 3
+    with pytest.raises(TypeError):
+        hash(of([]))
+
+
+def filled(rows, fold, scale=20):
+    """Statistics that seem to hold so many rows of zeros at a scale already."""
+    statistics = of([])
+    statistics.add("wool", fold, {5: np.zeros((1, 3), np.int32), scale: np.zeros((1, 3), np.int32)})
+    statistics._rows[scale][0, fold] = rows
+    statistics._seconds[scale][fold] = SecondMoment.of(np.zeros(6, np.int64), rows, DIMENSION)
+    return statistics
+
+
+@pytest.mark.parametrize("fold", range(FOLDS))
+def test_full_statistics_refuse_before_anything_is_added(fold):
+    """The sum over the folds has to fit int64 as well, not only each fold's own."""
+    statistics = filled(MOST_ROWS - 1, 0)
+    before = statistics.digest()
+    codes = {5: np.ones((3, 3), np.int32), 20: np.ones((2, 3), np.int32)}
+    with pytest.raises(CapacityError, match="exact"):
+        statistics.add("felt", fold, codes)
+    assert statistics.digest() == before
+    assert statistics.materials == {"wool": 1}
+    assert [statistics.second(5, at).rows for at in range(FOLDS)] == [1, 0, 0]
+    statistics.add("felt", fold, {5: codes[5], 20: codes[20][:1]})
+    assert statistics.materials == {"felt": 1, "wool": 1}
+
+
+def test_full_statistics_do_not_merge():
+    half = MOST_ROWS // 2 + 1
+    with pytest.raises(CapacityError, match="exact"):
+        filled(half, 0) + filled(half, 1)
+
+
+@given(st.binary(min_size=32, max_size=32))
+def test_a_fold_is_a_function_of_the_key(key):
+    assert fold_of(key) == sum(byte << 8 * at for at, byte in enumerate(key[:8])) % FOLDS
+
+
+def test_folds_are_even():
+    rng = np.random.default_rng(0)
+    counts = np.bincount([fold_of(rng.bytes(32)) for _ in range(6000)], minlength=FOLDS)
+    assert counts.min() > 1800

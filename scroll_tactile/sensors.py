@@ -12,6 +12,7 @@ import math
 from typing import Annotated, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 __all__ = ["BIOTAC", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
@@ -25,8 +26,9 @@ class Sensor(BaseModel):
     name: what streams of this sensor are known by, non-empty.
     channels: how many values a reading has, n ≥ 1.
     rate: readings per second, in Hz.
-    low, high: the range of a valid value, in `unit`; what lies outside is clipped to it.
-    unit: the unit of the values, such as "counts" or "N".
+    low, high: the range of a valid value, in `unit`; what lies outside is clipped to it. A number means all channels;
+        a sequence has one for each, as for electrodes beside pressure, or a gyroscope beside an accelerometer.
+    unit: the unit of the values, such as "counts" or "N"; likewise one for all channels, or one for each.
     duration: how long a touch usually lasts, in seconds. Streams may be shorter or longer.
     layout: how the channels lie on the sensor, such as (6, 10) patches × taxels; its product is `channels`.
     camera: whether a reading is a picture; then layout is (height, width, 3).
@@ -39,23 +41,40 @@ class Sensor(BaseModel):
     name: Annotated[str, Field(min_length=1)]
     channels: Annotated[int, Field(ge=1)]
     rate: _Positive
-    low: FiniteFloat
-    high: FiniteFloat
-    unit: str
+    low: FiniteFloat | tuple[FiniteFloat, ...]
+    high: FiniteFloat | tuple[FiniteFloat, ...]
+    unit: str | tuple[str, ...]
     duration: _Positive
     layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     camera: bool = False
 
     @model_validator(mode="after")
+    def _one_for_all_or_one_each(self) -> Self:
+        for field in ("low", "high", "unit"):
+            value = getattr(self, field)
+            if isinstance(value, tuple) and len(value) != self.channels:
+                raise ValueError(
+                    f"{field} has {len(value)} entries for {self.channels} channels: give one, or one each"
+                )
+            if isinstance(value, tuple) and self.camera:
+                raise ValueError(f"a camera has one {field} for all its pixels; {field} has {len(value)} entries")
+        return self
+
+    @model_validator(mode="after")
     def _range_fits_float32(self) -> Self:
         # Readings are kept, compared and scaled in float32, so the range has to survive there too.
-        if not self.low < self.high:
-            raise ValueError(f"low must lie below high; they are {self.low:g} and {self.high:g}")
         largest = float(np.finfo(np.float32).max)
-        if max(abs(self.low), abs(self.high), self.high - self.low) > largest:
-            raise ValueError(f"the range {self.low:g} to {self.high:g} is too wide for float32 readings")
-        if not np.float32(self.low) < np.float32(self.high):
-            raise ValueError(f"{self.low!r} and {self.high!r} are the same number in float32: rescale the readings")
+        lows, highs = np.atleast_1d(self.low, self.high)
+        for channel, (low, high) in enumerate(np.broadcast(lows, highs)):
+            where = f" in channel {channel}" if isinstance(self.low, tuple) or isinstance(self.high, tuple) else ""
+            if not low < high:
+                raise ValueError(f"low must lie below high{where}; they are {low:g} and {high:g}")
+            if max(abs(low), abs(high), high - low) > largest:
+                raise ValueError(f"the range {low:g} to {high:g}{where} is too wide for float32 readings")
+            if not np.float32(low) < np.float32(high):
+                raise ValueError(
+                    f"{float(low)!r} and {float(high)!r}{where} are the same number in float32: rescale the readings"
+                )
         return self
 
     @model_validator(mode="after")
@@ -78,6 +97,11 @@ class Sensor(BaseModel):
     def readings(self) -> int:
         """The number of readings in a touch of the usual duration."""
         return round(self.rate * self.duration)
+
+    @property
+    def limits(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Low and high in `unit`, float32: of shape () where they mean all channels, of shape (n,) otherwise."""
+        return np.asarray(self.low, dtype=np.float32), np.asarray(self.high, dtype=np.float32)
 
     @property
     def shape(self) -> tuple[int, ...]:

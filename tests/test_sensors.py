@@ -1,8 +1,11 @@
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from scroll_tactile import sensors
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import validate
 
 FIELDS = {
     "name": "skin", "channels": 6, "rate": 50.0, "low": 0.0, "high": 1.0, "unit": "counts", "duration": 5.0,
@@ -54,8 +57,45 @@ def test_a_sensor_is_frozen():
         ({"camera": True, "layout": (3, 2, 1)}, r"it is \(3, 2, 1\)"),
         ({"duration": 0.001}, "0.001 s at 50 Hz holds no reading"),
         ({"colour": "red"}, "Extra inputs"),
+        ({"low": (0.0,) * 5}, "low has 5 entries for 6 channels: give 1 or all"),
+        ({"high": (1.0,) * 7}, "high has 7 entries for 6 channels"),
+        ({"unit": ("V",) * 5}, "unit has 5 entries for 6 channels"),
+        ({"low": (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}, "low must lie below high in channel 3; they are 1 and 1"),
+        ({"low": 1.0, "high": (2.0, 2.0, 2.0, 2.0, 2.0, 0.5)}, "low must lie below high in channel 5"),
+        ({"high": (1e9, 1.0, 1.0, 1.0, 1.0, 1e300)}, "in channel 5 is too wide for float32"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_reason(change, message):
     with pytest.raises(ValueError, match=message):
         Sensor(**(FIELDS | change))
+
+
+MIXED = Sensor(
+    name="imu", channels=2, rate=50.0, low=(-1.0, 0.0), high=(1.0, 1000.0), unit=("rad/s", "mV"), duration=1.0
+)
+
+
+def test_channels_may_have_ranges_of_their_own():
+    readings = np.tile([0.5, 1500.0], (50, 1))
+    readings[0] = [-3.0, 250.0]
+    stream = validate(readings, MIXED)
+    assert stream.clipped == 50  # the first reading's one channel, and the other channel of the other 49
+    assert stream.readings[0].tolist() == [-1.0, 250.0]
+    image = tactile_image(stream)
+    assert image[:, 0].tolist() == [-1.0, -0.5]
+    assert image[:, 1].tolist() == [0.5, 1.0]
+
+
+def test_a_number_means_all_channels_to_the_bit():
+    one = Sensor(**FIELDS)
+    each = Sensor(**(FIELDS | {"low": (one.low,) * 6, "high": (one.high,) * 6, "unit": (one.unit,) * 6}))
+    readings = np.random.default_rng(0).uniform(-20, 300, (50, 6))
+    assert tactile_image(validate(readings, one)).tobytes() == tactile_image(validate(readings, each)).tobytes()
+    assert Sensor.model_validate_json(each.model_dump_json()) == each
+    assert one.model_dump(mode="json")["low"] == one.low  # as memories have kept it from the first version on
+
+
+def test_a_camera_has_one_range():
+    fields = {"name": "eye", "channels": 12, "rate": 5.0, "high": 1.0, "unit": "1", "duration": 1.0, "camera": True}
+    with pytest.raises(ValidationError, match="a camera has one low for all its pixels"):
+        Sensor(**fields, layout=(2, 2, 3), low=(0.0,) * 12)

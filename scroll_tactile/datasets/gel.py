@@ -85,8 +85,8 @@ class Gel:
         slopes = _pressed(self.seed, index, _grid(self.sensor.shape), random)
         shares = np.stack([_lit(slopes, float(one)) for one in pressure])
         shares += _NOISE * random.standard_normal(shares.shape)
-        span = self.sensor.high - self.sensor.low
-        return validate(self.sensor.low + np.round(np.clip(shares, 0, 1) * span), self.sensor)
+        low, high = np.asarray(self.sensor.low), np.asarray(self.sensor.high)
+        return validate(low + np.round(np.clip(shares, 0, 1) * (high - low)), self.sensor)
 
 
 @dataclass(frozen=True)

@@ -224,7 +224,9 @@ def _height(texture: _Texture, place: _Floats, random: np.random.Generator) -> _
 
 def _quantise(shares: _Floats, sensor: Sensor) -> _Floats:
     """In the sensor's unit, within its range, at the resolution of its converter."""
-    span = sensor.high - sensor.low
-    counts = sensor.unit == "counts" and span >= 100  # whole counts; a unit of rescaled counts is none
-    step = 1.0 if counts else span / 4095
-    return np.clip(sensor.low + np.round(shares * span / step) * step, sensor.low, sensor.high)
+    low, high = np.asarray(sensor.low), np.asarray(sensor.high)
+    span = high - low
+    counts = (np.asarray(sensor.unit) == "counts") & (span >= 100)  # whole counts; a unit of rescaled counts is none
+    step = np.where(counts, 1.0, span / 4095)
+    readings: _Floats = np.clip(low + np.round(shares * span / step) * step, low, high)
+    return readings

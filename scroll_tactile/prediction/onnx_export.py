@@ -66,7 +66,7 @@ def export_onnx(learner: TactileLearner, path: str | os.PathLike[str]) -> None:
 
 def _shape(sensor: Sensor) -> tuple[int, int]:
     """Channels and columns of the image of a touch of the usual length, or of one frame."""
-    readings = np.full((1 if sensor.camera else sensor.readings, *sensor.shape), sensor.low, np.float32)
+    readings = np.zeros((1 if sensor.camera else sensor.readings, *sensor.shape), np.float32) + sensor.limits[0]
     channels, columns = tactile_image(validate(readings, sensor)).shape
     return channels, columns
 

@@ -214,7 +214,8 @@ def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
     if sensor.camera:
         raise InputError(f"changes are of channels along time, and camera {sensor.name!r} takes whole frames")
     image = change(tactile_image(stream)).T.astype(np.float64)
-    return validate(sensor.low + (image + 1) / 2 * (sensor.high - sensor.low), sensor)
+    low, high = np.asarray(sensor.low), np.asarray(sensor.high)
+    return validate(low + (image + 1) / 2 * (high - low), sensor)
 
 
 def _long_enough(change: Change, least: int, image: Image) -> Image:

@@ -61,7 +61,8 @@ def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:
         return np.ones(len(frames), dtype=bool)
     still = frames[0] if isinstance(rest, str) else rest
     gap = np.abs(scaled_down(frames, *_CELLS) - scaled_down(still[None], *_CELLS)).max(axis=3)
-    span = np.float32(stream.sensor.high) - np.float32(stream.sensor.low)
+    low, high = stream.sensor.limits
+    span = high - low
     differing = np.count_nonzero(gap >= np.float32(DIFFERENCE) * span, axis=(1, 2))
     told: npt.NDArray[np.bool_] = differing >= max(1.0, AREA * gap[0].size)
     return told

@@ -15,8 +15,8 @@ _FRAME_ROWS, _FRAME_COLUMNS = 120, 160
 def tactile_image(stream: Stream, rest: npt.NDArray[np.float32] | None = None) -> npt.NDArray[np.float32]:
     """Lay a stream out as an image of shape (C, T): float32, C-contiguous, without unit.
 
-    The sensor's range [low, high] is mapped to [-1, 1]. A sensor's n channels are the rows, its T readings
-    the columns.
+    The sensor's range [low, high], of each channel where it has its own, is mapped to [-1, 1]. A sensor's n channels
+    are the rows, its T readings the columns.
 
     A camera's frames are scanned as if they slid past: each is reduced by area averaging to at most 120 × 160,
     its columns follow one another on the time axis, frame after frame, and its rows × 3 colours are the
@@ -25,7 +25,7 @@ def tactile_image(stream: Stream, rest: npt.NDArray[np.float32] | None = None) -
     half the range brighter is 1, half darker −1.
     """
     readings = _scan(stream.readings) if stream.sensor.camera else stream.readings
-    low, high = np.float32(stream.sensor.low), np.float32(stream.sensor.high)
+    low, high = (limit[..., None] for limit in stream.sensor.limits)  # against (C, T)
     if rest is None:
         # Low goes first, so that a narrow range far from zero keeps its digits.
         image = np.subtract(readings.T, low, order="C")

@@ -144,14 +144,14 @@ def fewest_readings(sensor: Sensor) -> int:
 
 
 def _clip(array: _Array, sensor: Sensor) -> Stream:
-    low, high = np.float32(sensor.low), np.float32(sensor.high)
+    low, high = sensor.limits
     with np.errstate(all="ignore"):  # values beyond float32 become infinite here, and are clipped below
         values = np.array(array, dtype=np.float32, order="C", copy=True, subok=False)
         least, most = values.min(), values.max()  # NaN if any value is
     if not (math.isfinite(least) and math.isfinite(most)):
         _require_finite(array, sensor)
     clipped = 0
-    if least < low or most > high:
+    if least < low.max() or most > high.min():
         clipped = int(np.count_nonzero(values < low)) + int(np.count_nonzero(values > high))
         np.clip(values, low, high, out=values)
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys

@@ -256,7 +256,7 @@ def _require_range(folder: Path, least: float, most: float, clipped: float, sens
             f"expected readings in {folder} from {wanted}; they reach from {least:g} to {most:g}, {100 * clipped:.1f} "
             "% of them outside. Give the limits of the array that they are of"
         )
-    if max(abs(least), abs(most)) < _LEAST_USED * (sensor.high - sensor.low) / 2:
+    if max(abs(least), abs(most)) < _LEAST_USED * float(np.ptp(sensor.limits)) / 2:
         logger.warning(
             "the readings in %s reach from %g to %g only, and are scaled as from %s: give the true limits",
             *(folder, least, most, wanted),

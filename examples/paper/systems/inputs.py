@@ -24,9 +24,9 @@ def picture(stream: Stream) -> Image:
     """
     if not stream.sensor.camera:
         return tactile_image(stream)
-    half = (stream.sensor.high - stream.sensor.low) / 2
+    low, high = np.asarray(stream.sensor.low), np.asarray(stream.sensor.high)
     frame = stream.readings.mean(axis=0, dtype=np.float64).transpose(2, 0, 1)
-    return np.ascontiguousarray(np.clip((frame - stream.sensor.low) / half - 1, -1, 1), dtype=np.float32)
+    return np.ascontiguousarray(np.clip((frame - low) / ((high - low) / 2) - 1, -1, 1), dtype=np.float32)
 
 
 def average_columns(image: Image, every: int) -> Image:

@@ -35,7 +35,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import Reading
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -95,7 +95,7 @@ class TactileLearner:
         self.refit = refit
         self.augmentation = require_augmentable(sensor, augmentation)
         self.solver: SolverName = solver
-        self._reading = Reading.of(sensor, self.embedding)
+        self._reading = WindowPlan.of(sensor, self.embedding)
         self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
         self._capacity = capacity_of(exemplars, exemplar_bytes, camera=sensor.camera)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
@@ -389,7 +389,7 @@ class TactileLearner:
         self,
         model: Model,
         candidates: Sequence[str],
-        means: Mapping[int, npt.NDArray[np.float64]],
+        means: Mapping[Scale, npt.NDArray[np.float64]],
         felt: Stream,
         columns: int,
         logits: Mapping[str, float] | None,
@@ -454,7 +454,7 @@ class TactileLearner:
             return {}
         statistics = memory.statistics
 
-        def mean(material: str, scale: int) -> npt.NDArray[np.int64]:
+        def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
             total = statistics.sums(scale, [material]).sum(axis=(0, 1))
             return mean_code(total, int(statistics.counts(scale, [material]).sum()))
 

@@ -725,7 +725,7 @@ def test_a_failing_snapshot_loses_nothing(tmp_path, monkeypatch):
 
 def fill(learner):
     """Make a memory that seems to hold as many rows as exact sums can."""
-    scale = learner._reading.widths[-1]
+    scale = learner._reading.windows[-1]
     seconds = learner._memory.statistics._seconds[scale]
     seconds[0] = SecondMoment.of(seconds[0].packed(), MOST_ROWS, SMALL.dimension)
 

@@ -57,7 +57,7 @@ def test_a_sensor_is_frozen():
         ({"camera": True, "layout": (3, 2, 1)}, r"it is \(3, 2, 1\)"),
         ({"duration": 0.001}, "0.001 s at 50 Hz holds no reading"),
         ({"colour": "red"}, "Extra inputs"),
-        ({"low": (0.0,) * 5}, "low has 5 entries for 6 channels: give 1 or all"),
+        ({"low": (0.0,) * 5}, "low has 5 entries for 6 channels: give one, or one each"),
         ({"high": (1.0,) * 7}, "high has 7 entries for 6 channels"),
         ({"unit": ("V",) * 5}, "unit has 5 entries for 6 channels"),
         ({"low": (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}, "low must lie below high in channel 3; they are 1 and 1"),

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool, herd, mean_code, quotas, rank
+from scroll_tactile.signals.windows import Scale
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap"]
 
@@ -77,7 +78,7 @@ class _Pooled:
         self._pool, self._means = ExemplarPool(capacity, ratio=ratio), means
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
-        self._pool.add(Exemplar(material, key, np.zeros((0, 0), np.float32), code, 1))
+        self._pool.add(Exemplar(material, key, np.zeros((0, 0), np.float32), code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
         ranked = rank(self._pool, lambda material, _: self._means[material])

@@ -25,6 +25,7 @@ from scroll_tactile.readouts.recursive import Recursive
 from scroll_tactile.readouts.selection import DEFAULT, task_of
 from scroll_tactile.readouts.tracking import Tracked
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["run_interleaved"]
@@ -163,7 +164,7 @@ def _drift(interleavings: int, seed: int) -> Record:
     """The largest relative difference, of weights and Gram matrix, between following and solving anew; and of the
     paper's recursion, which is not anchored in between.
     """
-    dimension, materials, scale = 64, 5, 1
+    dimension, materials, scale = 64, 5, Scale("window", 1)
     source = _Source(materials, dimension, seed)
     names = [str(place) for place in range(materials)]
     statistics = Statistics(dimension, [scale])

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.selection import select
 from scroll_tactile.readouts.tracking import Tracked
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -15,6 +16,7 @@ from scroll_tactile.statistics.statistics import Statistics, fold_of
 __all__ = ["Ours"]
 
 FloatArray = npt.NDArray[np.float64]
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 
 
 class Ours:
@@ -26,7 +28,7 @@ class Ours:
 
     def __init__(self, dimension: int, refit: float, bound: float = 1.0) -> None:
         self.bound = bound
-        self.statistics = Statistics(dimension, [1])
+        self.statistics = Statistics(dimension, [WHOLE])
         self.refit = refit
         self._waiting: list[tuple[str, npt.NDArray[np.int32]]] = []
         self._fitted_at = self._seen = 0
@@ -37,7 +39,7 @@ class Ours:
     def observe(self, place: int, row: FloatArray) -> None:
         """Learn one vector of the class at a place."""
         name, codes = f"{place:03d}", to_codes(row[None], self.bound)
-        self.statistics.add(name, fold_of(codes.tobytes()), {1: codes})
+        self.statistics.add(name, fold_of(codes.tobytes()), {WHOLE: codes})
         self._seen += 1
         self._waiting.append((name, codes))
 
@@ -53,13 +55,13 @@ class Ours:
     def _take_in(self) -> None:
         new = any(name not in self._names for name, _ in self._waiting)
         if new or self._readout is None or self._seen > (1 + self.refit) * self._fitted_at:
-            selection = select(self.statistics, 1, "lda")
+            selection = select(self.statistics, WHOLE, "lda")
             assert selection is not None
             self._names, self._readout = selection.places, selection.readout
             self._fitted_at, self._tracked = self._seen, None
         else:
             if self._tracked is None:
-                self._tracked = Tracked(self.statistics, 1, self._readout)
+                self._tracked = Tracked(self.statistics, WHOLE, self._readout)
             elif not all(self._tracked.add(codes, self._names[name]) for name, codes in self._waiting):
                 self._tracked.anchor(self.statistics)
             self._readout = self._tracked.readout()

@@ -28,7 +28,7 @@ from scroll_tactile.readouts.path import fit_path
 from scroll_tactile.readouts.readout import fit_readout
 from scroll_tactile.readouts.selection import PENALTIES, task_of
 from scroll_tactile.signals.image import tactile_image, three_planes
-from scroll_tactile.signals.windows import extent, scales
+from scroll_tactile.signals.windows import Scale, extent, scales
 from scroll_tactile.statistics.grid import to_codes
 from scroll_tactile.statistics.moments import SecondMoment, one_thread
 from scroll_tactile.statistics.statistics import Statistics
@@ -36,6 +36,7 @@ from scroll_tactile.statistics.statistics import Statistics
 __all__ = ["run_speed"]
 
 Record = dict[str, Any]
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 Note = Callable[[str], None]
 BLOCK = 64  # rows in which the plain update is fed, and ours
 
@@ -175,10 +176,10 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
     dimension, classes, rows = 1008, 20, 3000
     places = np.arange(rows) % classes
     values = np.clip(rng.normal(0, 0.05, (classes, dimension))[places] + rng.normal(0, 0.2, (rows, dimension)), -1, 1)
-    statistics = Statistics(dimension, [1])
+    statistics = Statistics(dimension, [WHOLE])
     for place in range(classes):
-        statistics.add(f"{place:02d}", 0, {1: to_codes(values[places == place], 1.0)})
-    task, penalties = task_of(statistics, 1), np.geomspace(min(PENALTIES), max(PENALTIES), count).tolist()
+        statistics.add(f"{place:02d}", 0, {WHOLE: to_codes(values[places == place], 1.0)})
+    task, penalties = task_of(statistics, WHOLE), np.geomspace(min(PENALTIES), max(PENALTIES), count).tolist()
     with one_thread():
         calls: dict[str, Callable[[], object]] = {
             "path": lambda: fit_path(task, penalties),
@@ -233,7 +234,8 @@ def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLe
     assert store is not None
     for at in range(observations):
         codes = {
-            width: rng.integers(0, 23, size=(1, learner.embedding.dimension), dtype=np.int32) * 2**14 for width in one
+            Scale("window", width): rng.integers(0, 23, size=(1, learner.embedding.dimension), dtype=np.int32) * 2**14
+            for width in one
         }
         key = rng.bytes(32)
         material = scene.materials[at % len(scene.materials)]

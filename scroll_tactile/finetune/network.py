@@ -18,7 +18,7 @@ from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.embeddings.vision import MOST_COLUMNS, TOGETHER, TunableVision
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import Reading
+from scroll_tactile.signals.windows import WindowPlan
 
 __all__ = ["Backbone", "Lesson", "TouchFeatures", "TunedReader", "adapted"]
 
@@ -105,7 +105,7 @@ class TouchFeatures:
     reads them, each by itself.
     """
 
-    def __init__(self, embedding: Embedding, reading: Reading) -> None:
+    def __init__(self, embedding: Embedding, reading: WindowPlan) -> None:
         whole: Any = getattr(embedding, "plain", embedding)
         self.parts: tuple[Any, ...] = tuple(getattr(whole, "parts", (whole,)))
         self.reading = reading
@@ -118,7 +118,7 @@ class TouchFeatures:
     @property
     def tunable(self) -> bool:
         """Whether there is a network to be trained, and a scale that it reads."""
-        return self._at is not None and self.reading.judging(self.reading.milestones()[-1])[-1] >= TOGETHER
+        return self._at is not None and self.reading.widths[-1] >= TOGETHER
 
     def reads(self, columns: int) -> bool:
         """Whether a touch of so many columns is one pass of the network, or needs none."""
@@ -133,8 +133,8 @@ class TouchFeatures:
         """Width → first columns of the windows that judge a touch of so many columns."""
         read = self.reading.extent(columns)
         return {
-            width: [read[width][place] for place in places]
-            for width, places in self.reading.scored(columns, columns).items()
+            scale.width: [read[scale.width][place] for place in places]
+            for scale, places in self.reading.scored(columns, columns).items()
         }
 
     def frozen(self, image: npt.NDArray[np.float32]) -> dict[int, FloatArray]:
@@ -196,7 +196,7 @@ class TouchFeatures:
 class TunedReader:
     """Logits of f*: the network with what was trained put into it, and the head."""
 
-    def __init__(self, embedding: Embedding, reading: Reading, tuned: Tuned) -> None:
+    def __init__(self, embedding: Embedding, reading: WindowPlan, tuned: Tuned) -> None:
         self.tuned = tuned
         self._touches = TouchFeatures(embedding, reading)
         self._net: Backbone | None = None

@@ -78,7 +78,7 @@ def start_of(model: Model, names: Sequence[str], fold: int | None = None) -> Sta
         mixing = np.eye(len(known)) if model.kind == "lda" else readout.ridge
         slopes = readout.weights @ mixing[:, at]
         offset = readout.scores(np.zeros(len(known)), model.kind)[at]
-        heads[scale] = weight * slopes * 2.0**BITS
+        heads[scale.width] = weight * slopes * 2.0**BITS
         bias += weight * (offset - readout.center @ slopes)
     return Start(list(names), heads, bias)
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import Sample
@@ -123,7 +124,7 @@ class Exemplar:
     key: bytes
     readings: npt.NDArray[np.float32]
     code: npt.NDArray[np.int32]
-    scale: int
+    scale: Scale
 
     @classmethod
     def of(
@@ -131,7 +132,7 @@ class Exemplar:
         material: str,
         key: bytes,
         readings: npt.NDArray[np.float32],
-        codes: Mapping[int, npt.NDArray[np.int32]],
+        codes: Mapping[Scale, npt.NDArray[np.int32]],
     ) -> Exemplar:
         """The exemplar of a stream; codes: for each scale those of its windows, shape (windows, d)."""
         scale = max(scale for scale, rows in codes.items() if len(rows))
@@ -241,7 +242,7 @@ class ExemplarPool:
         readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
         rows = zip(arrays["exemplar-keys"], arrays["exemplar-codes"], arrays["exemplar-scales"], strict=True)
         exemplars = [
-            Exemplar(material, key.tobytes(), readings[at].copy(), code, int(scale))
+            Exemplar(material, key.tobytes(), readings[at].copy(), code, Scale.numbered(int(scale)))
             for at, (material, (key, code, scale)) in enumerate(zip(attributes["materials"], rows, strict=True))
         ]
         pool._sample.update(attributes["felt"], map(_entry, exemplars))
@@ -252,7 +253,7 @@ def _entry(one: Exemplar) -> tuple[str, bytes, Exemplar, int]:
     return one.material, one.key, one, one.readings.nbytes
 
 
-def rank(pool: ExemplarPool, means: Callable[[str, int], IntArray]) -> dict[str, list[Exemplar]]:
+def rank(pool: ExemplarPool, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.
@@ -266,9 +267,9 @@ def rank(pool: ExemplarPool, means: Callable[[str, int], IntArray]) -> dict[str,
     return {name: _herded(candidates[name], means, count) for name, count in places.items() if count}
 
 
-def _herded(candidates: list[Exemplar], means: Callable[[str, int], IntArray], count: int) -> list[Exemplar]:
+def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray], count: int) -> list[Exemplar]:
     widest = max(one.scale for one in candidates)
     first = [one for one in candidates if one.scale == widest]
-    brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-one.scale, one.key))
+    brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-int(one.scale), one.key))
     codes, mean = np.stack([one.code for one in first]), means(candidates[0].material, widest)
     return ([first[at] for at in herd(codes, [one.key for one in first], mean, count)] + brief)[:count]

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 
 __all__ = ["Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
 
-Codes = dict[int, npt.NDArray[np.int32]]
+Codes = dict[Scale, npt.NDArray[np.int32]]
 LARGE, BLOCK = 2**13, 2**10  # codes
 
 
-def pack_codes(codes: Mapping[int, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
+def pack_codes(codes: Mapping[Scale, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
     """Codes by scale as the arrays of a journal row: their distinct values, and places among them.
 
     Windows hold few distinct values (a proportion of 22 positions has 23), so a place is a byte and packs well.
@@ -55,13 +56,17 @@ def _distinct(numbers: npt.NDArray[np.int32]) -> npt.NDArray[np.integer]:
 
 def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
     """The codes that `pack_codes` packed."""
-    plain = {int(name.removeprefix("codes-")): rows for name, rows in arrays.items() if name.startswith("codes-")}
-    scales = [int(name.removeprefix("values-")) for name in arrays if name.startswith("values-")]
+    plain = {_scale(name): rows for name, rows in arrays.items() if name.startswith("codes-")}
+    scales = [_scale(name) for name in arrays if name.startswith("values-")]
     packed = {
         scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
         for scale in scales
     }
     return dict(sorted((plain | packed).items()))
+
+
+def _scale(name: str) -> Scale:
+    return Scale.numbered(int(name.partition("-")[2]))
 
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:

@@ -17,7 +17,7 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool
 from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import NOISY, Reading
+from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.sample import Pool, Touch
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 from store import CompactedError, DamageError, Head, Record, Store
@@ -73,7 +73,7 @@ class Memory:
     saved: the last sequence that a generation is known to hold.
     """
 
-    def __init__(self, dimension: int, reading: Reading, capacity: Capacity | None = None) -> None:
+    def __init__(self, dimension: int, reading: WindowPlan, capacity: Capacity | None = None) -> None:
         self.reading = reading
         self.capacity = capacity or Capacity()
         self.statistics = Statistics(dimension, reading.scales)
@@ -233,9 +233,9 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> Touch:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-        if all(scale in codes for scale in NOISY):  # the first noisy copy, at a stage behind all that a touch can reach
-            unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
-            stages += [*unreached, {scale: [0] for scale in NOISY}]
+        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage behind all that a touch can reach
+            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            stages += [*unreached, {scale: [0] for scale in NOISE}]
         return Touch.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
@@ -253,7 +253,7 @@ class Memory:
         pooled, materials = self.pool.to_arrays()
         attributes: dict[str, Any] = {
             "dimension": self.statistics.dimension,
-            "scales": list(self.statistics.scales),
+            "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "pool": materials,
             "capacity": [self.capacity.streams, self.capacity.nbytes],
@@ -277,7 +277,7 @@ class Memory:
         return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
 
     @classmethod
-    def load(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None = None) -> Memory:
+    def load(cls, store: Store, dimension: int, reading: WindowPlan, capacity: Capacity | None = None) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
@@ -291,7 +291,7 @@ class Memory:
         return cls._loaded(store, dimension, reading, capacity)
 
     @classmethod
-    def _loaded(cls, store: Store, dimension: int, reading: Reading, capacity: Capacity | None) -> Memory:
+    def _loaded(cls, store: Store, dimension: int, reading: WindowPlan, capacity: Capacity | None) -> Memory:
         memory = cls(dimension, reading, capacity)
         memory.base = store.compacted
         # Where no generation verifies the base's own error says what is lost; without one all rows are there.

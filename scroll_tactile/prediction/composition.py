@@ -20,6 +20,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.constituents import Bench, Head, Stage, combined, space_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Constituent
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["Composer"]
@@ -45,7 +46,7 @@ class Composer:
             stages = [Bench(model, memory, stage).fit(targets) for stage in range(len(model.calibrations))]
         return cls(model, targets, stages)
 
-    def needed(self, columns: int) -> list[int]:
+    def needed(self, columns: int) -> list[Scale]:
         """The scales whose windows the heads read of a touch of so many columns."""
         return self.model.stages[self._reached(columns)]
 
@@ -56,7 +57,7 @@ class Composer:
         self,
         wanted: Sequence[str],
         feels_like: Mapping[str, float],
-        means: Mapping[int, FloatArray],
+        means: Mapping[Scale, FloatArray],
         columns: int,
         expected: float,
     ) -> tuple[tuple[Constituent, ...], float]:

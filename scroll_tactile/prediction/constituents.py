@@ -19,6 +19,7 @@ from scroll_tactile.readouts.attributes import GAMMAS, Curve, Solved, fit_curve,
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
 from scroll_tactile.readouts.left_out import left_out
 from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import Touch
 from scroll_tactile.statistics.statistics import fold_of
 
@@ -227,7 +228,7 @@ class Bench:
         return self._solved[key]
 
 
-def _readout(model: Model, scale: int, fold: int | None) -> tuple[list[str], Readout]:
+def _readout(model: Model, scale: Scale, fold: int | None) -> tuple[list[str], Readout]:
     """The materials of a scale's readout, and the readout: of all that was felt, or of all but a fold."""
     selection = model.selections[scale]
     if fold is None:
@@ -248,7 +249,7 @@ def space_of(model: Model, stage: int, fold: int | None = None) -> _Space:
 
 
 def combined(
-    model: Model, stage: int, names: Sequence[str], z: Mapping[int, FloatArray], fold: int | None = None
+    model: Model, stage: int, names: Sequence[str], z: Mapping[Scale, FloatArray], fold: int | None = None
 ) -> FloatArray:
     """z of a stage, shape (C,), of the z that its scales' readouts give, in the order of the names."""
     total = np.zeros(len(names))
@@ -265,6 +266,6 @@ def _weights(model: Model, stage: int) -> FloatArray:
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
 
 
-def _others(model: Model, scale: int, known: npt.NDArray[np.intp], out: str | None) -> npt.NDArray[np.intp]:
+def _others(model: Model, scale: Scale, known: npt.NDArray[np.intp], out: str | None) -> npt.NDArray[np.intp]:
     names = model.selections[scale].names
     return np.array([place for place, at in enumerate(known) if names[at] != out], dtype=np.intp)

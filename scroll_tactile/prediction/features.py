@@ -16,7 +16,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed, require_rest, rest_of
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISY, Reading
+from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 
 __all__ = ["Perception", "Readings"]
@@ -31,7 +31,9 @@ class Perception:
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
     """
 
-    def __init__(self, sensor: Sensor, embedding: Embedding, reading: Reading, augmentation: Augmented | None) -> None:
+    def __init__(
+        self, sensor: Sensor, embedding: Embedding, reading: WindowPlan, augmentation: Augmented | None
+    ) -> None:
         self._sensor = sensor
         self._embedding = embedding
         self._reading = reading
@@ -60,35 +62,37 @@ class Perception:
         own, *others = [self.features(one) for one in (image, *copies, *noisy * (not self._reading.noisy))]
         read = {scale: [rows, *(one[scale] for one in others if scale in one)] for scale, rows in own.items()}
         if self._reading.noisy and noisy:
-            read |= {scale: [rows] for scale, rows in zip(NOISY, self._noisy_features(noisy), strict=True)}
+            read |= {scale: [rows] for scale, rows in zip(NOISE, self._noisy_features(noisy), strict=True)}
         if self._reading.filled:
             read[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
         return {scale: to_codes(np.concatenate(rows), self._embedding.bound) for scale, rows in sorted(read.items())}
 
-    def means(self, image: Image, widths: Sequence[int]) -> dict[int, npt.NDArray[np.float64]]:
+    def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale."""
         places = self._reading.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error to what is asked about.
         return {
-            width: in_units(rows[places[width]], self._embedding.bound).mean(axis=0)
-            for width, rows in self.features(image, widths).items()
+            scale: in_units(rows[places[scale]], self._embedding.bound).mean(axis=0)
+            for scale, rows in self.features(image, scales).items()
         }
 
-    def features(self, image: Image, scales: Sequence[int] | None = None) -> dict[int, npt.NDArray[np.floating]]:
+    def features(self, image: Image, scales: Sequence[Scale] | None = None) -> dict[Scale, npt.NDArray[np.floating]]:
         """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
         windows = self._reading.extent(image.shape[1])
         narrowest = self._reading.widths[0]
         if scales is not None:
-            windows = {width: windows[width] for width in windows if width in scales}
-        read = embed_windows(self._embedding, image, windows)
-        for width, features in read.items():
+            wanted = {scale.width for scale in scales}
+            windows = {width: windows[width] for width in windows if width in wanted}
+        embedded = embed_windows(self._embedding, image, windows)
+        for width, features in embedded.items():
             expected = (len(windows[width]), self._embedding.dimension)
             if features.shape != expected:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
                 )
-        if self._reading.beginning and narrowest in read:
-            read = {BEGINNING: read[narrowest][:1], **read}
+        read = {Scale("window", width): features for width, features in embedded.items()}
+        if self._reading.beginning and narrowest in embedded:
+            read = {BEGINNING: embedded[narrowest][:1], **read}
         return read
 
     def as_far_as(self, felt: Stream, longest: int) -> Stream:
@@ -105,10 +109,10 @@ class Perception:
         """Whether a touch was felt through noise, by an embedding that tells; a function of the touch alone."""
         return self._reading.noisy and cast(Robust, self._embedding).is_noisy(image)
 
-    def noisy_means(self, image: Image) -> dict[int, npt.NDArray[np.float64]]:
+    def noisy_means(self, image: Image) -> dict[Scale, npt.NDArray[np.float64]]:
         """The features of a touch felt through noise, in the codes' unit, (d,) by scale."""
         sets = self._noisy_features([image])
-        return {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISY, sets, strict=True)}
+        return {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
 
     def _noisy_features(self, images: Sequence[Image]) -> npt.NDArray[np.floating]:
         embedding = cast(Robust, self._embedding)  # which `Reading.of` found to have it

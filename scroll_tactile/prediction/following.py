@@ -18,7 +18,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.recursive import Recursive
 from scroll_tactile.readouts.selection import Selection
 from scroll_tactile.readouts.tracking import Follower, Tracked
-from scroll_tactile.signals.windows import CHANNELS
+from scroll_tactile.signals.windows import CHANNELS, Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -27,7 +27,7 @@ __all__ = ["Added", "Following", "SolverName"]
 SolverName = Literal["exact", "recursive"]
 FOLLOWERS: dict[SolverName, type[Follower]] = {"exact": Tracked, "recursive": Recursive}
 
-Added = tuple[str, dict[int, npt.NDArray[np.int32]]]
+Added = tuple[str, dict[Scale, npt.NDArray[np.int32]]]
 """A material, and the codes of a touch of it by scale."""
 
 
@@ -43,7 +43,7 @@ class Following:
         self._follower = FOLLOWERS[solver]
         self._felt = sum(memory.statistics.materials.values())
         self._most = (1 + refit) * self._felt
-        self._tracked: dict[int, Follower] = {}
+        self._tracked: dict[Scale, Follower] = {}
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in the touches that were added since; False where the model has to be fitted again.
@@ -59,7 +59,7 @@ class Following:
             self.model = replace(self.model, selections=self._followed(statistics, added))
         return True
 
-    def _followed(self, statistics: Statistics, added: Sequence[Added]) -> dict[int, Selection]:
+    def _followed(self, statistics: Statistics, added: Sequence[Added]) -> dict[Scale, Selection]:
         selections = dict(self.model.selections)
         for scale, selection in selections.items():
             rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]
@@ -72,6 +72,6 @@ class Following:
             selections[scale] = replace(selection, readout=tracked.readout())
         return selections
 
-    def _names(self, scale: int) -> list[str]:
+    def _names(self, scale: Scale) -> list[str]:
         selection = self.model.selections.get(scale)
         return [] if selection is None else selection.names

@@ -12,7 +12,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.selection import PENALTIES, Selection, select
-from scroll_tactile.signals.windows import CHANNELS, NOISY, Reading
+from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["Judgement", "Model"]
@@ -38,9 +38,9 @@ class Model:
 
     kind: ReadoutName
     names: list[str]
-    reading: Reading
-    stages: list[list[int]]
-    selections: dict[int, Selection]
+    reading: WindowPlan
+    stages: list[list[Scale]]
+    selections: dict[Scale, Selection]
     calibrations: list[Calibration]
     noisy: Calibration | None = None
 
@@ -56,8 +56,8 @@ class Model:
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
             noisy = None
-            if all(scale in selections for scale in NOISY):
-                noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISY], kind)
+            if all(scale in selections for scale in NOISE):
+                noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISE], kind)
         give_back_scratch()
         return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations, noisy)
 
@@ -70,7 +70,7 @@ class Model:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
         return min(len(self.reading.stages(columns)), len(self.calibrations)) == len(self.stages)
 
-    def needed(self, candidates: Sequence[str], columns: int) -> list[int]:
+    def needed(self, candidates: Sequence[str], columns: int) -> list[Scale]:
         """The scales whose windows judging these candidates for a touch of so many columns takes."""
         decided = self._decided(candidates, len(self.reading.stages(columns)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]})
@@ -78,7 +78,7 @@ class Model:
     def judge(
         self,
         candidates: Sequence[str],
-        means: Mapping[int, FloatArray],
+        means: Mapping[Scale, FloatArray],
         columns: int,
         tuned: Mapping[str, float] | None = None,
     ) -> Judgement:
@@ -110,13 +110,13 @@ class Model:
         distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
 
-    def judge_noisy(self, candidates: Sequence[str], means: Mapping[int, FloatArray]) -> Judgement:
+    def judge_noisy(self, candidates: Sequence[str], means: Mapping[Scale, FloatArray]) -> Judgement:
         """Weigh the candidates for a touch felt through noise; means: scale → its features in the codes' unit, (d,)."""
         assert self.noisy is not None
         z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
-        logits = self._weighted(NOISY, self.noisy, z, candidates)
+        logits = self._weighted(NOISE, self.noisy, z, candidates)
         chances = np.exp(logits - logits.max())
-        novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISY]))
+        novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISE]))
         return Judgement(chances / chances.sum(), float(novelty), self.noisy)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
@@ -128,13 +128,13 @@ class Model:
             if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
         ]
 
-    def _felt_at(self, scales: Sequence[int], candidates: Sequence[str]) -> list[int]:
+    def _felt_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
         """The places of the candidates that were felt at all of these scales."""
         known = [self.selections[scale].places for scale in scales]
         return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
 
     def _weighted(
-        self, scales: Sequence[int], calibration: Calibration, z: Mapping[int, FloatArray], names: Sequence[str]
+        self, scales: Sequence[Scale], calibration: Calibration, z: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
         logits = np.zeros(len(names))
         for scale, weight in zip(scales, calibration.weights, strict=True):
@@ -143,7 +143,7 @@ class Model:
             logits += weight * selection.readout.scores(z[scale], self.kind)[places]
         return logits
 
-    def _distance(self, scale: int, z: FloatArray, candidates: Sequence[str]) -> float:
+    def _distance(self, scale: Scale, z: FloatArray, candidates: Sequence[str]) -> float:
         selection = self.selections[scale]
         places = np.array([selection.places[name] for name in candidates if name in selection.places])
         return float(selection.readout.novelty(z, places))

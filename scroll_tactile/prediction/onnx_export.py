@@ -18,6 +18,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 
 __all__ = ["export_onnx"]
@@ -71,7 +72,7 @@ def _shape(sensor: Sensor) -> tuple[int, int]:
     return channels, columns
 
 
-def _scales(model: Model, columns: int) -> tuple[int, list[int]]:
+def _scales(model: Model, columns: int) -> tuple[int, list[Scale]]:
     """The stage that a touch of so many columns is judged at, and its scales."""
     stage = min(len(model.reading.stages(columns)), len(model.calibrations)) - 1
     scales = list(model.stages[stage])
@@ -84,7 +85,7 @@ def _scales(model: Model, columns: int) -> tuple[int, list[int]]:
     return stage, scales
 
 
-def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, int], read: int) -> dict[int, str]:
+def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, int], read: int) -> dict[Scale, str]:
     """Scale → the features (windows, d) of the windows that are scored, float32."""
     net = embedding.network().net
     quick, last = folded(net, embedding.stages[-1]), embedding.stages[-1]
@@ -94,9 +95,9 @@ def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, i
     whole: list[str] = []
     features = {}
     for scale in _scales(model, read)[1]:
-        starts = [windows[scale][place] for place in places[scale]]
-        width = min(scale, read)
-        if scale >= TOGETHER and read <= MOST_COLUMNS:
+        starts = [windows[scale.width][place] for place in places[scale]]
+        width = min(scale.width, read)
+        if scale.width >= TOGETHER and read <= MOST_COLUMNS:
             whole = whole or graph.network(quick, planes, last)
             spans = [(start, start + width) for start in starts]
             features[scale] = _pooled(graph, embedding, net, whole, (shape[0], read), spans)
@@ -144,7 +145,7 @@ def _pooled(
     return graph.add("Min", graph.add("Concat", *parts, axis=1), graph.constant(np.float32(1)))
 
 
-def _scores(graph: Graph, model: Model, features: dict[int, str], columns: int) -> str:
+def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int) -> str:
     """Log probabilities (materials,) in double precision: the readouts' scores, weighed as the stage is calibrated."""
     stage, scales = _scales(model, columns)
     logits = ""

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -28,7 +29,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def left_out(
-    statistics: Statistics, scale: int, readout: Readout, rows: FloatArray, places: Sequence[int]
+    statistics: Statistics, scale: Scale, readout: Readout, rows: FloatArray, places: Sequence[int]
 ) -> FloatArray:
     """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been felt.
 

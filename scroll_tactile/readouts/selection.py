@@ -18,6 +18,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from scroll_tactile.readouts.path import fit_path
 from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, fit_readout
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import within_scatter
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
 
@@ -65,7 +66,7 @@ class _Trial:
 
 
 def select(
-    statistics: Statistics, scale: int, kind: ReadoutName, penalties: Sequence[float] = PENALTIES
+    statistics: Statistics, scale: Scale, kind: ReadoutName, penalties: Sequence[float] = PENALTIES
 ) -> Selection | None:
     """Choose λ among the penalties and fit the readout of a scale; None where nothing was felt at it."""
     names = statistics.names(scale)
@@ -86,7 +87,7 @@ def select(
     return Selection(names, readout, held_out, losses)
 
 
-def task_of(statistics: Statistics, scale: int) -> Task:
+def task_of(statistics: Statistics, scale: Scale) -> Task:
     """The task of all that was felt at a scale."""
     counts, sums = statistics.totals(scale)
     return Task.of(within_scatter(statistics.total_second(scale), counts, sums), counts, sums)
@@ -94,7 +95,7 @@ def task_of(statistics: Statistics, scale: int) -> Task:
 
 def _trial(
     statistics: Statistics,
-    scale: int,
+    scale: Scale,
     fold: int,
     counts: npt.NDArray[np.int64],
     sums: npt.NDArray[np.int64],

@@ -17,6 +17,7 @@ from scipy.linalg.blas import dtrsv
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.readouts.readout import Readout, centred_means
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -37,7 +38,7 @@ class Follower:
     A subclass has `anchor`, `add` and `readout`.
     """
 
-    def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
+    def __init__(self, statistics: Statistics, scale: Scale, start: Readout) -> None:
         self._scale = scale
         self._penalty = start.penalty
         # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.

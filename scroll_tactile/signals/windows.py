@@ -22,9 +22,10 @@ __all__ = [
     "ENOUGH",
     "FRAMES",
     "MOST_WINDOWS",
-    "NOISY",
+    "NOISE",
     "Extent",
-    "Reading",
+    "Scale",
+    "WindowPlan",
     "extent",
     "fitting",
     "milestones",
@@ -40,12 +41,45 @@ FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
 FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
-# Scales that are no widths, and smaller than any width:
-NOISY = (0, 3)  # the whole of a touch felt through noise, in two sets of features
-BEGINNING = 1  # the first of the narrowest windows, by itself
-CHANNELS = 2  # readings themselves, by which silent channels are filled in; it judges nothing
-
 Extent = dict[int, list[int]]  # width of windows → their first columns
+
+# The numbers by which memories on disk know the scales that are no windows; a window's number is its width.
+_NUMBERS = {"noise-a": 0, "beginning": 1, "channels": 2, "noise-b": 3}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What statistics are kept of, by itself.
+
+    kind: "window" for windows of `width` columns; "beginning" for the first of the narrowest windows alone; "noise-a"
+    and "noise-b" for the two sets of features of a touch felt through noise, as a whole; "channels" for readings
+    themselves, by which dead channels are filled in, and which judges nothing. width: 0 but for windows.
+
+    Scales are ordered by their number; `str` of one is its number, which names its arrays on disk.
+    """
+
+    kind: Literal["window", "beginning", "noise-a", "noise-b", "channels"]
+    width: int = 0
+
+    @classmethod
+    def numbered(cls, number: int) -> Scale:
+        """The scale of a number on disk."""
+        special = {other: kind for kind, other in _NUMBERS.items()}
+        return cls(special[number]) if number in special else cls("window", number)  # type: ignore[arg-type]
+
+    def __index__(self) -> int:
+        return self.width if self.kind == "window" else _NUMBERS[self.kind]
+
+    def __str__(self) -> str:
+        return str(int(self))
+
+    def __lt__(self, other: Scale) -> bool:
+        return int(self) < int(other)
+
+
+NOISE = (Scale("noise-a"), Scale("noise-b"))
+BEGINNING = Scale("beginning")
+CHANNELS = Scale("channels")
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
@@ -142,14 +176,14 @@ def stages(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> li
 
 
 @dataclass(frozen=True)
-class Reading:
+class WindowPlan:
     """How the touches of a sensor are read by an embedding: which windows, and which scales judge.
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
-    is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
-    penalties: the λ that the readouts are tried with; none: those of `ridge.selection`. frames: whether windows are a
-    camera's frames.
+    is a scale of its own. noisy: whether touches felt through noise are. filled: whether dead channels are filled in.
+    penalties: the λ that the readouts are tried with; none: those of `readouts.selection`. frames: whether windows
+    are a camera's frames.
     """
 
     widths: tuple[int, ...]
@@ -162,7 +196,7 @@ class Reading:
     frames: bool = False
 
     @classmethod
-    def of(cls, sensor: Sensor, embedding: Any) -> Reading:
+    def of(cls, sensor: Sensor, embedding: Any) -> WindowPlan:
         """As the embedding asks for by its attributes, where it has them.
 
         These are `partial_windows`, `judged_scales`, `reads_beginnings`, `fills_channels`, `penalties`, and whether
@@ -177,30 +211,37 @@ class Reading:
         return cls(scales(sensor), partial, judged, beginning, noisy, filled, penalties, sensor.camera)
 
     @property
-    def scales(self) -> tuple[int, ...]:
-        """All that has statistics of its own, ascending: the widths, and before them NOISY, BEGINNING, CHANNELS."""
-        own = NOISY * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled
-        return (*sorted(own), *self.widths)
+    def windows(self) -> tuple[Scale, ...]:
+        """The scales that are windows, ascending."""
+        return tuple(Scale("window", width) for width in self.widths)
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """All that has statistics of its own, ascending by number: what is no window comes first."""
+        own = NOISE * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled
+        return (*sorted(own), *self.windows)
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""
         return extent(columns, self.widths, partial=self.partial, frames=self.frames)
 
-    def judging(self, length: int) -> list[int]:
+    def judging(self, length: int) -> list[Scale]:
         """The scales that judge when so many columns have been felt."""
         fit = fitting(length, self.widths, partial=self.partial)
         chosen = fit[-1:] if self.judged == "widest" else fit
-        return [BEGINNING, *chosen] if self.beginning and chosen[0] == self.widths[0] else chosen
+        first = [BEGINNING] if self.beginning and chosen[0] == self.widths[0] else []
+        return [*first, *(Scale("window", width) for width in chosen)]
 
-    def scored(self, columns: int, length: int) -> dict[int, list[int]]:
+    def scored(self, columns: int, length: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows that judge after the first `length`."""
         places = scored(self.extent(columns), length, partial=self.partial)
-        return {scale: places.get(scale, [0]) for scale in self.judging(length)}
+        return {scale: places.get(scale.width, [0]) for scale in self.judging(length)}
 
-    def places(self, columns: int) -> dict[int, list[int]]:
+    def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
         places = scored(self.extent(columns), columns, partial=self.partial)
-        return {BEGINNING: [0], **places} if self.beginning else places
+        windows = {Scale("window", width): chosen for width, chosen in places.items()}
+        return {BEGINNING: [0], **windows} if self.beginning else windows
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""

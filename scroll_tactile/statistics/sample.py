@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.signals.windows import Scale
 
 __all__ = ["CAPACITY", "LARGEST_SHARE", "Pool", "Sample", "Touch"]
 
@@ -37,7 +38,7 @@ class Touch:
     pairs: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]) -> Touch:
+    def of(cls, stages: Sequence[Mapping[Scale, Sequence[int]]], codes: Mapping[Scale, npt.NDArray[np.int32]]) -> Touch:
         """The touch of these codes; stages: for each, width → places of the windows that are scored there."""
         chosen = [
             (stage, scale, width, places)

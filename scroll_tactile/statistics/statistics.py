@@ -15,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, require_room
 
 __all__ = ["FOLDS", "Statistics", "fold_of"]
 
 IntArray = npt.NDArray[np.int64]
-Codes = Mapping[int, npt.NDArray[np.int32]]
+Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
 # Each fold costs one more second moment a scale. Three leave two thirds of the touches to the model that is
 # tried on the rest; two made λ and the temperature those of a memory half as large.
@@ -40,7 +41,7 @@ class Statistics:
     `+` joins two, `-` takes one out of another, `==` compares bytes whatever the order of the materials.
     """
 
-    def __init__(self, dimension: int, scales: Sequence[int]) -> None:
+    def __init__(self, dimension: int, scales: Sequence[Scale]) -> None:
         self.dimension = dimension
         self.scales = tuple(scales)
         self._places: dict[str, int] = {}
@@ -80,7 +81,7 @@ class Statistics:
         for scale, rows in codes.items():
             require_room(self._total_rows(scale), len(rows))
 
-    def _total_rows(self, scale: int) -> int:
+    def _total_rows(self, scale: Scale) -> int:
         return sum(moment.rows for moment in self._seconds[scale])
 
     def remove(self, material: str, fold: int, codes: Codes, columns: int = 0) -> None:
@@ -118,29 +119,29 @@ class Statistics:
         self._rows = {scale: grown(rows) for scale, rows in self._rows.items()}
         self._sums = {scale: grown(sums) for scale, sums in self._sums.items()}
 
-    def names(self, scale: int) -> list[str]:
+    def names(self, scale: Scale) -> list[str]:
         """The materials that were felt at a scale, in alphabetical order."""
         rows = self._rows[scale].sum(axis=1)
         return [name for name, at in sorted(self._places.items()) if rows[at]]
 
-    def counts(self, scale: int, names: Sequence[str]) -> IntArray:
+    def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Rows of each material in each fold, shape (C, FOLDS)."""
         return self._rows[scale][[self._places[name] for name in names]]
 
-    def sums(self, scale: int, names: Sequence[str]) -> IntArray:
+    def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Sums of codes of each material in each fold, shape (C, FOLDS, d)."""
         return self._sums[scale][[self._places[name] for name in names]]
 
-    def totals(self, scale: int) -> tuple[IntArray, IntArray]:
+    def totals(self, scale: Scale) -> tuple[IntArray, IntArray]:
         """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`, over all folds."""
         names = self.names(scale)
         return self.counts(scale, names).sum(axis=1), self.sums(scale, names).sum(axis=1)
 
-    def second(self, scale: int, fold: int) -> SecondMoment:
+    def second(self, scale: Scale, fold: int) -> SecondMoment:
         """The second moment of a scale and fold, over all materials."""
         return self._seconds[scale][fold]
 
-    def total_second(self, scale: int) -> IntArray:
+    def total_second(self, scale: Scale) -> IntArray:
         """The lower triangle of A over all folds, shape (d·(d+1)/2,)."""
         total = self._seconds[scale][0].packed().copy()
         for moment in self._seconds[scale][1:]:
@@ -150,7 +151,7 @@ class Statistics:
 
     def digest(self) -> str:
         """Hex of a SHA-256 over all of it in one canonical order: equal if and only if the bytes are."""
-        digest = hashlib.sha256(repr((self.dimension, self.scales, FOLDS)).encode())
+        digest = hashlib.sha256(repr((self.dimension, tuple(map(int, self.scales)), FOLDS)).encode())
         names = sorted(self.materials)
         places = [self._places[name] for name in names]
         digest.update(repr(names).encode())
@@ -238,7 +239,7 @@ class Statistics:
     def from_arrays(
         cls,
         dimension: int,
-        scales: Sequence[int],
+        scales: Sequence[Scale],
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
     ) -> Statistics:

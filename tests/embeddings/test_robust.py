@@ -16,7 +16,7 @@ from scroll_tactile.pipelines.robustness import dead, noise
 from scroll_tactile.prediction.filling import Filling, sampled_readings
 from scroll_tactile.signals.copies import hiss
 from scroll_tactile.signals.image import tactile_image
-from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISY
+from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE
 from scroll_tactile.statistics.grid import to_codes
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -117,8 +117,8 @@ class TestMemory:
     def test_what_each_observation_adds(self):
         learner = fed(FELT[:2])
         statistics = learner._memory.statistics
-        assert statistics.scales[:4] == (NOISY[0], BEGINNING, CHANNELS, NOISY[1])
-        rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISY, BEGINNING, CHANNELS)]
+        assert statistics.scales[:4] == (NOISE[0], BEGINNING, CHANNELS, NOISE[1])
+        rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISE, BEGINNING, CHANNELS)]
         assert rows == [2 * 2, 2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
         assert learner.materials == {"a": 1, "b": 1}
 

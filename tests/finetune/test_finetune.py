@@ -15,7 +15,7 @@ from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
-from scroll_tactile.signals.windows import Reading
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
@@ -242,13 +242,13 @@ def test_a_memory_is_opened_with_the_buffer_that_it_was_made_with(tmp_path):
 @pytest.mark.parametrize("kind", ["vision", "kernels+vision"])
 def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
     embedding = EMBEDDINGS[kind]()
-    reading = Reading.of(PAD, embedding)
+    reading = WindowPlan.of(PAD, embedding)
     features = TouchFeatures(embedding, reading)
     image = tactile_image(touches[0][1])
     means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
     codes = embedding.embed_windows(image, reading.extent(image.shape[1]))
     for width, mean in means.items():
-        expected = codes[width][reading.places(image.shape[1])[width]].mean(axis=0)
+        expected = codes[width][reading.places(image.shape[1])[Scale("window", width)]].mean(axis=0)
         assert np.abs(mean[0].numpy() - expected).max() < 1e-5
     net = adapted(features.network())
     assert all("alpha" in name for name, p in net.named_parameters() if p.requires_grad)
@@ -345,20 +345,20 @@ def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path,
 def test_the_judged_windows_are_read_as_the_embedding_reads_them_whatever_their_width(rate, duration):
     sensor = PAD.model_copy(update={"rate": rate, "duration": duration})
     embedding = EMBEDDINGS["vision"]()
-    reading = Reading.of(sensor, embedding)
+    reading = WindowPlan.of(sensor, embedding)
     features = TouchFeatures(embedding, reading)
     image = tactile_image(Scene(sensor=sensor).touch(NAMES[0], 1))
     columns = image.shape[1]
     means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
     rows = embedding.embed_windows(image, reading.extent(columns))
     for width, mean in means.items():
-        expected = rows[width][reading.places(columns)[width]].mean(axis=0)
+        expected = rows[width][reading.places(columns)[Scale("window", width)]].mean(axis=0)
         assert np.abs(mean[0].detach().numpy() - expected).max() < 1e-5
     assert features.tunable is (max(means) >= TOGETHER)
 
 
 def test_touches_of_many_columns_are_left_to_f():
-    features = TouchFeatures(EMBEDDINGS["vision"](), Reading.of(PAD, EMBEDDINGS["vision"]()))
+    features = TouchFeatures(EMBEDDINGS["vision"](), WindowPlan.of(PAD, EMBEDDINGS["vision"]()))
     assert features.reads(4096)
     assert not features.reads(4097)
-    assert TouchFeatures(Kernels(dimension=64), Reading.of(PAD, Kernels())).reads(10**6)
+    assert TouchFeatures(Kernels(dimension=64), WindowPlan.of(PAD, Kernels())).reads(10**6)

@@ -9,12 +9,13 @@ from hypothesis.extra import numpy as arrays_of
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.memory.rows import pack_codes, unpack_codes
 from scroll_tactile.memory.state import OBSERVE, Memory
-from scroll_tactile.signals.windows import Reading, extent
+from scroll_tactile.signals.windows import Scale, WindowPlan, extent
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
 from store import Store
 
 DIMENSION, SCALES = 4, (6, 20)
-READING = Reading(SCALES)
+READING = WindowPlan(SCALES)
+NARROW = Scale("window", 6)
 
 codes_of_scale = arrays_of.arrays(
     np.int32, st.tuples(st.integers(1, 9), st.integers(1, 5)), elements=st.integers(-(2**20), 2**20)
@@ -22,7 +23,9 @@ codes_of_scale = arrays_of.arrays(
 
 
 @settings(deadline=None)
-@given(st.dictionaries(st.sampled_from([6, 20, 400]), codes_of_scale, min_size=1))
+@given(
+    st.dictionaries(st.sampled_from([NARROW, Scale("window", 20), Scale("window", 400)]), codes_of_scale, min_size=1)
+)
 def test_packed_codes_unpack_to_the_same(codes):
     again = unpack_codes(pack_codes(codes))
     assert sorted(again) == sorted(codes)
@@ -35,12 +38,12 @@ def test_packed_codes_unpack_to_the_same(codes):
 
 @pytest.mark.parametrize("values", [1, 2**8, 2**8 + 1, 2**16, 2**16 + 1])
 def test_any_number_of_distinct_values(values):
-    codes = {6: np.arange(values, dtype=np.int32).reshape(1, -1) * 15}
-    assert unpack_codes(pack_codes(codes))[6].tobytes() == codes[6].tobytes()
+    codes = {NARROW: np.arange(values, dtype=np.int32).reshape(1, -1) * 15}
+    assert unpack_codes(pack_codes(codes))[NARROW].tobytes() == codes[NARROW].tobytes()
 
 
 def test_few_distinct_values_take_a_byte_each():
-    packed = pack_codes({6: np.arange(4000, dtype=np.int32).reshape(40, 100) % 200})
+    packed = pack_codes({NARROW: np.arange(4000, dtype=np.int32).reshape(40, 100) % 200})
     assert packed["places-6"].dtype == np.uint8
 
 
@@ -48,7 +51,7 @@ def touch(seed):
     rng = np.random.default_rng(seed)
     columns = int(rng.integers(3, 60))
     codes = {
-        scale: rng.integers(0, 2**20, size=(len(begin), DIMENSION), dtype=np.int32)
+        Scale("window", scale): rng.integers(0, 2**20, size=(len(begin), DIMENSION), dtype=np.int32)
         for scale, begin in extent(columns, SCALES).items()
     }
     return "abcd"[seed % 4], rng.bytes(32), columns, codes
@@ -101,13 +104,15 @@ def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, up
 
 def test_a_full_memory_refuses_and_stays_as_it_was():
     memory = filled(range(5))
-    held = memory.statistics.second(6, 0).rows
-    memory.statistics._seconds[6][0] = SecondMoment.of(memory.statistics.second(6, 0).packed(), MOST_ROWS, DIMENSION)
+    held = memory.statistics.second(NARROW, 0).rows
+    memory.statistics._seconds[NARROW][0] = SecondMoment.of(
+        memory.statistics.second(NARROW, 0).packed(), MOST_ROWS, DIMENSION
+    )
     before = content(memory)
     with pytest.raises(CapacityError):
         memory.add(*touch(9), 6)
     assert content(memory) == before
-    memory.statistics._seconds[6][0].rows = held
+    memory.statistics._seconds[NARROW][0].rows = held
     assert content(memory) == content(filled(range(5)))
 
 

@@ -163,7 +163,7 @@ class TestAugmentedObservation:
     def test_copies_make_no_touch_longer(self):
         learner = fed([("a", (seed, 16)) for seed in range(4)], augmentation=Augmented(copies=3, speed=4))
         assert learner._memory.statistics.longest == 16
-        shortest, longest = learner._reading.widths
+        shortest, longest = learner._reading.windows
         assert learner._memory.statistics.names(shortest) == ["a"]
         assert learner._memory.statistics.names(longest) == []
 

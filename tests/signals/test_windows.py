@@ -5,7 +5,17 @@ from itertools import pairwise
 import pytest
 
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.signals.windows import MOST_WINDOWS, Reading, extent, fitting, milestones, scales, scored, stages
+from scroll_tactile.signals.windows import (
+    MOST_WINDOWS,
+    Scale,
+    WindowPlan,
+    extent,
+    fitting,
+    milestones,
+    scales,
+    scored,
+    stages,
+)
 
 
 def sensor(rate, duration, **settings):
@@ -120,10 +130,10 @@ def test_a_longer_touch_never_has_fewer_stages_or_scales():
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])
 def test_the_windows_of_a_camera_are_its_frames(frames):
-    reading = Reading.of(CAMERA, None)
+    reading = WindowPlan.of(CAMERA, None)
     starts = reading.extent(32 * frames)[32]
     assert len(starts) == min(frames, MOST_WINDOWS)
     assert starts[0] == 0
     assert starts[-1] == 32 * (frames - 1)
     assert all(start % 32 == 0 for start in starts)
-    assert reading.scored(32 * frames, 32 * frames) == {32: list(range(len(starts)))}
+    assert reading.scored(32 * frames, 32 * frames) == {Scale("window", 32): list(range(len(starts)))}

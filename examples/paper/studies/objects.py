@@ -32,7 +32,7 @@ from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import FRAMES
+from scroll_tactile.signals.windows import FRAMES, Scale
 from scroll_tactile.statistics.grid import in_units
 
 __all__ = ["COSINES", "TREES", "VALUES", "Objects", "most_often", "object_groups", "summary"]
@@ -184,7 +184,7 @@ class Objects:
         said = [learner.compose(self.recordings.streams[at], unfamiliar=1.0) for at in exam]
         keys = list(next(iter(self.attributes.values())))
         taught = {name: values for name, values in self.attributes.items() if name not in group}
-        heads = fit_heads(learner._memory.statistics, self._width, taught, keys)
+        heads = fit_heads(learner._memory.statistics, Scale("window", self._width), taught, keys)
         means = [in_units(self._read(self._waves, at), self._waves.bound).mean(axis=0) for at in exam]
         told: dict[str, dict[str, Any]] = {}
         for key in keys:

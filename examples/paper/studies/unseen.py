@@ -18,6 +18,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
 from scroll_tactile.readouts.readout import Readout, fit_readout
 from scroll_tactile.readouts.selection import task_of
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -51,7 +52,7 @@ class UnseenHead:
 
 
 def fit_heads(
-    statistics: Statistics, scale: int, attributes: Mapping[str, Mapping[str, int]], keys: Sequence[str]
+    statistics: Statistics, scale: Scale, attributes: Mapping[str, Mapping[str, int]], keys: Sequence[str]
 ) -> dict[str, UnseenHead]:
     """Attribute → its head over what was felt at a scale.
 

@@ -14,6 +14,7 @@ from examples.paper.transfer.shared_features import Features
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.selection import Selection, select
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -21,6 +22,7 @@ from scroll_tactile.statistics.statistics import Statistics, fold_of
 __all__ = ["Known", "MapsAcross", "OneReadout", "SharesPrior"]
 
 FloatArray = npt.NDArray[np.float64]
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 
 _BOUND = 8.0  # of standardised features, in standard deviations
 _OLD = "\0old "  # before the names of materials that are not to be answered
@@ -169,7 +171,7 @@ class OneReadout(_Touches):
         if not parts:
             raise InputError("expected touches to have been learned; there are none. Call observe first")
         with one_thread():
-            selection = select(parts[0] if len(parts) == 1 else parts[0] + parts[1], 0, "lda")
+            selection = select(parts[0] if len(parts) == 1 else parts[0] + parts[1], WHOLE, "lda")
         assert selection is not None
         return selection, [at for at, name in enumerate(selection.names) if not name.startswith(_OLD)]
 
@@ -267,9 +269,9 @@ def _means(features: FloatArray, materials: Sequence[str], names: Sequence[str])
 
 def _statistics(features: FloatArray, materials: Sequence[str], keys: Sequence[bytes]) -> Statistics:
     """Statistics of one scale, 0, of standardised features (N, d)."""
-    statistics = Statistics(features.shape[1], (0,))
+    statistics = Statistics(features.shape[1], (WHOLE,))
     for vector, material, key in zip(features, materials, keys, strict=True):
-        statistics.add(material, fold_of(key), {0: to_codes(vector[None], _BOUND)})
+        statistics.add(material, fold_of(key), {WHOLE: to_codes(vector[None], _BOUND)})
     return statistics
 
 

@@ -18,7 +18,7 @@ from scroll_tactile.readouts.selection import Selection, select
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import Reading
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -26,6 +26,7 @@ from scroll_tactile.statistics.statistics import Statistics, fold_of
 __all__ = ["COUNTS", "Feeler", "WidestFeatures", "WidestReadout", "draw_touches", "feeler_maker", "few_touches"]
 
 COUNTS = (1, 2, 5, 10, 20)
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 """Touches of each material after which the test is taken."""
 
 
@@ -46,7 +47,7 @@ class WidestFeatures:
     """
 
     def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
-        reading = Reading.of(sensor, embedding)
+        reading = WindowPlan.of(sensor, embedding)
         if reading.judged != "widest" or reading.beginning or reading.noisy:
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
@@ -61,8 +62,9 @@ class WidestFeatures:
             width = self._reading.widths[-1]
             if image.shape[1] < width:
                 raise InputError(f"expected touches of {width} readings or more; came one of {image.shape[1]}")
-            features = self._perception.features(image, [width])[width]
-            self._kept[stream.key] = features[self._reading.places(image.shape[1])[width]]
+            scale = self._reading.windows[-1]
+            features = self._perception.features(image, [scale])[scale]
+            self._kept[stream.key] = features[self._reading.places(image.shape[1])[scale]]
         return self._kept[stream.key]
 
 
@@ -77,19 +79,19 @@ class WidestReadout:
 
     def __init__(self, features: WidestFeatures) -> None:
         self._features = features
-        self._statistics = Statistics(features.embedding.dimension, (0,))
+        self._statistics = Statistics(features.embedding.dimension, (WHOLE,))
         self._selection: Selection | None = None
 
     def observe(self, material: str, stream: Stream) -> None:
         """See `Feeler.observe`."""
         codes = to_codes(self._features(stream), self._features.embedding.bound)
-        self._statistics.add(material, fold_of(stream.key), {0: codes})
+        self._statistics.add(material, fold_of(stream.key), {WHOLE: codes})
         self._selection = None
 
     def name_of(self, stream: Stream) -> str:
         """See `Feeler.name_of`. Raises InputError before anything was learned."""
         with one_thread():
-            self._selection = self._selection or select(self._statistics, 0, "lda")
+            self._selection = self._selection or select(self._statistics, WHOLE, "lda")
         if self._selection is None:
             raise InputError("expected a readout that has learned something; it has not. Call observe first")
         mean = in_units(self._features(stream), self._features.embedding.bound).mean(axis=0)
@@ -110,7 +112,7 @@ class _Learner:
 
 def feeler_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], Feeler]:
     """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that says the same."""
-    if Reading.of(sensor, embedding).judged == "widest":
+    if WindowPlan.of(sensor, embedding).judged == "widest":
         features = WidestFeatures(sensor, embedding)
         return lambda: WidestReadout(features)
     return lambda: _Learner(sensor, embedding)

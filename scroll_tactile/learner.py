@@ -27,7 +27,7 @@ from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import Perception, Readings
 from scroll_tactile.prediction.filling import Filling
-from scroll_tactile.prediction.following import Following, SolverName
+from scroll_tactile.prediction.incremental import IncrementalModel, SolverName
 from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Prediction, Receipt
@@ -101,7 +101,7 @@ class TactileLearner:
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
         self._tuned_reader: TunedReader | None = None
         self._model: tuple[int, Model] | None = None
-        self._following: tuple[int, Following] | None = None
+        self._following: tuple[int, IncrementalModel] | None = None
         self._composer: tuple[Model, int, Composer] | None = None
         self._filled: tuple[int, Filling | None] | None = None
 
@@ -431,8 +431,8 @@ class TactileLearner:
         if self._following is not None and self._following[0] == ledger.version:
             return self._following[1].model
         following, added = self._following and self._following[1], ledger.added
-        if following is None or added is None or not following.follow(ledger.memory, added):
-            following = Following(self.model(), ledger.memory, self.refit, self.solver)
+        if following is None or added is None or not following.update(ledger.memory, added):
+            following = IncrementalModel(self.model(), ledger.memory, self.refit, self.solver)
         self._following = ledger.version, following
         ledger.follow, ledger.added = True, []
         return following.model

@@ -21,9 +21,8 @@ from examples.benchmarks.timing import circumstances
 from examples.benchmarks.vector_peers import GradientSteps, Peer, PseudoInverse, Refitted, lacking
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import Readout, fit_readout
-from scroll_tactile.readouts.recursive import Recursive
+from scroll_tactile.readouts.recursive import RecursiveLeastSquares, WoodburyReadout
 from scroll_tactile.readouts.selection import DEFAULT, task_of
-from scroll_tactile.readouts.tracking import Tracked
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.statistics import Statistics
@@ -175,7 +174,7 @@ def _drift(interleavings: int, seed: int) -> Record:
     for at in range(200):
         statistics.add(names[at % materials], at % 3, {scale: codes(at % materials)})
     start = fit_readout(task_of(statistics, scale), DEFAULT)
-    tracked, recursive = Tracked(statistics, scale, start), Recursive(statistics, scale, start)
+    tracked, recursive = WoodburyReadout(statistics, scale, start), RecursiveLeastSquares(statistics, scale, start)
     worst = {"exact": 0.0, "recursive": 0.0}
     for at, place in enumerate(source.places(interleavings)):
         rows = codes(place)
@@ -185,7 +184,7 @@ def _drift(interleavings: int, seed: int) -> Record:
         recursive.add(rows, place)
         found = {"exact": tracked.readout()}
         if at % max(1, interleavings // 100) == 0 or at + 1 == interleavings:
-            anew = Tracked(statistics, scale, start).readout()
+            anew = WoodburyReadout(statistics, scale, start).readout()
             found["recursive"] = recursive.readout()
             worst = {name: max(worst[name], _difference(readout, anew)) for name, readout in found.items()}
     return {

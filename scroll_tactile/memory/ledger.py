@@ -18,7 +18,7 @@ from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, obse
 from scroll_tactile.memory.rows import Codes, pack_codes, spans
 from scroll_tactile.memory.state import DESCRIBE, OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.prediction.following import Added
+from scroll_tactile.prediction.incremental import Added
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
 from store import ReadOnlyError, Record, Store, StoreClosedError, StoreError

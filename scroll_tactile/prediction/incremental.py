@@ -1,6 +1,6 @@
-"""A model that follows a memory between two fits: the readouts are those of all that was felt, to rounding.
+"""A model brought up to date between two fits: its readouts are those of all that was observed, to rounding.
 
-Choosing λ and calibrating takes a dozen factorisations a scale. Where observing and asking alternate, that is done
+Choosing λ and calibrating takes a dozen factorisations a scale. Where observing and predicting alternate, that is done
 again only when the memory has grown by a share; in between the readouts are updated row by row.
 """
 
@@ -15,61 +15,61 @@ import numpy.typing as npt
 
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.recursive import Recursive
+from scroll_tactile.readouts.recursive import RecursiveLeastSquares, RecursiveReadout, WoodburyReadout
 from scroll_tactile.readouts.selection import Selection
-from scroll_tactile.readouts.tracking import Follower, Tracked
-from scroll_tactile.signals.windows import CHANNELS, Scale
+from scroll_tactile.signals.windows import CHANNELS
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Added", "Following", "SolverName"]
+__all__ = ["Added", "IncrementalModel", "SolverName"]
 
 SolverName = Literal["exact", "recursive"]
-FOLLOWERS: dict[SolverName, type[Follower]] = {"exact": Tracked, "recursive": Recursive}
+READOUTS: dict[SolverName, type[RecursiveReadout]] = {"exact": WoodburyReadout, "recursive": RecursiveLeastSquares}
 
 Added = tuple[str, dict[Scale, npt.NDArray[np.int32]]]
 """A material, and the codes of a touch of it by scale."""
 
 
-class Following:
+class IncrementalModel:
     """What a model that was fitted to a memory becomes as touches are added.
 
-    model: fitted to the memory as it is now. refit: the share by which the memory may grow before `follow` refuses.
+    model: fitted to the memory as it is now. refit: the share by which the memory may grow before `update` refuses.
     solver: "exact", against a factor of the exact statistics, or "recursive", by the paper's recursion.
     """
 
     def __init__(self, model: Model, memory: Memory, refit: float, solver: SolverName) -> None:
         self.model = model
-        self._follower = FOLLOWERS[solver]
-        self._felt = sum(memory.statistics.materials.values())
-        self._most = (1 + refit) * self._felt
-        self._tracked: dict[Scale, Follower] = {}
+        self._kind = READOUTS[solver]
+        self._observations = sum(memory.statistics.materials.values())
+        self._most = (1 + refit) * self._observations
+        self._readouts: dict[int, RecursiveReadout] = {}
 
-    def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
+    def update(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in the touches that were added since; False where the model has to be fitted again.
 
         memory: as it is with them.
         """
         statistics = memory.statistics
-        self._felt += len(added)
+        self._observations += len(added)
         judging = [scale for scale in statistics.scales if scale != CHANNELS]
-        if self._felt > self._most or any(statistics.names(scale) != self._names(scale) for scale in judging):
+        grown = self._observations > self._most
+        if grown or any(statistics.names(scale) != self._names(scale) for scale in judging):
             return False
         with one_thread():
-            self.model = replace(self.model, selections=self._followed(statistics, added))
+            self.model = replace(self.model, selections=self._updated(statistics, added))
         return True
 
-    def _followed(self, statistics: Statistics, added: Sequence[Added]) -> dict[Scale, Selection]:
+    def _updated(self, statistics: Statistics, added: Sequence[Added]) -> dict[int, Selection]:
         selections = dict(self.model.selections)
         for scale, selection in selections.items():
             rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]
             if not rows:
                 continue
-            if (tracked := self._tracked.get(scale)) is None:
-                tracked = self._tracked[scale] = self._follower(statistics, scale, selection.readout)
-            elif not all(tracked.add(codes, place) for place, codes in rows):
-                tracked.anchor(statistics)
-            selections[scale] = replace(selection, readout=tracked.readout())
+            if (recursive := self._readouts.get(scale)) is None:
+                recursive = self._readouts[scale] = self._kind(statistics, scale, selection.readout)
+            elif not all(recursive.add(codes, place) for place, codes in rows):
+                recursive.anchor(statistics)
+            selections[scale] = replace(selection, readout=recursive.readout())
         return selections
 
     def _names(self, scale: Scale) -> list[str]:

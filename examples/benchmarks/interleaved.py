@@ -22,7 +22,7 @@ from examples.benchmarks.vector_peers import GradientSteps, Peer, PseudoInverse,
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import Readout, fit_readout
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, WoodburyReadout
-from scroll_tactile.readouts.selection import DEFAULT, task_of
+from scroll_tactile.readouts.shrinkage import DEFAULT, task_of
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.statistics import Statistics

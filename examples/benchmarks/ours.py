@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.recursive import WoodburyReadout
-from scroll_tactile.readouts.selection import select
+from scroll_tactile.readouts.shrinkage import select
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of

@@ -24,9 +24,8 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.rows import pack_codes
 from scroll_tactile.memory.state import OBSERVE
-from scroll_tactile.readouts.path import fit_path
 from scroll_tactile.readouts.readout import fit_readout
-from scroll_tactile.readouts.selection import PENALTIES, task_of
+from scroll_tactile.readouts.shrinkage import PENALTIES, fit_readouts, task_of
 from scroll_tactile.signals.image import tactile_image, three_planes
 from scroll_tactile.signals.windows import Scale, extent, scales
 from scroll_tactile.statistics.grid import to_codes
@@ -182,11 +181,11 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
     task, penalties = task_of(statistics, WHOLE), np.geomspace(min(PENALTIES), max(PENALTIES), count).tolist()
     with one_thread():
         calls: dict[str, Callable[[], object]] = {
-            "path": lambda: fit_path(task, penalties),
+            "path": lambda: fit_readouts(task, penalties),
             "each": lambda: [fit_readout(task, penalty) for penalty in penalties],
         }
         timings = take_turns(calls, rounds, warm_up=1, clock=time.process_time)
-    pairs = zip(fit_path(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
+    pairs = zip(fit_readouts(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
     worst = max(float(np.abs(one.weights - two.weights).max() / np.abs(two.weights).max()) for one, two in pairs)
     return _record(
         f"readouts of {count} λ, {dimension} features, {classes} materials: one tridiagonalisation",

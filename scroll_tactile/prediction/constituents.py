@@ -17,7 +17,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, Solved, fit_curve, solve
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.left_out import left_out
+from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
 from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import Touch
@@ -169,7 +169,9 @@ class Bench:
         weights = self.model.calibrations[self.stage].weights
         for at, (scale, one, weight) in enumerate(zip(scales, selections, weights, strict=True)):
             rows = np.stack([means[at] for _, means in felt])
-            scores = left_out(statistics, scale, one.readout, rows, [one.places[material] for material, _ in felt])
+            scores = leave_one_out_scores(
+                statistics, scale, one.readout, rows, [one.places[material] for material, _ in felt]
+            )
             logits += weight * scores[:, [one.places[name] for name in names]]
         targets = [names.index(material) for material, _ in felt]
         return float(fit_weights([row[None] for row in logits], targets, np.ones(1))[0])

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, RecursiveReadout, WoodburyReadout
-from scroll_tactile.readouts.selection import Selection
+from scroll_tactile.readouts.shrinkage import Selection
 from scroll_tactile.signals.windows import CHANNELS
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.selection import Selection
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.readouts.shrinkage import Selection
 from scroll_tactile.statistics.sample import Pool
 from scroll_tactile.statistics.statistics import fold_of
 

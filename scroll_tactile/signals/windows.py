@@ -181,9 +181,9 @@ class WindowPlan:
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
-    is a scale of its own. noisy: whether touches felt through noise are. filled: whether dead channels are filled in.
-    penalties: the λ that the readouts are tried with; none: those of `readouts.selection`. frames: whether windows
-    are a camera's frames.
+    is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
+    penalties: the λ that the readouts are tried with; none: those of `shrinkage`. frames: whether windows are a
+    camera's frames.
     """
 
     widths: tuple[int, ...]

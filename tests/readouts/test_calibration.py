@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile.readouts.calibration import Calibration, calibrate, fit_weights
-from scroll_tactile.readouts.selection import select
+from scroll_tactile.readouts.shrinkage import select
 from scroll_tactile.statistics.sample import Pool, Touch
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 

@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from examples.paper.transfer.shared_features import Features
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.selection import Selection, select
+from scroll_tactile.readouts.shrinkage import Selection, select
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes

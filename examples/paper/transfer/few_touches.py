@@ -14,7 +14,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction.features import Perception
-from scroll_tactile.readouts.selection import Selection, select
+from scroll_tactile.readouts.shrinkage import Selection, select
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream

@@ -1,8 +1,12 @@
-"""λ by cross-validation on the statistics alone: each fold's touches are tried on a readout of the others'.
+"""Shrinkage: λ by cross-validation on the statistics alone; each fold is tried on a readout of the others.
 
 A fold's statistics say exactly how a readout's projections z = Wᵀ x of the held-out rows are spread: their class
 means and their scatter within classes. What follows from these is a function of the statistics, so the choice
-does not depend on the order in which anything was felt.
+does not depend on the order in which anything was observed.
+
+The readouts of all λ come from one factorisation. With Σ = Q T Qᵀ, T tridiagonal (Householder's reduction, LAPACK's
+dsytrd), (Σ + λ I)⁻¹ Mᵀ = Q (T + λ I)⁻¹ Qᵀ Mᵀ for every λ (Eldén 1977, BIT 17): after the reduction, which takes as long
+as four Cholesky factorisations, a λ costs O(d C), and turning all solutions back O(d² C) for each.
 """
 
 from __future__ import annotations
@@ -14,15 +18,14 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg.blas import dsymm
+from scipy.linalg.lapack import dormqr, dptsv, dsytrd
 from scipy.special import log_ndtr, logsumexp
 
-from scroll_tactile.readouts.path import fit_path
-from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, fit_readout
-from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import within_scatter
+from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, fit_readout, require_definite
+from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
 
-__all__ = ["DEFAULT", "PENALTIES", "Selection", "select", "task_of"]
+__all__ = ["DEFAULT", "PENALTIES", "Selection", "fit_readouts", "select", "task_of"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,6 +34,7 @@ FloatArray = npt.NDArray[np.float64]
 # no touch better apart, in five folds of both sets.
 PENALTIES = (1e-3, 3e-3, 1e-2, 3e-2)
 DEFAULT = 1e-2  # where nothing can be held out: a first touch, or every touch in one fold
+REDUCED = 32  # columns that LAPACK reduces at once
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Selection:
 
 
 @dataclass(frozen=True)
-class _Trial:
+class _FoldTask:
     """One fold: the others' task, and the fold's own rows of the materials that the others know."""
 
     known: npt.NDArray[np.intp]
@@ -74,8 +78,10 @@ def select(
         return None
     counts, sums = statistics.counts(scale, names), statistics.sums(scale, names)
     total = statistics.total_second(scale)
-    trials = {fold: trial for fold in range(FOLDS) if (trial := _trial(statistics, scale, fold, counts, sums, total))}
-    fitted = {fold: fit_path(trial.task, penalties) for fold, trial in trials.items()}
+    trials = {
+        fold: trial for fold in range(FOLDS) if (trial := _fold_task(statistics, scale, fold, counts, sums, total))
+    }
+    fitted = {fold: fit_readouts(trial.task, penalties) for fold, trial in trials.items()}
     lost = [_losses(trial, fitted[fold], kind) for fold, trial in trials.items()]
     # Where nothing overlaps the logs are of the order of -1e308, and their sum may be -∞: that is no reason to warn.
     of_each = [sum(parts, 0.0) for parts in zip(*lost, strict=True)]
@@ -93,14 +99,14 @@ def task_of(statistics: Statistics, scale: Scale) -> Task:
     return Task.of(within_scatter(statistics.total_second(scale), counts, sums), counts, sums)
 
 
-def _trial(
+def _fold_task(
     statistics: Statistics,
     scale: Scale,
     fold: int,
     counts: npt.NDArray[np.int64],
     sums: npt.NDArray[np.int64],
     total: npt.NDArray[np.int64],
-) -> _Trial | None:
+) -> _FoldTask | None:
     theirs = counts.sum(axis=1) - counts[:, fold]
     known = np.flatnonzero(theirs)
     own = known[counts[known, fold] > 0]
@@ -112,10 +118,10 @@ def _trial(
     scatter = within_scatter(held, counts[:, fold], sums[:, fold])
     in_fold = counts[known, fold]
     means = sums[known, fold] / np.maximum(in_fold, 1)[:, None] - task.center
-    return _Trial(known, task, in_fold, means, scatter)
+    return _FoldTask(known, task, in_fold, means, scatter)
 
 
-def _losses(trial: _Trial, readouts: Sequence[Readout], kind: ReadoutName) -> list[float]:
+def _losses(trial: _FoldTask, readouts: Sequence[Readout], kind: ReadoutName) -> list[float]:
     # The weights of all λ side by side: one product in place of many thin ones.
     weights = np.hstack([readout.weights for readout in readouts])
     spreads = np.split(dsymm(1.0, trial.scatter, weights, lower=0), len(readouts), axis=1)
@@ -126,7 +132,7 @@ def _losses(trial: _Trial, readouts: Sequence[Readout], kind: ReadoutName) -> li
     ]
 
 
-def _squared_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+def _squared_error(trial: _FoldTask, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
     """Σ over held-out rows of ‖t − s(x)‖²: that of the class means, and the spread about them.
 
     Exact where the other folds know every material of this one; where not, the spread is that of all its rows.
@@ -135,7 +141,7 @@ def _squared_error(trial: _Trial, readout: Readout, at: FloatArray, spread: Floa
     return float(trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge))
 
 
-def _pairwise_error(trial: _Trial, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+def _pairwise_error(trial: _FoldTask, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
     """Log of the held-out rows' mean error, class against class, with scores spread as a normal distribution.
 
     Class y loses to k with probability Φ(−Δ/σ), Δ the difference of its scores' held-out mean and σ² the held-out
@@ -151,3 +157,37 @@ def _pairwise_error(trial: _Trial, readout: Readout, at: FloatArray, spread: Flo
     chances[np.arange(len(felt)), felt] = -np.inf
     weights = np.log(trial.counts[felt] / trial.counts.sum())
     return float(logsumexp(chances + weights[:, None]))
+
+
+def fit_readouts(task: Task, penalties: Sequence[float]) -> list[Readout]:
+    """Fit a readout with each λ, all above 0: what `fit_readout` gives, to rounding. The task is left as it was.
+
+    Raises numpy.linalg.LinAlgError where Σ + λ I is not positive definite to working precision: λ is too small.
+    """
+    dimension, classes = task.means.shape[1], len(task.means)
+    if dimension == 1:  # of which LAPACK makes no tridiagonal matrix
+        return [fit_readout(task, penalty) for penalty in penalties]
+    # From the last feature to the first: the triangle that is there becomes the lower one, of which dormqr can apply Q.
+    system = np.array(task.covariance[::-1, ::-1], order="F")
+    turned = np.asfortranarray(task.means[:, ::-1].T)
+    with one_thread():
+        reduced, diagonal, beside, tau, _ = dsytrd(system, lower=1, lwork=REDUCED * dimension, overwrite_a=1)
+        # Q leaves the first coordinate alone.
+        reflectors = np.asfortranarray(reduced[1:, :-1])
+        _turn(reflectors, tau, turned, "T")
+        solved = np.empty((dimension, len(penalties) * classes), order="F")
+        for at, penalty in enumerate(penalties):
+            *_, part, failed = dptsv(diagonal + penalty, beside, turned)
+            require_definite(penalty, failed)
+            solved[:, at * classes : (at + 1) * classes] = part
+        _turn(reflectors, tau, solved, "N")
+        solved = solved[::-1]
+        return [
+            Readout.of(task, penalty, solved[:, at * classes : (at + 1) * classes])
+            for at, penalty in enumerate(penalties)
+        ]
+
+
+def _turn(reflectors: FloatArray, tau: FloatArray, columns: FloatArray, way: str) -> None:
+    """Put Q times the columns in their place, or with way "T" Qᵀ times them."""
+    columns[1:], _, _ = dormqr("L", way, reflectors, tau, columns[1:], REDUCED * max(REDUCED, columns.shape[1]))

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr, logsumexp
 
-from scroll_tactile.readouts.path import fit_path
 from scroll_tactile.readouts.readout import Task, fit_readout
-from scroll_tactile.readouts.selection import PENALTIES, select
+from scroll_tactile.readouts.shrinkage import PENALTIES, fit_readouts, select
 from scroll_tactile.statistics.moments import SecondMoment, within_scatter
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
 
@@ -95,7 +94,7 @@ def test_a_path_gives_the_readout_of_each_penalty(dimension, materials):
     task = Task.of(within_scatter(moment.packed(), counts, sums), counts, sums)
     before = task.covariance.tobytes(), task.means.tobytes()
     penalties = [1e-6, 1e-3, 3e-2, 10.0]
-    for penalty, found in zip(penalties, fit_path(task, penalties), strict=True):
+    for penalty, found in zip(penalties, fit_readouts(task, penalties), strict=True):
         expected = fit_readout(task, penalty)
         assert found.penalty == penalty
         for name in ("center", "weights", "gram", "ridge", "shares", "penalties"):
@@ -107,7 +106,7 @@ def test_a_path_gives_the_readout_of_each_penalty(dimension, materials):
 def test_a_path_to_a_system_that_is_not_definite_says_so():
     task = Task(np.asfortranarray(-np.eye(3)), np.eye(2, 3), np.zeros(3), np.ones(3), np.full(2, 0.5), 10)
     with pytest.raises(np.linalg.LinAlgError, match=r"λ = 0\.5 is not positive definite"):
-        fit_path(task, [2.0, 0.5])
+        fit_readouts(task, [2.0, 0.5])
 
 
 FELT = {

@@ -23,13 +23,13 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["left_out"]
+__all__ = ["leave_one_out_scores"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def left_out(
-    statistics: Statistics, scale: Scale, readout: Readout, rows: FloatArray, places: Sequence[int]
+def leave_one_out_scores(
+    statistics: Statistics, scale: int, readout: Readout, rows: FloatArray, places: Sequence[int]
 ) -> FloatArray:
     """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been felt.
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.left_out import left_out
+from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
 from scroll_tactile.readouts.readout import fit_readout
-from scroll_tactile.readouts.selection import task_of
+from scroll_tactile.readouts.shrinkage import task_of
 from scroll_tactile.statistics.moments import within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -28,7 +28,7 @@ def test_it_is_as_if_the_row_had_never_been_felt(penalty):
     statistics = felt(rows, materials)
     readout = fit_readout(task_of(statistics, SCALE), penalty)
     places = ["abcd".index(name) for name in materials]
-    told = left_out(statistics, SCALE, readout, rows.astype(np.float64), places)
+    told = leave_one_out_scores(statistics, SCALE, readout, rows.astype(np.float64), places)
     for out, row in enumerate(rows):
         left = felt(np.delete(rows, out, axis=0), materials[:out] + materials[out + 1 :])
         counts, sums = left.totals(SCALE)

@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError, ObservationError, StreamError, UnknownMaterialError
-from scroll_tactile.statistics.sample import Pool
+from scroll_tactile.statistics.sample import TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
 SMALL = Kernels(seed=0, dimension=64)
@@ -29,7 +29,7 @@ touches = st.tuples(st.integers(0, 5), st.sampled_from([5, 9, 15, 16, 25, 40, 90
 histories = st.lists(st.tuples(materials, touches), max_size=6)
 
 
-class SmallPool(Pool):
+class SmallSample(TouchSample):
     """A pool that is soon full, so that what was left out of it has to come back."""
 
     def __init__(self, capacity=5):
@@ -92,7 +92,7 @@ class History(RuleBasedStateMachine):
         self.felt: list[Felt] = []
         self.described: dict[str, dict] = {}
         self.last = 0
-        self.pools = mock.patch("scroll_tactile.memory.state.Pool", SmallPool)
+        self.pools = mock.patch("scroll_tactile.memory.state.TouchSample", SmallSample)
         self.pools.start()
 
     def open(self, path, readout="lda", mode="write"):

@@ -14,8 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool, herd, mean_code, quotas, rank
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, mean_code, quotas, rank
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap"]
 
@@ -75,7 +74,7 @@ class UniformRandom:
 
 class _Pooled:
     def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
-        self._pool, self._means = ExemplarPool(capacity, ratio=ratio), means
+        self._pool, self._means = ExemplarSample(capacity, ratio=ratio), means
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
         self._pool.add(Exemplar(material, key, np.zeros((0, 0), np.float32), code, Scale("window", 1)))

@@ -21,7 +21,7 @@ from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import Sample
 
-__all__ = ["CANDIDATES", "Exemplar", "ExemplarPool", "herd", "mean_code", "quotas", "rank"]
+__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "mean_code", "quotas", "rank"]
 
 IntArray = npt.NDArray[np.int64]
 
@@ -140,7 +140,7 @@ class Exemplar:
         return cls(material, key, readings, code.astype(np.int32), scale)
 
 
-class ExemplarPool:
+class ExemplarSample:
     """The candidates for the buffer: a function of the set of streams felt (see `Sample`).
 
     capacity: streams in the buffer; `ratio` times as many candidates are kept. None: no limit in numbers.
@@ -195,7 +195,7 @@ class ExemplarPool:
         """Add all streams felt; see `Sample.refill`."""
         self._sample.refill(felt, make)
 
-    def update(self, other: ExemplarPool) -> None:
+    def update(self, other: ExemplarSample) -> None:
         """Add all that another pool stands for: this one is then as if it had felt what both did.
 
         Raises MismatchError where their limits differ.
@@ -233,7 +233,7 @@ class ExemplarPool:
         *,
         capacity_bytes: int | None = None,
         ratio: int = CANDIDATES,
-    ) -> ExemplarPool:
+    ) -> ExemplarSample:
         """The pool that `to_arrays` described, or one of less capacity.
 
         With more capacity, or another limit of bytes, it is not the pool that feeling everything again would give.
@@ -253,7 +253,7 @@ def _entry(one: Exemplar) -> tuple[str, bytes, Exemplar, int]:
     return one.material, one.key, one, one.readings.nbytes
 
 
-def rank(pool: ExemplarPool, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
+def rank(pool: ExemplarSample, means: Callable[[str, int], IntArray]) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.

@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarPool
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample
 from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
-from scroll_tactile.statistics.sample import Pool, Touch
+from scroll_tactile.signals.windows import NOISY, Reading
+from scroll_tactile.statistics.sample import TouchSample, WindowSums
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 from store import CompactedError, DamageError, Head, Record, Store
 
@@ -55,9 +55,9 @@ class Capacity:
     streams: int | None = 400
     nbytes: int | None = None
 
-    def pool(self) -> ExemplarPool | None:
+    def pool(self) -> ExemplarSample | None:
         """An empty pool of this capacity; None where nothing is to be kept."""
-        return None if self.streams == 0 else ExemplarPool(self.streams, capacity_bytes=self.nbytes)
+        return None if self.streams == 0 else ExemplarSample(self.streams, capacity_bytes=self.nbytes)
 
 
 class Memory:
@@ -77,7 +77,7 @@ class Memory:
         self.reading = reading
         self.capacity = capacity or Capacity()
         self.statistics = Statistics(dimension, reading.scales)
-        self.pool = Pool()
+        self.pool = TouchSample()
         self.exemplars = self.capacity.pool()
         self.tuned: Tuned | None = None
         self.tuned_upto = 0
@@ -183,7 +183,7 @@ class Memory:
         heads = [one for one in self.retractable(store) if one.sequence <= self.sequence]
         felt = [(one.label, one.key, cast(int, one.attributes.get("nbytes", 0)), one.sequence) for one in heads]
 
-        def touch(material: str, key: bytes, sequence: int) -> Touch:
+        def touch(material: str, key: bytes, sequence: int) -> WindowSums:
             if (there := touches.get((material, key))) is not None:
                 return there
             record = store.record(sequence)
@@ -231,12 +231,12 @@ class Memory:
             fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
         return fresh
 
-    def _touch(self, columns: int, codes: Codes) -> Touch:
+    def _touch(self, columns: int, codes: Codes) -> WindowSums:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage behind all that a touch can reach
-            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
-            stages += [*unreached, {scale: [0] for scale in NOISE}]
-        return Touch.of(stages, codes)
+        if all(scale in codes for scale in NOISY):  # the first noisy copy, at a stage behind all that a touch can reach
+            unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            stages += [*unreached, {scale: [0] for scale in NOISY}]
+        return WindowSums.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         """Add all that another memory of the same making held: arrays and attributes of one of its generations."""
@@ -333,9 +333,9 @@ class Memory:
     def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         names, scales = attributes["materials"], self.reading.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        self.pool = Pool.from_arrays(arrays, attributes["pool"])
+        self.pool = TouchSample.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarPool.from_arrays(
+            self.exemplars = ExemplarSample.from_arrays(
                 arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
             )
         self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))

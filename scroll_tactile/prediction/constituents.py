@@ -19,8 +19,7 @@ from scroll_tactile.readouts.attributes import GAMMAS, Curve, Solved, fit_curve,
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
 from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
 from scroll_tactile.readouts.readout import Readout
-from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.sample import Touch
+from scroll_tactile.statistics.sample import WindowSums
 from scroll_tactile.statistics.statistics import fold_of
 
 __all__ = ["Bench", "Head", "Stage", "combined", "space_of"]
@@ -100,7 +99,7 @@ class Bench:
         self.trials = [trial for one in memory.pool if (trial := self._trial(*one)) is not None]
         self._solved: dict[tuple[int | None, float, bytes], Solved] = {}
 
-    def _trial(self, material: str, key: bytes, touch: Touch) -> _Trial | None:
+    def _trial(self, material: str, key: bytes, touch: WindowSums) -> _Trial | None:
         model, fold = self.model, fold_of(key)
         means = touch.means(self.stage)
         scales = model.stages[self.stage]

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.shrinkage import Selection
-from scroll_tactile.statistics.sample import Pool
+from scroll_tactile.statistics.sample import TouchSample
 from scroll_tactile.statistics.statistics import fold_of
 
 __all__ = ["FEWEST", "Calibration", "calibrate", "calibrate_stage", "fit_weights"]
@@ -63,7 +63,7 @@ UNMEASURED = 5.0  # spreads: where too little could be held out to measure the d
 
 
 def calibrate(
-    pool: Pool, stages: Sequence[Sequence[Scale]], selections: Mapping[Scale, Selection], kind: ReadoutName
+    pool: TouchSample, stages: Sequence[Sequence[int]], selections: Mapping[int, Selection], kind: ReadoutName
 ) -> list[Calibration]:
     """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
     return [
@@ -73,7 +73,7 @@ def calibrate(
     ]
 
 
-def calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName) -> Calibration:
+def calibrate_stage(stage: int, pool: TouchSample, selections: list[Selection], kind: ReadoutName) -> Calibration:
     """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
     scores, targets, distances = _held_out(stage, pool, selections, kind)
     prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
@@ -90,7 +90,7 @@ def calibrate_stage(stage: int, pool: Pool, selections: list[Selection], kind: R
 
 
 def _held_out(
-    stage: int, pool: Pool, selections: list[Selection], kind: ReadoutName
+    stage: int, pool: TouchSample, selections: list[Selection], kind: ReadoutName
 ) -> tuple[list[FloatArray], list[int], FloatArray]:
     """Scores (scales, C') and target place of each held-out touch, and its distances (touches, scales)."""
     scores: list[FloatArray] = []

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import Scale
 
-__all__ = ["CAPACITY", "LARGEST_SHARE", "Pool", "Sample", "Touch"]
+__all__ = ["CAPACITY", "LARGEST_SHARE", "Sample", "TouchSample", "WindowSums"]
 
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
 LARGEST_SHARE = 8  # an item of more than this part of the limit is never held: one would push out all others
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Touch:
+class WindowSums:
     """Sums of the codes of a touch's windows, for each stage it reached and each scale that fits there.
 
     sums: int32 of shape (pairs, d) (64 windows of codes below 2²¹ fit); a pair is a stage with a scale, by place.
@@ -38,7 +38,9 @@ class Touch:
     pairs: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, stages: Sequence[Mapping[Scale, Sequence[int]]], codes: Mapping[Scale, npt.NDArray[np.int32]]) -> Touch:
+    def of(
+        cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]
+    ) -> WindowSums:
         """The touch of these codes; stages: for each, width → places of the windows that are scored there."""
         chosen = [
             (stage, scale, width, places)
@@ -176,7 +178,7 @@ class Sample(Generic[T]):
         return max((len(keys) - 1, keys[-1], material) for material, keys in self._keys.items() if keys)
 
 
-class Pool(Sample[Touch]):
+class TouchSample(Sample[WindowSums]):
     """At most `capacity` touches of all materials, a function of the set of touches felt."""
 
     def __init__(self, capacity: int = CAPACITY) -> None:
@@ -193,11 +195,11 @@ class Pool(Sample[Touch]):
         }, [material for material, *_ in entries]
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> Pool:
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> TouchSample:
         """The pool that `to_arrays` described."""
         pool = cls()
         edges = np.cumsum(arrays["pool-sizes"])[:-1]
         sums, pairs = np.split(arrays["pool-sums"], edges), np.split(arrays["pool-pairs"], edges)
         for at, material in enumerate(materials):
-            pool.add(material, arrays["pool-keys"][at].tobytes(), Touch(sums[at], pairs[at]))
+            pool.add(material, arrays["pool-keys"][at].tobytes(), WindowSums(sums[at], pairs[at]))
         return pool

@@ -22,7 +22,7 @@ import torch
 import scroll_tactile.memory.state
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError
-from scroll_tactile.statistics.sample import Pool
+from scroll_tactile.statistics.sample import TouchSample
 
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 MATERIALS = ("a", "b", "c", "ü")
@@ -33,7 +33,7 @@ Constituents = tuple[tuple[str, float | bool | None], ...]
 Operation = tuple[Any, ...]
 
 
-class SmallPool(Pool):
+class SmallSample(TouchSample):
     """A pool that is soon full, so that what was left out of it has to come back."""
 
     def __init__(self, capacity: int = 5) -> None:
@@ -43,7 +43,7 @@ class SmallPool(Pool):
 def warm() -> None:
     """Have everything imported and set, so that a process forked from here begins at once, with no thread running."""
     torch.set_num_threads(1)
-    scroll_tactile.memory.state.Pool = SmallPool  # type: ignore[misc]  # for good: this process does nothing else
+    scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]  # for good: this process does nothing else
     learner = TactileLearner(**settings())
     for at in range(4):
         for name in MATERIALS[:2]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from examples.benchmarks.buffers import compare
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarPool, herd, mean_code, quotas, rank
+from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarSample, herd, mean_code, quotas, rank
 from scroll_tactile.statistics.sample import LARGEST_SHARE
 
 few = settings(max_examples=150, deadline=None)
@@ -155,7 +155,7 @@ def exemplar(material, number, length, scale=1):
 
 
 def pool_of(felt, **limits):
-    pool = ExemplarPool(**limits)
+    pool = ExemplarSample(**limits)
     for material, number, length in felt:
         one = exemplar(material, number, length)
         before = state(pool)
@@ -236,7 +236,7 @@ def test_a_pool_of_two_pools_is_the_pool_of_all(ours, theirs, limits):
 @given(streams, streams, limits)
 def test_a_pool_that_was_kept_goes_on_as_if_it_had_not_been(before, after, limits):
     pool = pool_of(before, **limits)
-    again = ExemplarPool.from_arrays(*pool.to_arrays(), **limits)
+    again = ExemplarSample.from_arrays(*pool.to_arrays(), **limits)
     assert state(again) == state(pool)
     known = {(name, number): length for name, number, length in before}
     for name, number, length in after:
@@ -249,7 +249,7 @@ def test_a_pool_that_was_kept_goes_on_as_if_it_had_not_been(before, after, limit
 @given(streams, st.integers(1, 6))
 def test_a_pool_of_less_capacity_is_the_beginning_of_it(felt, capacity):
     large = pool_of(felt, capacity=6)
-    assert held(ExemplarPool.from_arrays(*large.to_arrays(), capacity)) == held(pool_of(felt, capacity=capacity))
+    assert held(ExemplarSample.from_arrays(*large.to_arrays(), capacity)) == held(pool_of(felt, capacity=capacity))
 
 
 def test_a_short_stream_in_place_of_a_long_one_lets_nothing_back_in():
@@ -280,7 +280,7 @@ def test_one_very_long_stream_pushes_out_nothing():
 
 def test_pools_of_other_limits_are_not_merged():
     with pytest.raises(MismatchError, match="came one of 3, None"):
-        ExemplarPool(2).update(ExemplarPool(3))
+        ExemplarSample(2).update(ExemplarSample(3))
 
 
 @pytest.mark.parametrize(
@@ -288,7 +288,7 @@ def test_pools_of_other_limits_are_not_merged():
 )
 def test_a_pool_that_could_hold_nothing_or_everything_is_refused(wrong):
     with pytest.raises(InputError, match="expected"):
-        ExemplarPool(**wrong)
+        ExemplarSample(**wrong)
 
 
 def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
@@ -324,7 +324,7 @@ def test_the_buffer_depends_on_no_order_and_is_even(felt, capacity, random):
 
 
 def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind():
-    pool = ExemplarPool(6)
+    pool = ExemplarSample(6)
     near, far, brief, briefer = (exemplar("a", number, 2) for number in (9, 1, 7, 8))
     scales, codes = (20, 20, 5, 5), ([1, 0, 0], [90, 0, 0], [0, 0, 0], [0, 0, 0])
     for one, scale, code in zip((near, far, brief, briefer), scales, codes, strict=True):
@@ -340,9 +340,9 @@ def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind(
 
 
 def test_no_candidates_make_no_buffer():
-    pool = ExemplarPool(3)
+    pool = ExemplarSample(3)
     assert rank(pool, lambda *_: np.zeros(3, np.int64)) == {}
-    assert len(ExemplarPool.from_arrays(*pool.to_arrays(), 3)) == 0
+    assert len(ExemplarSample.from_arrays(*pool.to_arrays(), 3)) == 0
 
 
 def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():

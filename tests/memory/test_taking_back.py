@@ -6,7 +6,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from test_learner_machine import PAD, SETTINGS, SMALL, SmallPool, fed, require_same, stream
+from test_learner_machine import PAD, SETTINGS, SMALL, SmallSample, fed, require_same, stream
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import (
@@ -631,7 +631,7 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
 
 @pytest.mark.parametrize("at", range(12))
 def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.memory.state.Pool", SmallPool)
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
     felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]
     learner, receipts = filled(path, felt)
     with learner:

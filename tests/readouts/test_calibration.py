@@ -5,7 +5,7 @@ import pytest
 
 from scroll_tactile.readouts.calibration import Calibration, calibrate, fit_weights
 from scroll_tactile.readouts.shrinkage import select
-from scroll_tactile.statistics.sample import Pool, Touch
+from scroll_tactile.statistics.sample import TouchSample, WindowSums
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 
 DIMENSION, SCALES, STAGES = 8, (10, 40), [[10], [10, 40]]
@@ -15,7 +15,7 @@ def scene(noises=(20_000, 20_000), materials=6, each=20, seed=0, unit=40_000):
     """A memory of touches with one window a scale; noises: their spread at each scale."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(len(SCALES), materials, DIMENSION)) * unit
-    statistics, pool = Statistics(DIMENSION, SCALES), Pool()
+    statistics, pool = Statistics(DIMENSION, SCALES), TouchSample()
     for at in range(materials * each):
         material, key = at % materials, rng.bytes(32)
         codes = {
@@ -23,7 +23,7 @@ def scene(noises=(20_000, 20_000), materials=6, each=20, seed=0, unit=40_000):
             for place, scale in enumerate(SCALES)
         }
         statistics.add(str(material), fold_of(key), codes)
-        pool.add(str(material), key, Touch.of([{10: [0]}, {10: [0], 40: [0]}], codes))
+        pool.add(str(material), key, WindowSums.of([{10: [0]}, {10: [0], 40: [0]}], codes))
     return statistics, pool
 
 
@@ -143,12 +143,12 @@ def test_a_stage_whose_scale_was_never_felt_has_no_calibration():
     statistics, pool = scene()
     selections = {10: select(statistics, 10, "lda")}
     assert len(calibrate(pool, STAGES, selections, "lda")) == 1
-    assert calibrate(Pool(), STAGES, {}, "lda") == []
+    assert calibrate(TouchSample(), STAGES, {}, "lda") == []
 
 
 def test_the_order_of_what_was_felt_changes_no_bit():
     statistics, pool = scene()
-    turned = Pool()
+    turned = TouchSample()
     for entry in reversed(list(pool)):
         turned.add(*entry)
     selections = {scale: select(statistics, scale, "lda") for scale in SCALES}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.statistics.sample import CAPACITY, Pool, Touch
+from scroll_tactile.statistics.sample import CAPACITY, TouchSample, WindowSums
 
 DIMENSION = 2
 
@@ -16,11 +16,11 @@ def touch(material, key):
     """A touch whose content tells which it is."""
     stages = len(key) % 2 + 1
     sums = np.full((stages, DIMENSION), 1000 * ord(material[0]) + key[0], dtype=np.int32)
-    return Touch(sums, np.array([(stage, 0, stage + 1) for stage in range(stages)]))
+    return WindowSums(sums, np.array([(stage, 0, stage + 1) for stage in range(stages)]))
 
 
 def filled(entries, capacity=6):
-    pool = Pool(capacity)
+    pool = TouchSample(capacity)
     for material, key in entries:
         pool.add(material, key, touch(material, key))
     return pool
@@ -99,7 +99,7 @@ def test_wants_says_whether_add_would_keep_it(felt, one):
 def test_what_a_store_keeps_is_all_of_it(felt):
     pool = filled(felt, CAPACITY)
     arrays, materials = pool.to_arrays()
-    again = Pool.from_arrays(arrays, materials)
+    again = TouchSample.from_arrays(arrays, materials)
     assert content(again) == content(pool)
     assert len(again) == len(pool)
     again.add("z", b"\x01", touch("z", b"\x01"))
@@ -108,13 +108,13 @@ def test_what_a_store_keeps_is_all_of_it(felt):
 
 
 def test_an_empty_pool_can_be_kept():
-    arrays, materials = Pool().to_arrays()
-    assert list(Pool.from_arrays(arrays, materials)) == []
+    arrays, materials = TouchSample().to_arrays()
+    assert list(TouchSample.from_arrays(arrays, materials)) == []
 
 
 def test_a_touch_holds_the_sums_of_each_stages_windows():
     codes = {5: np.arange(12, dtype=np.int32).reshape(4, 3), 20: np.full((1, 3), 2**20, dtype=np.int32)}
-    one = Touch.of([{5: [0]}, {5: [0, 2, 3], 20: [0]}], codes)
+    one = WindowSums.of([{5: [0]}, {5: [0, 2, 3], 20: [0]}], codes)
     assert [mean.tolist() for mean in one.means(0)] == [[0, 1, 2]]
     assert [mean.tolist() for mean in one.means(1)] == [[5, 6, 7], [2**20] * 3]
     assert one.means(2) is None
@@ -122,13 +122,13 @@ def test_a_touch_holds_the_sums_of_each_stages_windows():
 
 def test_sums_of_the_most_windows_fit():
     codes = {5: np.full((64, 2), 2**20, dtype=np.int32)}
-    assert Touch.of([{5: list(range(64))}], codes).means(0)[0].tolist() == [2**20] * 2
+    assert WindowSums.of([{5: list(range(64))}], codes).means(0)[0].tolist() == [2**20] * 2
 
 
 @pytest.mark.parametrize("materials", [1, 7, 400])
 def test_the_default_capacity(materials):
     rng = np.random.default_rng(0)
-    pool = Pool()
+    pool = TouchSample()
     for at in range(1200):
         key = rng.bytes(32)
         pool.add(str(at % materials), key, touch("m", key))

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings import Embedding, Frames, Kernels
+from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
@@ -35,7 +36,6 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import Scale, WindowPlan
 from store import Store
 
 __all__ = ["TactileLearner"]
@@ -95,7 +95,7 @@ class TactileLearner:
         self.refit = refit
         self.augmentation = require_augmentable(sensor, augmentation)
         self.solver: SolverName = solver
-        self._reading = WindowPlan.of(sensor, self.embedding)
+        self._reading = window_plan(sensor, self.embedding)
         self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
         self._capacity = capacity_of(exemplars, exemplar_bytes, camera=sensor.camera)
         self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))

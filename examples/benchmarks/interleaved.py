@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from examples.benchmarks.ours import Ours
 from examples.benchmarks.timing import circumstances
 from examples.benchmarks.vector_peers import GradientSteps, Peer, PseudoInverse, Refitted, lacking
+from scroll_tactile.embeddings import Capabilities
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import Readout, fit_readout
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, WoodburyReadout
@@ -43,8 +44,7 @@ class AsIs:
     dimension = CHANNELS * READINGS
     bound = 1.0
     fingerprint = hashlib.sha256(b"the image's values as they are, 1").hexdigest()
-    partial_windows = False
-    judged_scales = "widest"
+    capabilities = Capabilities(partial_windows=False, judged_scales="widest")
 
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """The image's first values, and zeros where there are fewer."""

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, embed_windows
-from scroll_tactile.embeddings.vision import TOGETHER
+from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = ["check_embedding"]
@@ -127,7 +126,7 @@ def _windows_repeat(embedding: Embedding, images: list[Image]) -> None:
 
 def _windows_are_cuts(embedding: Embedding, images: list[Image]) -> None:
     """narrow windows, and all that no pass is shared for, are read as if cut out."""
-    shares = hasattr(embedding, "embed_windows")
+    shares = capabilities_of(embedding).embeds_windows
     for image in images:
         windows = {width: starts for width, starts in _windows(image, images).items() if width < TOGETHER or not shares}
         for width, rows in embed_windows(embedding, image.copy(), windows).items():
@@ -162,7 +161,7 @@ def _windows(image: Image, images: list[Image]) -> dict[int, list[int]]:
 
 def _require_sound(embedding: Embedding, features: npt.NDArray[np.floating], shape: tuple[int, ...], what: str) -> None:
     if not isinstance(features, np.ndarray) or not np.issubdtype(features.dtype, np.floating):
-        kind = getattr(features, "dtype", type(features).__name__)
+        kind = features.dtype if isinstance(features, np.ndarray) else type(features).__name__
         raise _broken(embedding, f"expected floating-point NumPy features of {what}; came {kind}")
     if features.shape != shape:
         raise _broken(embedding, f"expected features of shape {shape} of {what}; came {features.shape}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from torch.nn import functional
 
 from scroll_tactile.embeddings.banks import LEVELS, to_levels
-from scroll_tactile.embeddings.protocol import canary
+from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.embeddings.surfaces import COLOURS, LIGHT, SURFACE, light, surface
 from scroll_tactile.embeddings.vision import to_planes
@@ -62,7 +62,6 @@ class Frames:
 
     name = "frames"
     bound = 1.0
-    reads_frames = True
 
     def __init__(
         self,
@@ -82,6 +81,7 @@ class Frames:
         if weights is None and runtime != "torch":
             raise InputError(f"expected a runtime with weights, which it is to run; came {runtime!r} without")
         self.rest: Rest = _checked(rest)
+        self.capabilities = Capabilities(reads_frames=True, rest=self.rest)
         self.cosines = cosines
         self.seed = seed
         self.runtime: RuntimeName = runtime
@@ -127,15 +127,6 @@ class Frames:
             return self._waved(surface(levels))
         relief = surface(levels) if self._net is None else self._seen(planes)
         return np.concatenate([light(levels), relief])
-
-    def embed_windows(
-        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
-    ) -> dict[int, npt.NDArray[np.floating]]:
-        """Width → features (windows, d), each what `embed` gives for the window cut out, to the bit."""
-        return {
-            width: np.stack([self.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts])
-            for width, starts in windows.items()
-        }
 
     @cached_property
     def _waves(self) -> tuple[torch.Tensor, torch.Tensor]:

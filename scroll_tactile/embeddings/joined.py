@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, embed_windows
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.contact import rest_of
 
 __all__ = ["Joined"]
 
@@ -41,18 +39,24 @@ class Joined:
         self.parts: tuple[Embedding, ...] = embeddings
         self.name = "+".join(part.name for part in embeddings)
         self.dimension = sum(part.dimension for part in embeddings)
-        self.partial_windows: bool = all(getattr(part, "partial_windows", True) for part in embeddings)
+        declared = [capabilities_of(part) for part in embeddings]
+        framed = [part for part in declared if part.reads_frames]
+        rest = framed[0].rest if framed else None
+        if not all(np.array_equal(part.rest, rest) for part in framed):  # type: ignore[arg-type]
+            raise InputError(f"expected embeddings of frames with one resting image; came {embeddings}")
         # Judged by all scales, kernels with vision are not better (BioTac 99.4 against 99.5 %, RoboSkin 98.4 to 98.6),
         # at the price of a pass for each narrow window.
-        widest = any(getattr(part, "judged_scales", "all") == "widest" for part in embeddings)
-        self.judged_scales: Literal["widest", "all"] = "widest" if widest else "all"
-        asked = [tuple(getattr(part, "penalties", ())) for part in embeddings]
-        self.penalties: tuple[float, ...] = tuple(sorted(set().union(*asked))) if all(asked) else ()
-        framed = [part for part in embeddings if getattr(part, "reads_frames", False)]
-        self.reads_frames = bool(framed)
-        self.rest = rest_of(framed[0]) if framed else None
-        if not all(np.array_equal(rest_of(part), self.rest) for part in framed):  # type: ignore[arg-type]
-            raise InputError(f"expected embeddings of frames with one resting image; came {framed}")
+        widest = any(part.judged_scales == "widest" for part in declared)
+        penalties = [part.penalties for part in declared]
+        self.capabilities = Capabilities(
+            partial_windows=all(part.partial_windows for part in declared),
+            judged_scales="widest" if widest else "all",
+            penalties=tuple(sorted(set().union(*penalties))) if all(penalties) else (),
+            reads_frames=bool(framed),
+            rest=rest,
+            embeds_windows=True,
+            composite=True,
+        )
 
     def __repr__(self) -> str:
         return f"Joined({', '.join(map(repr, self.parts))})"

@@ -14,7 +14,7 @@ import torch
 
 from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
 from scroll_tactile.embeddings.levels import triangle_features, window_statistics
-from scroll_tactile.embeddings.protocol import canary
+from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.signals.windows import ENOUGH
 
 __all__ = ["Kernels"]
@@ -55,6 +55,7 @@ class Kernels:
 
     name = "kernels"
     bound = 1.0
+    capabilities = Capabilities(embeds_windows=True)
 
     def __init__(self, *, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
         if not 64 <= dimension <= MOST_FEATURES:

@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import gaussian_filter, shift
 
 from scroll_tactile.embeddings.kernels import one_torch_thread
-from scroll_tactile.embeddings.protocol import canary
+from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
 
 __all__ = ["Maps"]
@@ -58,7 +58,6 @@ class Maps:
 
     name = "maps"
     bound = 1.0
-    judged_scales: Literal["widest", "all"] = "widest"
 
     def __init__(
         self,
@@ -91,7 +90,7 @@ class Maps:
         self._read = 1 if len(layout) == 1 else len(self.views)
         self.dimension = cosines or self._read * self._seen
         # As many cosines as touches know each by heart: with the λ of other features letters fall by three points.
-        self.penalties: tuple[float, ...] = PENALTIES if cosines else ()
+        self.capabilities = Capabilities(judged_scales="widest", penalties=PENALTIES if cosines else ())
 
     def __repr__(self) -> str:
         return (

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from scroll_tactile.embeddings.protocol import canary
+from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.errors import EmbeddingError, InputError
 
@@ -62,8 +62,7 @@ class ModuleEmbedding:
         self.name = name
         self.dimension = dimension
         self.bound = bound
-        self.partial_windows = partial_windows
-        self.judged_scales: Literal["widest", "all"] = judged_scales
+        self.capabilities = Capabilities(partial_windows=partial_windows, judged_scales=judged_scales)
         self._channels = tuple(channels)
         self._module = copy.deepcopy(module).eval().requires_grad_(False).cpu()
 

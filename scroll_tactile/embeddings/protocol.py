@@ -1,16 +1,67 @@
-"""What an embedding has to be, and how any embedding reads windows."""
+"""What an embedding has to be, what more it may declare, and how any embedding reads windows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Final, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Embedding", "canary", "embed_windows"]
+from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.contact import Rest
+from scroll_tactile.signals.windows import Reading, scales
+
+__all__ = [
+    "TOGETHER",
+    "Capabilities",
+    "CompositeEmbedding",
+    "Embedding",
+    "NoiseEmbedding",
+    "WindowEmbedding",
+    "canary",
+    "capabilities_of",
+    "embed_windows",
+    "parts_of",
+    "require_rest",
+    "window_plan",
+]
 
 FloatArray = npt.NDArray[np.floating]
+
+TOGETHER: Final = 48
+"""Columns from which windows may share one pass over an image; narrower ones are always read as if cut out."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What an embedding declares beyond the `Embedding` protocol, in an attribute `capabilities`; defaults without one.
+
+    partial_windows: a touch of 0.65 of a wide window or more is read at that scale, as far as it goes.
+    judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
+    reads_beginnings: the first narrow window of a touch is a scale of its own.
+    fills_channels: dead channels are filled in from the others before anything is embedded.
+    penalties: the λ that readouts of its features are tried with; none: the usual ones.
+    reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
+    embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
+    embeds_noise: it has `is_noisy(image)` and `embed_noisy(images)`, see `NoiseEmbedding`.
+    composite: it has `parts`, see `CompositeEmbedding`.
+    tunable: it has `network()`, a copy of its network to be fine-tuned, see `Vision.network`.
+    """
+
+    partial_windows: bool = True
+    judged_scales: Literal["widest", "all"] = "all"
+    reads_beginnings: bool = False
+    fills_channels: bool = False
+    penalties: tuple[float, ...] = ()
+    reads_frames: bool = False
+    rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
+    embeds_windows: bool = False
+    embeds_noise: bool = False
+    composite: bool = False
+    tunable: bool = False
 
 
 @runtime_checkable
@@ -49,6 +100,88 @@ class Embedding(Protocol):
         ...
 
 
+class WindowEmbedding(Embedding, Protocol):
+    """An embedding that reads all windows of an image at once: `Capabilities.embeds_windows`."""
+
+    def embed_windows(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
+    ) -> Mapping[int, FloatArray]:
+        """Width → features (windows, d) of width → first columns; see the function `embed_windows`."""
+        ...
+
+
+class NoiseEmbedding(Embedding, Protocol):
+    """An embedding with features made for noisy touches: `Capabilities.embeds_noise`."""
+
+    def is_noisy(self, image: npt.NDArray[np.float32]) -> bool:
+        """Whether a touch is read by `embed_noisy`, a function of its image (C, T) alone."""
+        ...
+
+    def embed_noisy(self, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:
+        """Two sets of features, shape (2, N, d), of N ≥ 1 whole images (C, T) of as many channels."""
+        ...
+
+
+class CompositeEmbedding(Embedding, Protocol):
+    """An embedding that is others side by side, each one's features divided by its bound: `Capabilities.composite`."""
+
+    @property
+    def parts(self) -> tuple[Embedding, ...]:
+        """The embeddings, in the order of their features."""
+        ...
+
+
+def capabilities_of(embedding: object) -> Capabilities:
+    """What an embedding declares; the defaults for one that declares nothing.
+
+    Raises EmbeddingError for an attribute `capabilities` of another type.
+    """
+    declared = getattr(embedding, "capabilities", Capabilities())
+    if not isinstance(declared, Capabilities):
+        raise EmbeddingError(
+            f"expected the capabilities of {type(embedding).__name__} as scroll_tactile.embeddings.Capabilities(...); "
+            f"came {declared!r:.80}"
+        )
+    return declared
+
+
+def parts_of(embedding: Embedding) -> tuple[Embedding, ...]:
+    """The parts of a composite embedding; of another, itself."""
+    if capabilities_of(embedding).composite:
+        return cast(CompositeEmbedding, embedding).parts
+    return (embedding,)
+
+
+def window_plan(sensor: Sensor, embedding: Embedding) -> Reading:
+    """How an embedding reads the touches of a sensor: which windows, and which scales judge, as it declares."""
+    declared = capabilities_of(embedding)
+    return Reading(
+        scales(sensor),
+        declared.partial_windows,
+        declared.judged_scales,
+        declared.reads_beginnings,
+        declared.embeds_noise,
+        declared.fills_channels and sensor.channels <= embedding.dimension,
+        tuple(float(penalty) for penalty in declared.penalties),
+        sensor.camera,
+    )
+
+
+def require_rest(embedding: Embedding, sensor: Sensor) -> None:
+    """Raise InputError where an embedding of frames is to read channels, or its resting image is not the sensor's."""
+    declared = capabilities_of(embedding)
+    if declared.reads_frames and not sensor.camera:
+        raise InputError(
+            f"embedding {embedding.name!r} reads a camera's frames, and sensor {sensor.name!r} has "
+            f"{sensor.channels} channels: take Kernels()"
+        )
+    if isinstance(declared.rest, np.ndarray) and declared.rest.shape != sensor.shape:
+        raise InputError(
+            f"expected a resting image of sensor {sensor.name!r} of shape {sensor.shape}; {embedding.name!r} has one "
+            f"of {declared.rest.shape}"
+        )
+
+
 def embed_windows(
     embedding: Embedding, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
 ) -> dict[int, FloatArray]:
@@ -57,12 +190,10 @@ def embed_windows(
     image: shape (C, T), in [-1, 1]. windows: width in columns → first columns. Returns width → features of
     shape (number of windows, d), where row i equals `embedding.embed(image[:, start_i : start_i + width])`
     to the bit. A window that begins at 0 may be wider than the image: it is read as far as it goes. An embedding
-    with an `embed_windows(image, windows)` of its own is asked for all at once, and told the width there too.
+    whose capabilities say `embeds_windows` reads them all at once.
     """
-    together = getattr(embedding, "embed_windows", None)
-    if together is not None:
-        embedded: dict[int, FloatArray] = together(image, windows)
-        return embedded
+    if capabilities_of(embedding).embeds_windows:
+        return dict(cast(WindowEmbedding, embedding).embed_windows(image, windows))
     return {
         width: np.stack([embedding.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts])
         for width, starts in windows.items()

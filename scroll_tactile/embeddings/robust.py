@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.noisy import is_noisy, noisy_features
-from scroll_tactile.embeddings.protocol import Embedding, canary, embed_windows
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, canary, capabilities_of, embed_windows
 from scroll_tactile.errors import InputError
 
 __all__ = ["Robust"]
@@ -40,20 +39,25 @@ class Robust:
     Robust(Kernels(seed=1, dimension=64), seed=1)
     """
 
-    reads_beginnings = True
-    fills_channels = True
-
     def __init__(self, inner: Embedding | None = None, *, seed: int = 1) -> None:
         self.inner: Embedding = Kernels(dimension=2016) if inner is None else inner
         self.seed = seed
         self.name = f"robust {self.inner.name}"
         self.dimension = self.inner.dimension
         self.bound = max(1.0, self.inner.bound)
-        self.partial_windows: bool = getattr(self.inner, "partial_windows", True)
-        self.judged_scales: Literal["widest", "all"] = getattr(self.inner, "judged_scales", "all")
-        self.penalties: tuple[float, ...] = getattr(self.inner, "penalties", ())
-        if getattr(self.inner, "reads_frames", False):
+        inside = capabilities_of(self.inner)
+        if inside.reads_frames:
             raise InputError(f"expected an embedding of channels, whose noise and wires are known; came {self.inner!r}")
+        # Not tunable, and no composite: f* is made of windows alone.
+        self.capabilities = Capabilities(
+            partial_windows=inside.partial_windows,
+            judged_scales=inside.judged_scales,
+            reads_beginnings=True,
+            fills_channels=True,
+            penalties=inside.penalties,
+            embeds_windows=True,
+            embeds_noise=True,
+        )
 
     def __repr__(self) -> str:
         return f"Robust({self.inner!r}, seed={self.seed})"

@@ -7,7 +7,6 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +14,13 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from scroll_tactile.embeddings.protocol import canary
+from scroll_tactile.embeddings.protocol import TOGETHER, Capabilities, canary
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
 
-__all__ = ["TOGETHER", "TunableVision", "Vision", "pool_windows", "to_planes"]
+__all__ = ["TunableVision", "Vision", "pool_windows", "to_planes"]
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -29,10 +28,9 @@ FloatArray = npt.NDArray[np.float32]
 MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
 
-# Columns from which windows share one pass over the whole image: RoboSkin is told apart 0.3 points better so than in
-# windows apart, and one pass is cheaper. Narrower ones are cut out first, for early decisions rest on them, and these
-# see only what was felt: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
-TOGETHER = 48
+# Windows of TOGETHER columns or more share one pass over the whole image: RoboSkin is told apart 0.3 points better so
+# than in windows apart, and one pass is cheaper. Narrower ones are cut out first, for early decisions rest on them, and
+# these see only what was observed: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
 MOST_COLUMNS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory
 LEAST = {"torchvision": 1, "universal": 3}  # rows and columns: a kernel has to fit the padded image
 BATCH = 32  # images at once in `embed_bulk`
@@ -49,7 +47,7 @@ class Vision:
     precision: "bfloat16" is faster on processors that have it, with an error of half a percent.
     seed, depth: of the random network; the depth of given weights is seen from them.
 
-    A touch narrower than a window is not read at that scale (`partial_windows` is False): a network is lost at a
+    A touch narrower than a window is not read at that scale (`Capabilities.partial_windows`): a network is lost at a
     length that it did not learn from. Where several scales fit only the widest is judged (`judged_scales`), so that
     a touch costs one forward pass.
 
@@ -65,8 +63,7 @@ class Vision:
 
     name = "vision"
     bound = 1.0
-    partial_windows = False
-    judged_scales: Literal["widest", "all"] = "widest"
+    capabilities = Capabilities(partial_windows=False, judged_scales="widest", embeds_windows=True, tunable=True)
 
     def __init__(
         self,

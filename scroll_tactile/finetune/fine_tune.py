@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from scipy.special import logsumexp
 
-from scroll_tactile.embeddings import Embedding
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.network import Lesson, TouchFeatures
 from scroll_tactile.finetune.training import Progress, Trained, Trainer, repeatable, start_of, told_of_memory
@@ -27,7 +27,7 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.contact import Rest, image_of, rest_of
+from scroll_tactile.signals.contact import Rest, image_of
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.statistics.statistics import FOLDS
 
@@ -73,7 +73,7 @@ def fine_tune(
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars)
     touches = TouchFeatures(embedding, model.reading)
-    lessons = list(_lessons(touches, model, exemplars, (sensor, rest_of(embedding)), progress))
+    lessons = list(_lessons(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
     names = sorted({lesson.material for lesson in lessons})
     if len(names) < 2:
         raise InputError(

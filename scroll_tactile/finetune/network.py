@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +13,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from scroll_tactile.embeddings import Embedding, embed_windows
+from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, parts_of
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
-from scroll_tactile.embeddings.vision import MOST_COLUMNS, TOGETHER, TunableVision
+from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
 
@@ -100,17 +100,15 @@ def adapted(net: Backbone) -> Backbone:
 class TouchFeatures:
     """Mean features of touches, by scale, with the embedding's frozen parts and any network for the rest.
 
-    Features are given as shares of the embedding's bound. Of several parts at most one, the first that has a
-    `network`, is tuned, and of the scales those whose windows share one pass; narrower windows stay as the embedding
+    Features are given as shares of the embedding's bound. Of several parts at most one, the first that is
+    tunable, is tuned, and of the scales those whose windows share one pass; narrower windows stay as the embedding
     reads them, each by itself.
     """
 
-    def __init__(self, embedding: Embedding, reading: WindowPlan) -> None:
-        whole: Any = getattr(embedding, "plain", embedding)
-        self.parts: tuple[Any, ...] = tuple(getattr(whole, "parts", (whole,)))
+    def __init__(self, embedding: Embedding, reading: Reading) -> None:
+        self.parts = parts_of(embedding)
         self.reading = reading
-        able = [at for at, part in enumerate(self.parts) if callable(getattr(part, "network", None))]
-        self._at = able[0] if able else None
+        self._at = next((i for i, part in enumerate(self.parts) if capabilities_of(part).tunable), None)
         edges = np.cumsum([0, *(part.dimension for part in self.parts)])
         self.dimension = int(edges[-1])
         self._place = slice(0, 0) if self._at is None else slice(int(edges[self._at]), int(edges[self._at + 1]))
@@ -127,7 +125,7 @@ class TouchFeatures:
     def network(self) -> Backbone:
         """A new copy of the network, with the embedding's own weights."""
         assert self._at is not None
-        return Backbone(self.parts[self._at].network())
+        return Backbone(cast(Vision, self.parts[self._at]).network())
 
     def windows(self, columns: int) -> dict[int, list[int]]:
         """Width → first columns of the windows that judge a touch of so many columns."""

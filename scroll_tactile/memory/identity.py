@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from scroll_tactile.embeddings import Embedding
+from scroll_tactile.embeddings.protocol import Embedding, require_rest, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
 from scroll_tactile.memory.state import Capacity
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.contact import require_rest
 from scroll_tactile.signals.copies import Augmented
-from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS
 from store import Store
@@ -68,7 +66,7 @@ def identity_of(
     Raises InputError for an embedding that cannot read the sensor: before anything is written.
     """
     require_rest(embedding, sensor)
-    reading = WindowPlan.of(sensor, embedding)
+    reading = window_plan(sensor, embedding)
     # Memories of cameras that lack it had windows across two frames: another grid, and refused.
     frames = {"frames": True} if reading.frames else {}
     # Left out where there is none: such a memory can be opened by the versions before it.

@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings import Embedding, Frames, Kernels
+from scroll_tactile.embeddings import Capabilities, Embedding, Frames, Kernels
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
@@ -25,7 +25,8 @@ class Unneeded:
         self.dimension: int = made["dimension"]
         self.bound: float = made["bound"]
         self.fingerprint: str = made["fingerprint"]
-        self.partial_windows, self.judged_scales = reading or [True, "all"]
+        partial, judged = reading or [True, "all"]
+        self.capabilities = Capabilities(partial_windows=partial, judged_scales=judged)
 
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
         """Raise MismatchError: there is nothing to embed with."""

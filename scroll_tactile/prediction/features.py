@@ -8,12 +8,18 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings import Embedding, Robust, embed_windows
+from scroll_tactile.embeddings.protocol import (
+    Embedding,
+    NoiseEmbedding,
+    capabilities_of,
+    embed_windows,
+    require_rest,
+)
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.prediction.filling import sampled_readings
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.contact import Rest, image_of, pressed, require_rest, rest_of
+from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
@@ -39,7 +45,7 @@ class Perception:
         self._reading = reading
         self._augmentation = augmentation
         require_rest(embedding, sensor)
-        self._rest: Rest = rest_of(embedding)
+        self._rest: Rest = capabilities_of(embedding).rest
 
     def felt(self, readings: Readings) -> Stream:
         """What is read of readings: a sound stream; of a camera's, the frames in contact.
@@ -107,7 +113,7 @@ class Perception:
 
     def is_noisy(self, image: Image) -> bool:
         """Whether a touch was felt through noise, by an embedding that tells; a function of the touch alone."""
-        return self._reading.noisy and cast(Robust, self._embedding).is_noisy(image)
+        return self._reading.noisy and cast(NoiseEmbedding, self._embedding).is_noisy(image)
 
     def noisy_means(self, image: Image) -> dict[Scale, npt.NDArray[np.float64]]:
         """The features of a touch felt through noise, in the codes' unit, (d,) by scale."""
@@ -115,5 +121,4 @@ class Perception:
         return {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
 
     def _noisy_features(self, images: Sequence[Image]) -> npt.NDArray[np.floating]:
-        embedding = cast(Robust, self._embedding)  # which `Reading.of` found to have it
-        return embedding.embed_noisy(images)
+        return cast(NoiseEmbedding, self._embedding).embed_noisy(images)

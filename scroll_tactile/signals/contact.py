@@ -1,23 +1,22 @@
 """Which of a camera's frames count: those in which the gel is pressed, told by their difference from the gel at rest.
 
 The resting image is the first frame of every stream, or one that is given once and for all, or there is none and every
-frame counts; an embedding that reads frames says which, by its attribute `rest`. A frame is in contact where enough of
+frame counts; an embedding that reads frames says which, by `Capabilities.rest`. A frame is in contact where enough of
 it is brighter or darker than at rest, in any colour: a function of the stream alone, so that a memory is one, too.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError, NoContactError
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.errors import NoContactError
 from scroll_tactile.signals.image import scaled_down, tactile_image
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Rest", "image_of", "in_contact", "pressed", "require_rest", "rest_of"]
+__all__ = ["Rest", "image_of", "in_contact", "pressed"]
 
 Rest = Literal["first"] | npt.NDArray[np.float32] | None
 
@@ -27,27 +26,6 @@ DIFFERENCE = 0.02
 AREA = 0.01  # of the frame, that has to differ
 _CELLS = (60, 80)  # at most, rows and columns that a frame is averaged to before it is compared
 MOST_FRAMES = 64  # in contact that are kept of a stream, evenly spread
-
-
-def rest_of(embedding: Any) -> Rest:
-    """The resting image that an embedding asks for; None for one that does not speak of it."""
-    rest: Rest = getattr(embedding, "rest", None)
-    return rest
-
-
-def require_rest(embedding: Any, sensor: Sensor) -> None:
-    """Raise InputError where an embedding of frames is to read channels, or its resting image is not the sensor's."""
-    if getattr(embedding, "reads_frames", False) and not sensor.camera:
-        raise InputError(
-            f"embedding {embedding.name!r} reads a camera's frames, and sensor {sensor.name!r} has "
-            f"{sensor.channels} channels: take Kernels()"
-        )
-    rest = rest_of(embedding)
-    if isinstance(rest, np.ndarray) and rest.shape != sensor.shape:
-        raise InputError(
-            f"expected a resting image of sensor {sensor.name!r} of shape {sensor.shape}; {embedding.name!r} has one "
-            f"of {rest.shape}"
-        )
 
 
 def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -194,21 +194,6 @@ class WindowPlan:
     filled: bool = False
     penalties: tuple[float, ...] = ()
     frames: bool = False
-
-    @classmethod
-    def of(cls, sensor: Sensor, embedding: Any) -> WindowPlan:
-        """As the embedding asks for by its attributes, where it has them.
-
-        These are `partial_windows`, `judged_scales`, `reads_beginnings`, `fills_channels`, `penalties`, and whether
-        there is an `embed_noisy`.
-        """
-        partial = bool(getattr(embedding, "partial_windows", True))
-        beginning = bool(getattr(embedding, "reads_beginnings", False))
-        noisy = hasattr(embedding, "embed_noisy")
-        filled = bool(getattr(embedding, "fills_channels", False)) and sensor.channels <= embedding.dimension
-        judged: Literal["all", "widest"] = getattr(embedding, "judged_scales", "all")
-        penalties = tuple(float(one) for one in getattr(embedding, "penalties", ()))
-        return cls(scales(sensor), partial, judged, beginning, noisy, filled, penalties, sensor.camera)
 
     @property
     def windows(self) -> tuple[Scale, ...]:

@@ -25,6 +25,10 @@ def image(channels=19, columns=100):
     return np.random.default_rng([channels, columns]).uniform(-1, 1, (channels, columns)).astype(np.float32)
 
 
+def judged(embedding):
+    return embedding.capabilities.partial_windows, embedding.capabilities.judged_scales
+
+
 def test_it_is_its_parts_side_by_side():
     joined = Joined(KERNELS, VISION)
     assert (joined.name, joined.dimension, joined.bound) == ("kernels+vision", 64 + 192, 1.0)
@@ -51,11 +55,11 @@ def test_each_part_is_divided_by_its_bound():
 
 
 def test_the_most_demanding_part_decides_on_windows():
-    assert (VISION.partial_windows, VISION.judged_scales) == (False, "widest")
+    assert judged(VISION) == (False, "widest")
     both = Joined(KERNELS, VISION)
-    assert (both.partial_windows, both.judged_scales) == (False, "widest")
+    assert judged(both) == (False, "widest")
     plain = Joined(Loud(), Loud())
-    assert (plain.partial_windows, plain.judged_scales) == (True, "all")
+    assert judged(plain) == (True, "all")
 
 
 def test_the_fingerprint_depends_on_the_parts_and_their_order():
@@ -87,5 +91,5 @@ def test_what_is_no_embedding_is_refused():
 def test_penalties_are_named_only_where_every_part_names_some():
     cosines = Maps(layout=(3,), cosines=64)
     both = Joined(cosines, Maps(layout=(3,), cosines=64, seed=2))
-    assert both.penalties == cosines.penalties
-    assert Joined(cosines, Kernels(dimension=64)).penalties == ()
+    assert both.capabilities.penalties == cosines.capabilities.penalties
+    assert Joined(cosines, Kernels(dimension=64)).capabilities.penalties == ()

@@ -110,7 +110,7 @@ def test_cosines_fall_off_with_the_sum_of_differences():
 
 
 def test_cosines_ask_for_larger_penalties_and_maps_for_none():
-    assert Maps(layout=(3,), cosines=64).penalties[-1] == 1.0
-    assert Maps(layout=(3,)).penalties == ()
+    assert Maps(layout=(3,), cosines=64).capabilities.penalties[-1] == 1.0
+    assert Maps(layout=(3,)).capabilities.penalties == ()
     with pytest.raises(InputError, match="one or more for each of 3 views"):
         Maps(layout=(4, 4), cosines=2)

@@ -9,7 +9,7 @@ from torch import nn
 
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Embedding, Kernels, ModuleEmbedding, check_embedding
+from scroll_tactile.embeddings import Capabilities, Embedding, Kernels, ModuleEmbedding, check_embedding
 from scroll_tactile.errors import EmbeddingError, InputError
 
 POOL = nn.Sequential(nn.AdaptiveAvgPool2d((4, 8)), nn.Flatten())
@@ -38,7 +38,7 @@ def fixed_channels(channels=19, dimension=16):
 def test_a_module_becomes_an_embedding_in_one_line():
     embedding = ModuleEmbedding(POOL, name="pool", dimension=32)
     assert isinstance(embedding, Embedding)
-    assert (embedding.partial_windows, embedding.judged_scales, embedding.bound) == (False, "all", 1.0)
+    assert (embedding.capabilities, embedding.bound) == (Capabilities(partial_windows=False), 1.0)
     assert len(check_embedding(embedding, columns=(9, 60))) == 9
     image = np.linspace(-1, 1, 19 * 40, dtype=np.float32).reshape(19, 40)
     assert np.array_equal(embedding.embed(image), POOL(torch.from_numpy(image)[None])[0].numpy())
@@ -157,6 +157,8 @@ def by_company(self, image, windows):
     return {w: np.full((len(starts), 2), len(windows) / 10) for w, starts in windows.items()}
 
 
+OWN = Capabilities(embeds_windows=True)
+
 CASES = {
     "a promise missing": (Broken().embed, "lacks some"),
     "dimension": (broken(dimension=3), "expected features of shape (3,)"),
@@ -171,9 +173,9 @@ CASES = {
     "depends on the past": (broken(embed=remembers), "other"),
     "writes into its input": (broken(embed=writes), "wrote into the image"),
     "refuses read-only": (broken(embed=only_writable), "read-only"),
-    "windows differ from cuts": (broken(embed_windows=lies), "cut out"),
-    "windows missing": (broken(embed_windows=forgets_rows), "expected features of shape (3, 2)"),
-    "windows by company": (broken(embed_windows=by_company), "with other windows and alone"),
+    "windows differ from cuts": (broken(embed_windows=lies, capabilities=OWN), "cut out"),
+    "windows missing": (broken(embed_windows=forgets_rows, capabilities=OWN), "expected features of shape (3, 2)"),
+    "windows by company": (broken(embed_windows=by_company, capabilities=OWN), "with other windows and alone"),
 }
 
 

@@ -9,13 +9,12 @@ import torch
 import scroll_tactile.learner as learner_module
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings.vision import TOGETHER
+from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
-from scroll_tactile.signals.windows import Scale, WindowPlan
 from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
@@ -242,7 +241,7 @@ def test_a_memory_is_opened_with_the_buffer_that_it_was_made_with(tmp_path):
 @pytest.mark.parametrize("kind", ["vision", "kernels+vision"])
 def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
     embedding = EMBEDDINGS[kind]()
-    reading = WindowPlan.of(PAD, embedding)
+    reading = window_plan(PAD, embedding)
     features = TouchFeatures(embedding, reading)
     image = tactile_image(touches[0][1])
     means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
@@ -345,7 +344,7 @@ def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path,
 def test_the_judged_windows_are_read_as_the_embedding_reads_them_whatever_their_width(rate, duration):
     sensor = PAD.model_copy(update={"rate": rate, "duration": duration})
     embedding = EMBEDDINGS["vision"]()
-    reading = WindowPlan.of(sensor, embedding)
+    reading = window_plan(sensor, embedding)
     features = TouchFeatures(embedding, reading)
     image = tactile_image(Scene(sensor=sensor).touch(NAMES[0], 1))
     columns = image.shape[1]
@@ -358,7 +357,7 @@ def test_the_judged_windows_are_read_as_the_embedding_reads_them_whatever_their_
 
 
 def test_touches_of_many_columns_are_left_to_f():
-    features = TouchFeatures(EMBEDDINGS["vision"](), WindowPlan.of(PAD, EMBEDDINGS["vision"]()))
+    features = TouchFeatures(EMBEDDINGS["vision"](), window_plan(PAD, EMBEDDINGS["vision"]()))
     assert features.reads(4096)
     assert not features.reads(4097)
-    assert TouchFeatures(Kernels(dimension=64), WindowPlan.of(PAD, Kernels())).reads(10**6)
+    assert TouchFeatures(Kernels(dimension=64), window_plan(PAD, Kernels())).reads(10**6)

@@ -5,10 +5,11 @@ import pytest
 
 from scroll_tactile import Frames, Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.gel import SMALL, Gel
+from scroll_tactile.embeddings.protocol import require_rest
 from scroll_tactile.errors import InputError, MismatchError, NoContactError, StreamError
 from scroll_tactile.memory.identity import identity_of
 from scroll_tactile.memory.state import Capacity
-from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pressed, require_rest
+from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pressed
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 from store import Store

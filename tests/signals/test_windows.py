@@ -4,18 +4,10 @@ from itertools import pairwise
 
 import pytest
 
+from scroll_tactile.embeddings import Frames
+from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.signals.windows import (
-    MOST_WINDOWS,
-    Scale,
-    WindowPlan,
-    extent,
-    fitting,
-    milestones,
-    scales,
-    scored,
-    stages,
-)
+from scroll_tactile.signals.windows import MOST_WINDOWS, extent, fitting, milestones, scales, scored, stages
 
 
 def sensor(rate, duration, **settings):
@@ -130,7 +122,7 @@ def test_a_longer_touch_never_has_fewer_stages_or_scales():
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])
 def test_the_windows_of_a_camera_are_its_frames(frames):
-    reading = WindowPlan.of(CAMERA, None)
+    reading = window_plan(CAMERA, Frames())
     starts = reading.extent(32 * frames)[32]
     assert len(starts) == min(frames, MOST_WINDOWS)
     assert starts[0] == 0

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings import Embedding, embed_windows
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows, parts_of
 
 __all__ = ["Cached"]
 
@@ -46,9 +47,14 @@ class Cached:
         return getattr(self._embedding, name)
 
     @property
-    def plain(self) -> Embedding:
-        """The wrapped one, for images that will not be read again, such as augmented ones."""
-        return self._embedding
+    def capabilities(self) -> Capabilities:
+        """The wrapped embedding's, which it reads all windows with, and it stands as its own part."""
+        return replace(capabilities_of(self._embedding), embeds_windows=True, composite=True)
+
+    @property
+    def parts(self) -> tuple[Embedding, ...]:
+        """The wrapped one or its parts, for images that will not be read again, such as augmented ones."""
+        return parts_of(self._embedding)
 
     @property
     def name(self) -> str:

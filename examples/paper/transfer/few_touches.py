@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding
+from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
@@ -18,7 +18,6 @@ from scroll_tactile.readouts.shrinkage import Selection, select
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -47,7 +46,7 @@ class WidestFeatures:
     """
 
     def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
-        reading = WindowPlan.of(sensor, embedding)
+        reading = window_plan(sensor, embedding)
         if reading.judged != "widest" or reading.beginning or reading.noisy:
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
@@ -112,7 +111,7 @@ class _Learner:
 
 def feeler_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], Feeler]:
     """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that says the same."""
-    if WindowPlan.of(sensor, embedding).judged == "widest":
+    if window_plan(sensor, embedding).judged == "widest":
         features = WidestFeatures(sensor, embedding)
         return lambda: WidestReadout(features)
     return lambda: _Learner(sensor, embedding)

@@ -36,6 +36,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import candidates_of, require_augmentable, require_name, require_settings
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Scale
 from store import Store
 
 __all__ = ["TactileLearner"]

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, mean_code, quotas, rank
+from scroll_tactile.signals.windows import Scale
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap"]
 

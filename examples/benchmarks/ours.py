@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.recursive import WoodburyReadout
 from scroll_tactile.readouts.shrinkage import select
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -60,7 +61,7 @@ class Ours:
             self._fitted_at, self._tracked = self._seen, None
         else:
             if self._tracked is None:
-                self._tracked = WoodburyReadout(self.statistics, 1, self._readout)
+                self._tracked = WoodburyReadout(self.statistics, WHOLE, self._readout)
             elif not all(self._tracked.add(codes, self._names[name]) for name, codes in self._waiting):
                 self._tracked.anchor(self.statistics)
             self._readout = self._tracked.readout()

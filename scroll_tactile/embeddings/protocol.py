@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest
-from scroll_tactile.signals.windows import Reading, scales
+from scroll_tactile.signals.windows import WindowPlan, scales
 
 __all__ = [
     "TOGETHER",
@@ -152,10 +152,10 @@ def parts_of(embedding: Embedding) -> tuple[Embedding, ...]:
     return (embedding,)
 
 
-def window_plan(sensor: Sensor, embedding: Embedding) -> Reading:
+def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
     """How an embedding reads the touches of a sensor: which windows, and which scales judge, as it declares."""
     declared = capabilities_of(embedding)
-    return Reading(
+    return WindowPlan(
         scales(sensor),
         declared.partial_windows,
         declared.judged_scales,

@@ -105,7 +105,7 @@ class TouchFeatures:
     reads them, each by itself.
     """
 
-    def __init__(self, embedding: Embedding, reading: Reading) -> None:
+    def __init__(self, embedding: Embedding, reading: WindowPlan) -> None:
         self.parts = parts_of(embedding)
         self.reading = reading
         self._at = next((i for i, part in enumerate(self.parts) if capabilities_of(part).tunable), None)

@@ -253,7 +253,7 @@ def _entry(one: Exemplar) -> tuple[str, bytes, Exemplar, int]:
     return one.material, one.key, one, one.readings.nbytes
 
 
-def rank(pool: ExemplarSample, means: Callable[[str, int], IntArray]) -> dict[str, list[Exemplar]]:
+def rank(pool: ExemplarSample, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.

@@ -17,7 +17,7 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample
 from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import NOISY, Reading
+from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.sample import TouchSample, WindowSums
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 from store import CompactedError, DamageError, Head, Record, Store
@@ -233,9 +233,9 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> WindowSums:
         stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
-        if all(scale in codes for scale in NOISY):  # the first noisy copy, at a stage behind all that a touch can reach
-            unreached: list[dict[int, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
-            stages += [*unreached, {scale: [0] for scale in NOISY}]
+        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage behind all that a touch can reach
+            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            stages += [*unreached, {scale: [0] for scale in NOISE}]
         return WindowSums.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:

@@ -19,6 +19,7 @@ from scroll_tactile.readouts.attributes import GAMMAS, Curve, Solved, fit_curve,
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
 from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
 from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import WindowSums
 from scroll_tactile.statistics.statistics import fold_of
 

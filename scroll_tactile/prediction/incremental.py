@@ -17,7 +17,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, RecursiveReadout, WoodburyReadout
 from scroll_tactile.readouts.shrinkage import Selection
-from scroll_tactile.signals.windows import CHANNELS
+from scroll_tactile.signals.windows import CHANNELS, Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -42,7 +42,7 @@ class IncrementalModel:
         self._kind = READOUTS[solver]
         self._observations = sum(memory.statistics.materials.values())
         self._most = (1 + refit) * self._observations
-        self._readouts: dict[int, RecursiveReadout] = {}
+        self._readouts: dict[Scale, RecursiveReadout] = {}
 
     def update(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in the touches that were added since; False where the model has to be fitted again.
@@ -59,7 +59,7 @@ class IncrementalModel:
             self.model = replace(self.model, selections=self._updated(statistics, added))
         return True
 
-    def _updated(self, statistics: Statistics, added: Sequence[Added]) -> dict[int, Selection]:
+    def _updated(self, statistics: Statistics, added: Sequence[Added]) -> dict[Scale, Selection]:
         selections = dict(self.model.selections)
         for scale, selection in selections.items():
             rows = [(selection.places[name], codes[scale]) for name, codes in added if len(codes.get(scale, ()))]

@@ -12,7 +12,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.shrinkage import PENALTIES, Selection, select
-from scroll_tactile.signals.windows import CHANNELS, NOISY, Reading
+from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["Judgement", "Model"]

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.shrinkage import Selection
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import TouchSample
 from scroll_tactile.statistics.statistics import fold_of
 
@@ -63,7 +64,7 @@ UNMEASURED = 5.0  # spreads: where too little could be held out to measure the d
 
 
 def calibrate(
-    pool: TouchSample, stages: Sequence[Sequence[int]], selections: Mapping[int, Selection], kind: ReadoutName
+    pool: TouchSample, stages: Sequence[Sequence[Scale]], selections: Mapping[Scale, Selection], kind: ReadoutName
 ) -> list[Calibration]:
     """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
     return [

@@ -29,7 +29,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def leave_one_out_scores(
-    statistics: Statistics, scale: int, readout: Readout, rows: FloatArray, places: Sequence[int]
+    statistics: Statistics, scale: Scale, readout: Readout, rows: FloatArray, places: Sequence[int]
 ) -> FloatArray:
     """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been felt.
 

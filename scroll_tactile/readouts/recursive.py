@@ -30,6 +30,7 @@ from scipy.linalg.blas import dger, dtrsv
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -50,7 +51,7 @@ class RecursiveReadout(ABC):
     statistics: exact, of all rows so far. scale: the one that it reads. start: the readout fitted to them.
     """
 
-    def __init__(self, statistics: Statistics, scale: int, start: Readout) -> None:
+    def __init__(self, statistics: Statistics, scale: Scale, start: Readout) -> None:
         self._scale = scale
         self._penalty = start.penalty
         # A feature that never varied was given a variance of 1, in codes²; should it begin to, that is no penalty.

@@ -22,6 +22,7 @@ from scipy.linalg.lapack import dormqr, dptsv, dsytrd
 from scipy.special import log_ndtr, logsumexp
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, fit_readout, require_definite
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
 

@@ -39,7 +39,7 @@ class WindowSums:
 
     @classmethod
     def of(
-        cls, stages: Sequence[Mapping[int, Sequence[int]]], codes: Mapping[int, npt.NDArray[np.int32]]
+        cls, stages: Sequence[Mapping[Scale, Sequence[int]]], codes: Mapping[Scale, npt.NDArray[np.int32]]
     ) -> WindowSums:
         """The touch of these codes; stages: for each, width → places of the windows that are scored there."""
         chosen = [

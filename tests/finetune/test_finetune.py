@@ -15,6 +15,7 @@ from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.windows import Scale
 from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")

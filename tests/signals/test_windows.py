@@ -7,7 +7,7 @@ import pytest
 from scroll_tactile.embeddings import Frames
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.signals.windows import MOST_WINDOWS, extent, fitting, milestones, scales, scored, stages
+from scroll_tactile.signals.windows import MOST_WINDOWS, Scale, extent, fitting, milestones, scales, scored, stages
 
 
 def sensor(rate, duration, **settings):

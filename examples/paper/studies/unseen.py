@@ -18,6 +18,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
 from scroll_tactile.readouts.readout import Readout, fit_readout
 from scroll_tactile.readouts.shrinkage import task_of
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 

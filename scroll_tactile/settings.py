@@ -1,45 +1,74 @@
-"""What a learner is asked for, looked at before anything is done."""
+"""Settings of a learner, and the checks of what it is asked for, before anything is done."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialError
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
 
-__all__ = ["candidates_of", "require_augmentable", "require_name", "require_settings"]
+__all__ = ["LONGEST_NAME", "FrozenModel", "Settings", "candidates_of", "require_name"]
 
 LONGEST_NAME = 200  # characters
 
 
-def require_settings(readout: str, false_alarms: float, refit: float, solver: str) -> None:
-    """Raise InputError for readouts and solvers that there are not, and shares that are none."""
-    if readout not in ("lda", "ridge"):
-        raise InputError(f"readout must be 'lda' or 'ridge'; came {readout!r}")
-    if not 0 < false_alarms < 1:
-        raise InputError(f"false_alarms must be a share between 0 and 1; came {false_alarms!r}")
-    if not 0 <= refit <= 1:
-        raise InputError(f"refit must be a share from 0 to 1; came {refit!r}")
-    if solver not in ("exact", "recursive"):
-        raise InputError(f"solver must be 'exact' or 'recursive'; came {solver!r}")
-    if solver == "recursive" and not refit:
-        raise InputError(
-            "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by one: "
-            "give refit=1.0, say, to fit again when the memory has doubled"
-        )
+class FrozenModel(BaseModel):
+    """Fields that are validated once and never change; raises InputError for what does not fit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    def __init__(self, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise InputError(_described(error, type(self))) from None
 
 
-def require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> Augmented | None:
-    """The augmentation. Raises InputError for what is none, and for a camera, whose frames are not slid along time."""
-    if augmentation is not None and not isinstance(augmentation, Augmented):
-        raise InputError(f"expected an augmentation such as Augmented(copies=4); came {augmentation!r:.60}")
-    if augmentation is not None and sensor.camera:
-        raise InputError(
-            f"the copies of an augmentation differ in speed, noise and broken wires, and camera {sensor.name!r} takes "
-            "whole frames: leave the augmentation out"
-        )
-    return augmentation
+class Settings(FrozenModel):
+    """How a learner reads its memory; all but `exemplars` can differ at every opening.
+
+    readout: "lda" or "ridge" (the paper's); both are computed from the same statistics.
+    false_alarms: the share of touches of known materials that may be called unknown, between 0 and 1.
+    refit: the share, 0 to 1, by which the memory may grow before λ and the calibration are chosen again. With 0 they
+    are at each change, and every answer is a function of the memory alone. With 0.1, say, a `predict` just after an
+    `observe` is a hundred times as fast: the readouts are of all that was observed, λ and the calibration of a little
+    less.
+    solver: how the readouts follow between two such fits. "exact" updates a factor of the exact statistics and equals a
+    fresh solve to rounding. "recursive" is the paper's recursive least squares, whose rounding errors add up until the
+    next fit; it is there to be compared with, and what the memory keeps is exact all the same.
+    exemplars: streams in the buffer that `fine_tune` trains on; three times as many are kept raw, to choose from. 0
+    keeps none. None is 400, and none for a camera, whose frames are large (480 × 640: 4 MB).
+
+    Raises InputError for anything else.
+    """
+
+    readout: Literal["lda", "ridge"] = "lda"
+    false_alarms: Annotated[float, Field(gt=0, lt=1, strict=False)] = 0.05
+    refit: Annotated[float, Field(ge=0, le=1, strict=False)] = 0.0
+    solver: Literal["exact", "recursive"] = "exact"
+    exemplars: Annotated[int, Field(ge=0)] | None = None
+
+    def model_post_init(self, context: Any) -> None:
+        """Refuse a solver that would never be used."""
+        if self.solver == "recursive" and not self.refit:
+            raise InputError(
+                "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by "
+                "one: give refit=1.0, say, to fit again when the memory has doubled"
+            )
+
+
+def _described(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first thing wrong, with what was expected and what came."""
+    first = error.errors()[0]
+    name = str(first["loc"][0]) if first["loc"] else model.__name__
+    if first["type"] == "extra_forbidden":
+        return f"{name!r} is no setting of {model.__name__}; there are {', '.join(model.model_fields)}"
+    if first["type"] == "missing":
+        return f"{model.__name__} needs {name}"
+    what = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"expected {name} to be {what}; came {first['input']!r:.80}"
 
 
 def require_name(material: str) -> None:
@@ -52,20 +81,23 @@ def require_name(material: str) -> None:
         raise MaterialError(f"expected a name of printable characters; came {material!r}")
 
 
-def candidates_of(scene: Sequence[str], names: list[str]) -> list[str]:
-    """The materials of a scene, in alphabetical order.
+def candidates_of(scene: Sequence[str] | None, names: list[str]) -> list[str]:
+    """The materials of a scene, in alphabetical order; all that were observed where it is None.
 
-    Raises InputError for an empty one, UnknownMaterialError for one that names what was never felt.
+    Raises InputError for an empty one, UnknownMaterialError for one that names what was never observed.
     """
+    if scene is None:
+        return names
     if isinstance(scene, str):
         raise InputError(f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]")
     wanted = list(dict.fromkeys(scene))
     if not wanted:
         raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
-    felt = set(names)
-    missing = [name for name in wanted if name not in felt]
+    observed = set(names)
+    missing = [name for name in wanted if name not in observed]
     if missing:
         raise UnknownMaterialError(
-            f"the scene names {missing}, which were never felt; felt were {names if len(names) <= 30 else len(names)}"
+            f"the scene names {missing}, which were never observed; observed were "
+            f"{names if len(names) <= 30 else len(names)}"
         )
     return sorted(wanted)

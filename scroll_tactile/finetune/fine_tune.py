@@ -72,12 +72,12 @@ def fine_tune(
     begun = time.perf_counter()
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars)
-    touches = TouchFeatures(embedding, model.reading)
+    touches = TouchFeatures(embedding, model.plan)
     lessons = list(_lessons(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
     names = sorted({lesson.material for lesson in lessons})
     if len(names) < 2:
         raise InputError(
-            f"expected exemplars of at least two materials of {model.reading.milestones()[-1]} columns or more; there "
+            f"expected exemplars of at least two materials of {model.plan.milestones()[-1]} columns or more; there "
             f"are some of {names}. Observe longer touches, or more materials"
         )
     chosen = mode or _mode(touches, len(lessons))

@@ -2,116 +2,209 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, Literal, Self
 
-from scroll_tactile.embeddings.protocol import Embedding, require_rest, window_plan
-from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
-from scroll_tactile.memory.state import Capacity
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, window_plan
+from scroll_tactile.embeddings.kernels import Kernels
+from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
+from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS
-from store import Store
+from store import DamageError, Store
 
-__all__ = ["capacity_of", "identity_of", "kept_augmentation", "kept_capacity", "require_same"]
+__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "Grid", "Identity"]
 
-
-def capacity_of(streams: int | None, nbytes: int | None, *, camera: bool = False) -> Capacity:
-    """The size of the buffer that was asked for; a camera has none unless asked. Raises InputError for one below 0."""
-    for what, size in (("exemplars", streams), ("exemplar_bytes", nbytes)):
-        if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 0):
-            raise InputError(f"expected {what} as a whole number of 0 or more; came {size!r}")
-    if streams is None and nbytes is None:
-        return Capacity(0) if camera else Capacity()
-    return Capacity(0 if nbytes == 0 else streams, nbytes or None)
+USUAL_EXEMPLARS = 400  # streams
+ROBUST = "robust kernels"
 
 
-def kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
-    """The size of the buffer that a memory was made with. Raises MismatchError where another one was asked for."""
-    told = store.identity.get("exemplars")
-    if told is None:  # made before there were any: those felt since it was first opened with some are kept
-        generation = store.latest()
-        told = None if generation is None else generation.attributes.get("capacity")
-    if told is None:
-        return asked
-    kept = Capacity(*cast(list[int | None], told))
-    if given and kept != asked:
-        raise MismatchError(
-            f"{store.path} was made with exemplars={kept.streams}, exemplar_bytes={kept.nbytes}; it was opened with "
-            f"{asked.streams} and {asked.nbytes}. What was not kept cannot be had back: leave them out"
+class _Kept(BaseModel):
+    """A part of an identity, as JSON keeps it; what a later version adds is passed over."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class EmbeddingIdentity(_Kept):
+    """An embedding as a memory names it; its configuration, from which it can be made again, None for a user's own."""
+
+    name: str
+    dimension: int
+    bound: float
+    fingerprint: str
+    configuration: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, embedding: Embedding) -> Self:
+        """The identity of an embedding."""
+        return cls(
+            name=embedding.name,
+            dimension=embedding.dimension,
+            bound=embedding.bound,
+            fingerprint=embedding.fingerprint,
+            configuration=configuration_of(embedding),
         )
-    return kept
+
+    def __str__(self) -> str:
+        return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
 
-def kept_augmentation(store: Store, asked: Augmented | None) -> Augmented | None:
-    """The augmentation that a memory was made with, none where it was made before there was any.
+class Grid(_Kept):
+    """The grid of codes, and the widths of windows that statistics are kept of; frames: a camera's windows are those."""
 
-    Raises MismatchError where another one was asked for.
+    bits: int
+    folds: int
+    scales: tuple[int, ...]
+    frames: bool = False
+
+
+class Identity(_Kept):
+    """All that a memory is made with, for good.
+
+    reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
+    exemplars: streams in the buffer, and a limit of bytes that is not used any more; None likewise.
     """
-    told = store.identity.get("augmentation")
-    kept = None if told is None else Augmented(**cast(dict[str, Any], told))
-    if asked is not None and asked != kept:
+
+    sensor: Sensor
+    embedding: EmbeddingIdentity
+    grid: Grid
+    reading: tuple[bool, Literal["all", "widest"]] | None = None
+    exemplars: tuple[int | None, int | None] | None = None
+    augmentation: Augmented | None = None
+
+    @classmethod
+    def of(
+        cls, sensor: Sensor, embedding: Embedding, exemplars: int | None, augmentation: Augmented | None = None
+    ) -> Self:
+        """The identity of a new memory.
+
+        exemplars: streams in its buffer; None: the usual number, and none for a camera.
+        """
+        plan = window_plan(sensor, embedding)
+        usual = 0 if sensor.camera else USUAL_EXEMPLARS
+        return cls(
+            sensor=sensor,
+            embedding=EmbeddingIdentity.of(embedding),
+            grid=Grid(bits=BITS, folds=FOLDS, scales=plan.widths, frames=plan.frames),
+            reading=(plan.partial, plan.judged),
+            exemplars=(usual if exemplars is None else exemplars, None),
+            augmentation=augmentation,
+        )
+
+    @classmethod
+    def read(cls, store: Store) -> Self:
+        """The identity that a store was made with.
+
+        Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.
+        """
+        if "sensor" not in store.identity:
+            raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
+        try:
+            return cls.model_validate(store.identity)
+        except (ValidationError, ValueError) as error:
+            first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
+            where = ".".join(map(str, first["loc"]))
+            raise DamageError(f"the identity of {store.path} cannot be read: {where}: {first['msg']}") from error
+
+    def to_json(self) -> dict[str, Any]:
+        """In JSON's types, as a store keeps it; what is not there is left out, as the versions before it left it."""
+        kept = self.model_dump(mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars"})
+        kept["grid"] = self.grid.model_dump(mode="json", exclude={"frames"} if not self.grid.frames else None)
+        if self.exemplars is not None:
+            kept["exemplars"] = list(self.exemplars)
+        if self.augmentation is not None:
+            kept["augmentation"] = self.augmentation.to_json()
+        kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
+        return kept
+
+    def own_embedding(self, path: Path) -> Embedding:
+        """The embedding that it was made with, made again from its configuration; nothing is embedded.
+
+        Raises EmbeddingMismatchError for a user's own, which only the user has.
+        """
+        made = self.embedding
+        if made.configuration is not None:
+            return from_configuration(made.configuration)
+        found = guess(made.name, made.dimension, made.fingerprint, self.sensor)
+        if found is None:
+            raise EmbeddingMismatchError(
+                f"{path} was made with embedding {made}, which does not ship with scroll-tactile: pass the one that "
+                "made it, TactileLearner.open(path, embedding=...)"
+            )
+        return found
+
+    def require(
+        self, path: Path, *, sensor: Sensor | None, exemplars: int | None, augmentation: Augmented | None
+    ) -> None:
+        """Raise MismatchError for what was asked for (not None) and differs from what the memory was made with."""
+        if sensor is not None and sensor != self.sensor:
+            differing = [
+                f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
+                for name in Sensor.model_fields
+                if getattr(self.sensor, name) != getattr(sensor, name)
+            ]
+            raise SensorMismatchError(
+                f"{path} holds the memory of sensor {self.sensor.name!r}; it was opened for {sensor.name!r} "
+                f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
+            )
+        if exemplars is not None and self.exemplars is not None and exemplars != self.exemplars[0]:
+            raise MismatchError(
+                f"{path} was made with exemplars={self.exemplars[0]}; it was opened with {exemplars}. What was not "
+                "kept cannot be had back: leave them out"
+            )
+        if augmentation is not None and augmentation != self.augmentation:
+            raise MismatchError(
+                f"{path} was made with {self.augmentation or 'no augmentation'}; it was opened with {augmentation}. "
+                "Its touches were not observed with those copies: leave the augmentation out, or take another path"
+            )
+
+    def require_embedding(self, path: Path, embedding: Embedding) -> None:
+        """Raise EmbeddingMismatchError for another embedding than it was made with; embeds the canaries of both."""
+        mine, plan = EmbeddingIdentity.of(embedding), window_plan(self.sensor, embedding)
+        made = self.embedding
+        if (made.name, made.dimension, made.bound, made.fingerprint) != (
+            mine.name,
+            mine.dimension,
+            mine.bound,
+            mine.fingerprint,
+        ):
+            raise EmbeddingMismatchError(
+                f"{path} was made with embedding {made}; it was opened with {mine}. Features of one mean nothing to "
+                "the other: open it with the embedding that made it, or take another path"
+            )
+        if self.reading is not None and self.reading != (plan.partial, plan.judged):
+            raise EmbeddingMismatchError(
+                f"{path} was made with an embedding whose partial_windows and judged_scales are {list(self.reading)}; "
+                f"it was opened with one whose are {[plan.partial, plan.judged]}. Open it with those"
+            )
+        grid = Grid(bits=BITS, folds=FOLDS, scales=plan.widths, frames=plan.frames)
+        if self.grid != grid:
+            raise MismatchError(f"{path} was made with {self.grid!r}; this version works with {grid!r}")
+
+
+class AbsentEmbedding:
+    """Stands for the embedding that a memory was made with, where nothing is to be embedded."""
+
+    def __init__(self, identity: Identity) -> None:
+        made = identity.embedding
+        self.name, self.dimension, self.bound = made.name, made.dimension, made.bound
+        self.fingerprint = made.fingerprint
+        partial, judged = identity.reading or (True, "all")
+        self.capabilities = Capabilities(partial_windows=partial, judged_scales=judged)
+        if made.name == ROBUST:  # the one kind that has more scales than its windows, and so more statistics
+            from scroll_tactile.embeddings.robust import Robust
+
+            self.capabilities = Robust(Kernels(dimension=made.dimension)).capabilities
+
+    def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        """Raise MismatchError: there is nothing to embed with."""
         raise MismatchError(
-            f"{store.path} was made with {kept or 'no augmentation'}; it was opened with {asked}. Its touches were not "
-            "observed with those copies: leave the augmentation out, or take another path"
-        )
-    return kept
-
-
-def identity_of(
-    sensor: Sensor, embedding: Embedding, capacity: Capacity, augmentation: Augmented | None = None
-) -> dict[str, Any]:
-    """What is written into a new memory for good, in JSON's types.
-
-    Raises InputError for an embedding that cannot read the sensor: before anything is written.
-    """
-    require_rest(embedding, sensor)
-    reading = window_plan(sensor, embedding)
-    # Memories of cameras that lack it had windows across two frames: another grid, and refused.
-    frames = {"frames": True} if reading.frames else {}
-    # Left out where there is none: such a memory can be opened by the versions before it.
-    copies = {} if augmentation is None else {"augmentation": augmentation.to_json()}
-    return copies | {
-        "exemplars": [capacity.streams, capacity.nbytes],
-        "reading": [reading.partial, reading.judged],
-        "sensor": sensor.model_dump(mode="json"),
-        "embedding": {
-            "name": embedding.name,
-            "dimension": embedding.dimension,
-            "bound": embedding.bound,
-            "fingerprint": embedding.fingerprint,
-        },
-        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(reading.widths)} | frames,
-    }
-
-
-def require_same(store: Store, kept: Sensor, sensor: Sensor | None, embedding: Embedding) -> None:
-    """Compare what a memory was made with to what it is opened with."""
-    if sensor is not None and sensor != kept:
-        differing = [
-            f"{name} {getattr(kept, name)!r} there, {getattr(sensor, name)!r} here"
-            for name in Sensor.model_fields
-            if getattr(kept, name) != getattr(sensor, name)
-        ]
-        raise SensorMismatchError(
-            f"{store.path} holds the memory of sensor {kept.name!r}; it was opened for {sensor.name!r} "
-            f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
-        )
-    mine = identity_of(kept, embedding, Capacity())
-    if (theirs := cast(dict[str, Any], store.identity["embedding"])) != mine["embedding"]:
-        ours = mine["embedding"]
-        raise EmbeddingMismatchError(
-            f"{store.path} was made with embedding {theirs['name']!r} ({theirs['dimension']} features, fingerprint "
-            f"{theirs['fingerprint'][:12]}); it was opened with {ours['name']!r} ({ours['dimension']} features, "
-            f"fingerprint {ours['fingerprint'][:12]}). Features of one mean nothing to the other: open it with the "
-            "embedding that made it, or take another path"
-        )
-    if store.identity.get("reading", mine["reading"]) != mine["reading"]:
-        raise EmbeddingMismatchError(
-            f"{store.path} was made with an embedding whose partial_windows and judged_scales are "
-            f"{store.identity['reading']}; it was opened with one whose are {mine['reading']}. Open it with those"
-        )
-    if store.identity["grid"] != mine["grid"]:
-        raise MismatchError(
-            f"{store.path} was made with {store.identity['grid']}; this version works with {mine['grid']}"
+            f"the memory was opened without its embedding {self.name!r}, to look after it only: open it with "
+            "TactileLearner.open(path, embedding=...)"
         )

@@ -15,10 +15,9 @@ import numpy.typing as npt
 from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
-from scroll_tactile.memory.rows import Codes, pack_codes, spans
+from scroll_tactile.memory.rows import Added, Codes, pack_codes, spans
 from scroll_tactile.memory.state import DESCRIBE, OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.prediction.incremental import Added
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
 from store import ReadOnlyError, Record, Store, StoreClosedError, StoreError
@@ -67,11 +66,27 @@ class Ledger:
                     "back to: make a new one"
                 )
             self._memory = self._load()
+            self._whole = True
             self._changed()
         return self._memory
 
-    def _changed(self, added: Added | None = None) -> None:
+    @contextmanager
+    def _mutation(self, revert: Callable[[], None] | None = None) -> Iterator[None]:
+        """A change of the memory and its journal: cut short anywhere, the memory is read anew before its next use.
+
+        revert: undoes in the memory what the journal refused; None where a StoreError leaves the memory half changed.
+        """
+        self._whole = False
+        try:
+            yield
+        except StoreError:
+            if revert is not None:
+                revert()
+                self._whole = not self._batching  # a batch that fails loses all that was added in it before
+            raise
         self._whole = True
+
+    def _changed(self, added: Added | None = None) -> None:
         self.version += 1
         if added is None or (self.added is not None and len(self.added) >= MOST_ADDED):
             self.added = None
@@ -111,41 +126,31 @@ class Ledger:
         except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
             logger.warning("%s: no generation could be written: %s", store.path, error)
 
-    def observe(self, material: str, felt: Stream, columns: int, codes: Codes) -> Receipt:
+    def observe(self, material: str, stream: Stream, columns: int, codes: Codes) -> Receipt:
         """Write an observation down, then add it."""
         with self.lock:
             self.require_open()
             # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
             self.memory.statistics.require_room(codes)
-            readings = felt.readings if self._memory.exemplars is not None else None
-            self._whole = False
-            sequence = self._written(material, felt.key, columns, codes, readings)
-            self._memory.add(material, felt.key, columns, codes, sequence, readings)
-            self._changed((material, codes))
+            readings = stream.readings if self._memory.exemplars is not None else None
+            with self._mutation(_nothing):
+                sequence = self._append(material, stream.key, columns, codes, readings)
+                self._memory.add(material, stream.key, columns, codes, sequence, readings)
+                self._changed((material, codes))
             self._snapshot_if_due()
             durable = self.store is not None and not self._batching
-        return Receipt(sequence, material, felt.key, felt.seconds, felt.clipped, durable)
+        return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable)
 
-    def _written(
-        self,
-        material: str,
-        key: bytes,
-        columns: int,
-        codes: Codes,
-        readings: npt.NDArray[np.float32] | None,
+    def _append(
+        self, material: str, key: bytes, columns: int, codes: Codes, readings: npt.NDArray[np.float32] | None
     ) -> int:
         if self.store is None:
             return self._memory.sequence + 1
         attributes, arrays = {"columns": columns}, pack_codes(codes)
         if readings is not None:
-            # All, and not only those that are exemplars now: one taken back leaves its place to any other.
+            # All, and not only those that are exemplars now: one retracted leaves its place to any other.
             attributes["nbytes"], arrays[READINGS] = readings.nbytes, readings
-        try:
-            return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
-        except StoreError:
-            # The journal refused it and the memory never had it; but of a batch all is lost that was added before.
-            self._whole = not self._batching
-            raise
+        return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
         """As `TactileLearner.describe`, of what was checked."""
@@ -154,18 +159,12 @@ class Ledger:
             memory = self.memory
             if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but says another thing
                 return
-            self._whole = False
-            if self.store is not None:
-                try:
+            with self._mutation(_nothing):
+                if self.store is not None:
                     attributes = {"constituents": constituents}
-                    row = self.store.append(DESCRIBE, material, b"", attributes=attributes)
-                except StoreError:
-                    self._whole = not self._batching
-                    raise
-                memory.sequence = row.sequence
-            memory.describe(material, constituents)
-            self._whole = True
-            self.described += 1
+                    memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence
+                memory.describe(material, constituents)
+                self.described += 1
             self._snapshot_if_due()
 
     def retract(self, receipt: Receipt | int) -> None:
@@ -188,21 +187,19 @@ class Ledger:
         store.base()
         memory, sequences = self._memory, spans(record.sequence for record in taken)
         before = memory.pool, memory.exemplars, memory.tuned
-        self._whole = False
-        try:
-            for record in taken:
-                memory.withdraw(record)
-            memory.refill(store)
-            row = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
-        except StoreError:
+
+        def revert() -> None:
             for record in taken:
                 memory.put_back(record)
             memory.pool, memory.exemplars, memory.tuned = before
-            self._whole = not self._batching
-            raise
-        memory.sequence = row
-        memory.describe(material, None)
-        self._changed()
+
+        with self._mutation(revert):
+            for record in taken:
+                memory.withdraw(record)
+            memory.refill(store)
+            memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
+            memory.describe(material, None)
+            self._changed()
         self._snapshot_if_due()
 
     @contextmanager
@@ -235,7 +232,7 @@ class Ledger:
         path: str | os.PathLike[str],
         shared: Literal["once", "twice"],
         descriptions: Choice,
-        told: Callable[[str, int, int], object],
+        progress: Callable[[str, int, int], object],
     ) -> Merged:
         """As `TactileLearner.merge`."""
         with self.lock:
@@ -244,9 +241,8 @@ class Ledger:
                 raise InputError("a merge is a batch of its own: end the batch before it")
             with Store.open(path, mode="read") as source:
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
-                self._whole = False
-                with store.batch():
-                    added = incoming.append_to(store, memory, lambda done, of: told("merging", done, of))
+                with self._mutation(), store.batch():
+                    added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
             self._changed()
             self._snapshot_if_due()
         return Merged(added, incoming.shared, len(incoming.descriptions))
@@ -262,11 +258,10 @@ class Ledger:
                 self._snapshot()
                 base = memory.until(store, upto) if upto < memory.sequence else memory
                 arrays, attributes = base.to_arrays(base_at=upto)
-                self._whole = False  # should ctrl-C come when it is done already, what can be taken back is read anew
-                store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
-                memory.base = upto
-                memory.withdrawn = {sequence for sequence in memory.withdrawn if sequence > upto}
-                self._whole = True
+                with self._mutation():
+                    store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
+                    memory.base = upto
+                    memory.withdrawn = {sequence for sequence in memory.withdrawn if sequence > upto}
                 give_back_scratch()
             return Compacted(memory.base, before, sum(store.size().values()))
 
@@ -340,3 +335,7 @@ class Ledger:
             finally:
                 store.close()
                 give_back_scratch()
+
+
+def _nothing() -> None:
+    """The memory never had what the journal refused."""

@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.rows import unspanned
-from scroll_tactile.memory.state import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory, hear
+from scroll_tactile.memory.state import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory, apply_description
 from scroll_tactile.results import Receipt
 from store import Head, Record, Store
 
@@ -123,7 +123,7 @@ class Incoming:
         for material, one in self.descriptions.items():
             memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": one}).sequence
             memory.describe(material, one)
-        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._told(), start=1):
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != FELT:
                 memory.replay(ours.record(head.sequence), ours)
@@ -131,7 +131,7 @@ class Incoming:
             each(done, total)
         return sum(head.kind in (OBSERVE, FELT) for head in self.rows)
 
-    def _told(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+    def _rows_to_append(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         base = self.source.base()
         if base is not None:
             left_out = ("tuned", "descriptions")  # these come as rows of their own, where they do
@@ -162,10 +162,10 @@ def _standing(store: Store) -> list[Head]:
 def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
     """Their descriptions that are to come in."""
     base = theirs.base()
-    said = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
+    theirs_now = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
     for head in theirs.heads(0 if base is None else base.upto):
-        hear(said, head)
-    new = {name: one for name, one in sorted(said.items()) if repr(memory.descriptions.get(name)) != repr(one)}
+        apply_description(theirs_now, head)
+    new = {name: one for name, one in sorted(theirs_now.items()) if repr(memory.descriptions.get(name)) != repr(one)}
     differing = [name for name in new if name in memory.descriptions]
     if differing and choice == "same":
         name = differing[0]
@@ -183,8 +183,8 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
         mine, other = ours.identity.get(part), theirs.identity.get(part)
         if mine != other:
             raise MismatchError(
-                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is {_told_of(mine)}, "
-                f"there {_told_of(other)}. Merge memories of one sensor and one embedding"
+                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is {_formatted(mine)}, "
+                f"there {_formatted(other)}. Merge memories of one sensor and one embedding"
             )
     whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
     if whole and memory.exemplars is not None and ours.identity.get("exemplars") != theirs.identity.get("exemplars"):
@@ -194,7 +194,7 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
         )
 
 
-def _told_of(part: Any) -> str:
+def _formatted(part: Any) -> str:
     if isinstance(part, dict):
         fields = {name: value[:12] if name == "fingerprint" else value for name, value in part.items()}
         return ", ".join(f"{name} {value!r}" for name, value in fields.items() if value is not None)

@@ -11,9 +11,12 @@ import numpy.typing as npt
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 
-__all__ = ["Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
+__all__ = ["Added", "Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
 
 Codes = dict[Scale, npt.NDArray[np.int32]]
+Added = tuple[str, Codes]
+"""A material, and the codes of a touch of it by scale."""
+
 LARGE, BLOCK = 2**13, 2**10  # codes
 
 

@@ -31,8 +31,8 @@ __all__ = [
     "RETRACT",
     "Capacity",
     "Memory",
+    "apply_description",
     "give_back_scratch",
-    "hear",
 ]
 
 logger = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class Capacity:
 class Memory:
     """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
 
-    dimension: d. reading: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
+    dimension: d. plan: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
     tuned: f*, of the last fine-tune; None before one, or where what it was made from was taken back.
     tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
     excluded: of a base, the sequences up to it that had been taken back when it was made.
@@ -73,10 +73,10 @@ class Memory:
     saved: the last sequence that a generation is known to hold.
     """
 
-    def __init__(self, dimension: int, reading: WindowPlan, capacity: Capacity | None = None) -> None:
-        self.reading = reading
+    def __init__(self, dimension: int, plan: WindowPlan, capacity: Capacity | None = None) -> None:
+        self.plan = plan
         self.capacity = capacity or Capacity()
-        self.statistics = Statistics(dimension, reading.scales)
+        self.statistics = Statistics(dimension, plan.scales)
         self.pool = TouchSample()
         self.exemplars = self.capacity.pool()
         self.tuned: Tuned | None = None
@@ -117,7 +117,7 @@ class Memory:
         After the last row `refill` has to be called. Raises MismatchError for a row of a kind that this version
         does not know.
         """
-        hear(self.descriptions, record)
+        apply_description(self.descriptions, record)
         if record.kind == OBSERVE:
             codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
             self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
@@ -144,7 +144,7 @@ class Memory:
 
     def describe(self, material: str, constituents: Any) -> None:
         """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
-        _say(self.descriptions, material, constituents)
+        _describe(self.descriptions, material, constituents)
 
     def withdraw(self, record: Record) -> None:
         """Take an observation out of the sums; `refill` then mends the pools."""
@@ -201,7 +201,7 @@ class Memory:
 
     def _empty(self) -> Memory:
         """Another memory of the same making."""
-        return Memory(self.statistics.dimension, self.reading, self.capacity)
+        return Memory(self.statistics.dimension, self.plan, self.capacity)
 
     def _base_samples(self, store: Store) -> Memory:
         """A memory with pool and exemplars of the base, empty ones without a base."""
@@ -232,9 +232,9 @@ class Memory:
         return fresh
 
     def _touch(self, columns: int, codes: Codes) -> WindowSums:
-        stages = [self.reading.scored(columns, length) for length in self.reading.stages(columns)]
+        stages = [self.plan.scored(columns, length) for length in self.plan.stages(columns)]
         if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage behind all that a touch can reach
-            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.reading.milestones()) - len(stages))
+            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.plan.milestones()) - len(stages))
             stages += [*unreached, {scale: [0] for scale in NOISE}]
         return WindowSums.of(stages, codes)
 
@@ -277,22 +277,22 @@ class Memory:
         return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
 
     @classmethod
-    def load(cls, store: Store, dimension: int, reading: WindowPlan, capacity: Capacity | None = None) -> Memory:
+    def load(cls, store: Store, dimension: int, plan: WindowPlan, capacity: Capacity | None = None) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
             try:
-                memory = cls._loaded(store, dimension, reading, capacity)
+                memory = cls._loaded(store, dimension, plan, capacity)
             except CompactedError:  # a writer compacted it between two looks of this reader
                 continue
             # A generation that came between the looks may hold an f* from before the rows that were read.
             if store.newest == newest:
                 return memory
-        return cls._loaded(store, dimension, reading, capacity)
+        return cls._loaded(store, dimension, plan, capacity)
 
     @classmethod
-    def _loaded(cls, store: Store, dimension: int, reading: WindowPlan, capacity: Capacity | None) -> Memory:
-        memory = cls(dimension, reading, capacity)
+    def _loaded(cls, store: Store, dimension: int, plan: WindowPlan, capacity: Capacity | None) -> Memory:
+        memory = cls(dimension, plan, capacity)
         memory.base = store.compacted
         # Where no generation verifies the base's own error says what is lost; without one all rows are there.
         generation = store.latest() or store.base()
@@ -324,14 +324,14 @@ class Memory:
             if record.sequence > upto:
                 break
             if record.kind == RETRACT:
-                hear(memory.descriptions, record)
+                apply_description(memory.descriptions, record)
             elif record.sequence not in self.withdrawn:
                 memory.replay(record, store)
         memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
         return memory
 
     def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
-        names, scales = attributes["materials"], self.reading.scales
+        names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         self.pool = TouchSample.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
@@ -344,13 +344,13 @@ class Memory:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
 
 
-def hear(descriptions: dict[str, Description], row: Head | Record) -> None:
-    """Take in what a journal row says that materials are made of; one that is forgotten takes its description along."""
+def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:
+    """Apply a journal row to descriptions; a material that is forgotten takes its description along."""
     if row.kind in (DESCRIBE, RETRACT):  # of which a retraction has no constituents, and a label where all is forgotten
-        _say(descriptions, row.label, row.attributes.get("constituents"))
+        _describe(descriptions, row.label, row.attributes.get("constituents"))
 
 
-def _say(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
+def _describe(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
     if constituents is None:
         descriptions.pop(material, None)
     else:

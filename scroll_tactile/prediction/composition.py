@@ -51,7 +51,7 @@ class Composer:
         return self.model.stages[self._reached(columns)]
 
     def _reached(self, columns: int) -> int:
-        return min(len(self.model.reading.stages(columns)), len(self.stages)) - 1
+        return min(len(self.model.plan.stages(columns)), len(self.stages)) - 1
 
     def compose(
         self,

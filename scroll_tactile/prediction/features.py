@@ -1,8 +1,9 @@
-"""From a touch to what is learned of it and asked about it: codes, and mean features."""
+"""From a touch to its features: codes for what is observed, mean features for what is evaluated."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -18,6 +19,7 @@ from scroll_tactile.embeddings.protocol import (
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.prediction.filling import sampled_readings
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
@@ -25,58 +27,93 @@ from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 
-__all__ = ["Perception", "Readings"]
+__all__ = ["Encoded", "FeatureExtractor", "Readings"]
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
 
 
-class Perception:
-    """What a learner's sensor, embedding, windows and augmentation make of touches; it learns nothing.
+@dataclass(frozen=True)
+class Encoded:
+    """A touch as it is evaluated.
+
+    image: (C, T) in [-1, 1], dead channels filled in where the embedding asks for that. means: scale → mean features in
+    the codes' unit, (d,). noisy: whether it is read as felt through noise. seconds: how much touch it is.
+    """
+
+    image: Image
+    means: dict[Scale, npt.NDArray[np.float64]]
+    noisy: bool
+    seconds: float
+
+    @property
+    def columns(self) -> int:
+        """T, the columns of the image."""
+        return self.image.shape[1]
+
+
+class FeatureExtractor:
+    """What a sensor, an embedding, a plan of windows and an augmentation make of touches; it learns nothing.
 
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
     """
 
-    def __init__(
-        self, sensor: Sensor, embedding: Embedding, reading: WindowPlan, augmentation: Augmented | None
-    ) -> None:
+    def __init__(self, sensor: Sensor, embedding: Embedding, plan: WindowPlan, augmentation: Augmented | None) -> None:
         self._sensor = sensor
         self._embedding = embedding
-        self._reading = reading
+        self._plan = plan
         self._augmentation = augmentation
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
 
-    def felt(self, readings: Readings) -> Stream:
-        """What is read of readings: a sound stream; of a camera's, the frames in contact.
+    def stream(self, readings: Readings) -> Stream:
+        """The sound stream of some readings; of a camera's, the frames in contact.
 
         Raises StreamError: see `validate` and `pressed`.
         """
         return pressed(validate(readings, self._sensor), self._rest)
 
-    def image(self, felt: Stream) -> Image:
-        """The tactile image of what was `felt`."""
-        return image_of(felt, self._rest)
+    def image(self, stream: Stream) -> Image:
+        """The tactile image of a `stream`."""
+        return image_of(stream, self._rest)
 
     def codes(self, image: Image, key: bytes) -> Codes:
         """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
 
-        The touch's own come first: the pool finds them by their place. Copies are no longer than the touch, and so
+        The touch's own come first: the sample finds them by their place. Copies are no longer than the touch, and so
         have no scale that it has not.
         """
         copies, noisy = self._augmentation.copies_of(image, key) if self._augmentation is not None else ([], [])
-        own, *others = [self.features(one) for one in (image, *copies, *noisy * (not self._reading.noisy))]
-        read = {scale: [rows, *(one[scale] for one in others if scale in one)] for scale, rows in own.items()}
-        if self._reading.noisy and noisy:
-            read |= {scale: [rows] for scale, rows in zip(NOISE, self._noisy_features(noisy), strict=True)}
-        if self._reading.filled:
-            read[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
-        return {scale: to_codes(np.concatenate(rows), self._embedding.bound) for scale, rows in sorted(read.items())}
+        own, *others = [self.features(picture) for picture in (image, *copies, *noisy * (not self._plan.noisy))]
+        rows = {scale: [first, *(other[scale] for other in others if scale in other)] for scale, first in own.items()}
+        if self._plan.noisy and noisy:
+            rows |= {scale: [features] for scale, features in zip(NOISE, self._noisy_features(noisy), strict=True)}
+        if self._plan.filled:
+            rows[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
+        return {scale: to_codes(np.concatenate(rows[scale]), self._embedding.bound) for scale in sorted(rows)}
+
+    def encode(
+        self, stream: Stream, model: Model, needed: Callable[[int], Sequence[Scale]]
+    ) -> Encoded:
+        """What is evaluated of a `stream`: its part within the longest touch that was learned.
+
+        model: of the memory; it knows that length, whether noisy touches were learned, and how dead channels are
+        filled in. needed: the scales to be read of a touch of so many columns.
+        """
+        stream = self._within(stream, model.longest)
+        image = self.image(stream)
+        if model.noisy is not None and cast(NoiseEmbedding, self._embedding).is_noisy(image):
+            sets = self._noisy_features([image])
+            means = {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
+            return Encoded(image, means, True, stream.seconds)
+        if model.filling is not None:
+            image = model.filling.fill(image)
+        return Encoded(image, self.means(image, needed(image.shape[1])), False, stream.seconds)
 
     def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale."""
-        places = self._reading.places(image.shape[1])
-        # Not rounded: the grid is for sums, and would only add its error to what is asked about.
+        places = self._plan.places(image.shape[1])
+        # Not rounded: the grid is for sums, and would only add its error to what is evaluated.
         return {
             scale: in_units(rows[places[scale]], self._embedding.bound).mean(axis=0)
             for scale, rows in self.features(image, scales).items()
@@ -84,8 +121,8 @@ class Perception:
 
     def features(self, image: Image, scales: Sequence[Scale] | None = None) -> dict[Scale, npt.NDArray[np.floating]]:
         """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
-        windows = self._reading.extent(image.shape[1])
-        narrowest = self._reading.widths[0]
+        windows = self._plan.extent(image.shape[1])
+        narrowest = self._plan.widths[0]
         if scales is not None:
             wanted = {scale.width for scale in scales}
             windows = {width: windows[width] for width in windows if width in wanted}
@@ -96,29 +133,20 @@ class Perception:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
                 )
-        read = {Scale("window", width): features for width, features in embedded.items()}
-        if self._reading.beginning and narrowest in embedded:
-            read = {BEGINNING: embedded[narrowest][:1], **read}
-        return read
+        by_scale = {Scale("window", width): features for width, features in embedded.items()}
+        if self._plan.beginning and narrowest in embedded:
+            by_scale = {BEGINNING: embedded[narrowest][:1], **by_scale}
+        return by_scale
 
-    def as_far_as(self, felt: Stream, longest: int) -> Stream:
-        """The part of a touch that lies within the longest one learned, of so many columns.
+    def _within(self, stream: Stream, longest: int) -> Stream:
+        """The part of a touch that lies within the longest one learned.
 
-        What comes later was never felt of any material, and the later part of a slide differs: learned from 2 s of
+        What comes later was never observed of any material, and the later part of a slide differs: learned from 2 s of
         BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
         """
-        frame = self._reading.widths[0] if self._sensor.camera else 1
+        frame = self._plan.widths[0] if self._sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column
-        return felt.first((longest // frame + before) / self._sensor.rate)
-
-    def is_noisy(self, image: Image) -> bool:
-        """Whether a touch was felt through noise, by an embedding that tells; a function of the touch alone."""
-        return self._reading.noisy and cast(NoiseEmbedding, self._embedding).is_noisy(image)
-
-    def noisy_means(self, image: Image) -> dict[Scale, npt.NDArray[np.float64]]:
-        """The features of a touch felt through noise, in the codes' unit, (d,) by scale."""
-        sets = self._noisy_features([image])
-        return {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
+        return stream.first((longest // frame + before) / self._sensor.rate)
 
     def _noisy_features(self, images: Sequence[Image]) -> npt.NDArray[np.floating]:
         return cast(NoiseEmbedding, self._embedding).embed_noisy(images)

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, RecursiveReadout, WoodburyReadout
@@ -21,13 +22,10 @@ from scroll_tactile.signals.windows import CHANNELS, Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Added", "IncrementalModel", "SolverName"]
+__all__ = ["IncrementalModel", "SolverName"]
 
 SolverName = Literal["exact", "recursive"]
 READOUTS: dict[SolverName, type[RecursiveReadout]] = {"exact": WoodburyReadout, "recursive": RecursiveLeastSquares}
-
-Added = tuple[str, dict[Scale, npt.NDArray[np.int32]]]
-"""A material, and the codes of a touch of it by scale."""
 
 
 class IncrementalModel:
@@ -56,7 +54,7 @@ class IncrementalModel:
         if grown or any(statistics.names(scale) != self._names(scale) for scale in judging):
             return False
         with one_thread():
-            self.model = replace(self.model, selections=self._updated(statistics, added))
+            self.model = replace(self.model, selections=self._updated(statistics, added), longest=statistics.longest)
         return True
 
     def _updated(self, statistics: Statistics, added: Sequence[Added]) -> dict[Scale, Selection]:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.prediction.filling import Filling
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.shrinkage import PENALTIES, Selection, select
@@ -31,27 +32,31 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Model:
-    """names: the materials. selections: scale → its readout. stages: for each, the scales that judge there.
+    """Everything that predictions need of one state of a memory, so that each answer rests on one state.
 
-    noisy: of touches felt through noise; None where none were learned.
+    names: the materials. selections: scale → its readout. stages: for each, the scales that judge there. longest: the
+    columns of the longest touch that was learned. noisy: of touches felt through noise; None where none were learned.
+    filling: of dead channels; None where none are filled in.
     """
 
     kind: ReadoutName
     names: list[str]
-    reading: WindowPlan
+    plan: WindowPlan
     stages: list[list[Scale]]
     selections: dict[Scale, Selection]
     calibrations: list[Calibration]
+    longest: int
     noisy: Calibration | None = None
+    filling: Filling | None = None
 
     @classmethod
-    def of(cls, memory: Memory, kind: ReadoutName) -> Model:
-        """Fit the readouts of a memory and calibrate them."""
+    def of(cls, memory: Memory, kind: ReadoutName, filling: Filling | None = None) -> Model:
+        """Fit the readouts of a memory and calibrate them; filling: of its dead channels, see `Filling.of`."""
         statistics = memory.statistics
         scales = statistics.scales
-        stages = [memory.reading.judging(length) for length in memory.reading.milestones()]
+        stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
         with one_thread():
-            penalties = memory.reading.penalties or PENALTIES
+            penalties = memory.plan.penalties or PENALTIES
             chosen = {scale: select(statistics, scale, kind, penalties) for scale in scales if scale != CHANNELS}
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
             calibrations = calibrate(memory.pool, stages, selections, kind)
@@ -59,20 +64,21 @@ class Model:
             if all(scale in selections for scale in NOISE):
                 noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISE], kind)
         give_back_scratch()
-        return cls(kind, list(statistics.materials), memory.reading, stages, selections, calibrations, noisy)
+        names, longest = list(statistics.materials), statistics.longest
+        return cls(kind, names, memory.plan, stages, selections, calibrations, longest, noisy, filling)
 
     @property
     def scales(self) -> tuple[int, ...]:
         """The widths of windows, ascending."""
-        return self.reading.widths
+        return self.plan.widths
 
     def is_last(self, columns: int) -> bool:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
-        return min(len(self.reading.stages(columns)), len(self.calibrations)) == len(self.stages)
+        return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)
 
     def needed(self, candidates: Sequence[str], columns: int) -> list[Scale]:
         """The scales whose windows judging these candidates for a touch of so many columns takes."""
-        decided = self._decided(candidates, len(self.reading.stages(columns)))
+        decided = self._decided(candidates, len(self.plan.stages(columns)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]})
 
     def judge(
@@ -81,17 +87,21 @@ class Model:
         means: Mapping[Scale, FloatArray],
         columns: int,
         tuned: Mapping[str, float] | None = None,
+        *,
+        noisy: bool = False,
     ) -> Judgement:
         """Weigh the candidates for a touch.
 
-        means: for each scale that is `needed` the touch's mean features in the codes' unit, (d,). columns: felt so far.
-        tuned: logits of f*, by material, in place of the last stage's scores.
+        means: for each scale that is `needed`, or of NOISE where the touch is `noisy`, its mean features in the codes'
+        unit, (d,). columns: observed so far. tuned: logits of f*, by material, in place of the last stage's scores.
 
-        Materials that were felt at fewer scales are weighed against all others at the stage that they share; what
+        Materials that were observed at fewer scales are weighed against all others at the stage that they share; what
         these leave over is shared out among the others at the finer stages.
         """
-        reached = len(self.reading.stages(columns))
         z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
+        if noisy:
+            return self._judge_noisy(candidates, z)
+        reached = len(self.plan.stages(columns))
         probability, mass = np.ones(len(candidates)), 1.0
         decided = self._decided(candidates, reached)
         for at, (stage, members) in enumerate(decided):
@@ -110,10 +120,8 @@ class Model:
         distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
         return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
 
-    def judge_noisy(self, candidates: Sequence[str], means: Mapping[Scale, FloatArray]) -> Judgement:
-        """Weigh the candidates for a touch felt through noise; means: scale → its features in the codes' unit, (d,)."""
+    def _judge_noisy(self, candidates: Sequence[str], z: Mapping[Scale, FloatArray]) -> Judgement:
         assert self.noisy is not None
-        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
         logits = self._weighted(NOISE, self.noisy, z, candidates)
         chances = np.exp(logits - logits.max())
         novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISE]))
@@ -121,15 +129,15 @@ class Model:
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
-        groups = [self._felt_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
+        groups = [self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
         return [
             (stage, members)
             for stage, members in enumerate(groups)
             if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
         ]
 
-    def _felt_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
-        """The places of the candidates that were felt at all of these scales."""
+    def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
+        """The places of the candidates that were observed at all of these scales."""
         known = [self.selections[scale].places for scale in scales]
         return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
 

@@ -75,7 +75,7 @@ def _shape(sensor: Sensor) -> tuple[int, int]:
 
 def _scales(model: Model, columns: int) -> tuple[int, list[Scale]]:
     """The stage that a touch of so many columns is judged at, and its scales."""
-    stage = min(len(model.reading.stages(columns)), len(model.calibrations)) - 1
+    stage = min(len(model.plan.stages(columns)), len(model.calibrations)) - 1
     scales = list(model.stages[stage])
     for name in model.names:
         if any(name not in model.selections[scale].places for scale in scales):
@@ -91,8 +91,8 @@ def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, i
     net = embedding.network().net
     quick, last = folded(net, embedding.stages[-1]), embedding.stages[-1]
     planes = _planes(graph, shape[1], read)
-    windows = model.reading.extent(read)
-    places = model.reading.places(read)
+    windows = model.plan.extent(read)
+    places = model.plan.places(read)
     whole: list[str] = []
     features = {}
     for scale in _scales(model, read)[1]:

@@ -1,4 +1,4 @@
-"""Augmented observation: a touch is learned together with copies of it as they would have been felt otherwise.
+"""Augmented observation: a touch is learned together with copies of it as they would have been observed otherwise.
 
 The copies are drawn with a generator that is seeded by the touch's content hash, so that what is learned of a touch
 is a function of the touch: in any order, on any machine, at any time the same bits. Only the four operations that
@@ -8,13 +8,14 @@ IEEE 754 rounds correctly are used, and no power or logarithm, whose last bit di
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, FiniteFloat
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.settings import FrozenModel
 from scroll_tactile.signals.augmentation import Image, crop, resize
 
 __all__ = ["Augmented", "hiss", "silence", "wander"]
@@ -33,7 +34,7 @@ def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
 
 
 def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
-    """The touch felt with broken wires: a `share` of the channels, rounded, reads the low end of the range throughout.
+    """The touch felt with dead channels: a `share` of the channels, rounded, reads the low end of the range throughout.
 
     image: float32 of shape (C, T) in [-1, 1]. Which channels are broken is drawn.
     """
@@ -56,8 +57,11 @@ def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -
     return wandered
 
 
-@dataclass(frozen=True)
-class Augmented:
+_Count = Annotated[int, Field(ge=0)]
+_Strength = Annotated[FiniteFloat, Field(ge=0, strict=False)]
+
+
+class Augmented(FrozenModel):
     """Which copies a touch is observed with.
 
     copies: how many that differ in all but noise, the same for every touch, so that each counts alike. speed: the most
@@ -76,33 +80,28 @@ class Augmented:
     Raises InputError for strengths that cannot be.
     """
 
-    copies: int = 4
-    speed: float = 2.0
-    dead: float = 0.0
-    offset: float = 0.0
-    gain: float = 0.0
-    noisy: int = 0
-    noise: float = 1.0
+    copies: _Count = 4
+    speed: Annotated[FiniteFloat, Field(ge=1, strict=False)] = 2.0
+    dead: Annotated[FiniteFloat, Field(ge=0, lt=1, strict=False)] = 0.0
+    offset: _Strength = 0.0
+    gain: _Strength = 0.0
+    noisy: _Count = 0
+    noise: _Strength = 1.0
     thinned: bool = False
 
-    def __post_init__(self) -> None:
-        counts = (self.copies, self.noisy)
-        counted = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in counts)
-        strengths = (self.speed - 1, self.dead, self.offset, self.gain, self.noise)
-        possible = all(math.isfinite(one) and one >= 0 for one in strengths) and self.dead < 1
-        thinnable = self.speed >= 2 and self.copies > 0
-        if not counted or not possible or not sum(counts) or (self.thinned and not thinnable):
-            raise InputError(
-                f"expected 1 copy or more in all, a speed of 1 or more, dead in [0, 1), offset, gain and noise of 0 or "
-                f"more, and to be thinned a copy and a speed of 2 or more; came {self}"
-            )
+    def model_post_init(self, context: Any) -> None:
+        """Refuse what would copy nothing, or thin nothing."""
+        if not self.copies + self.noisy:
+            raise InputError(f"expected 1 copy or more in all; came {self}")
+        if self.thinned and (self.speed < 2 or not self.copies):
+            raise InputError(f"expected, to be thinned, a copy and a speed of 2 or more; came {self}")
 
     def to_json(self) -> dict[str, Any]:
         """All of it in JSON's types, as a memory keeps it.
 
         `thinned` only where it is asked for: memories from before it was there are of the same making as without it.
         """
-        return {name: one for name, one in asdict(self).items() if name != "thinned" or one}
+        return {name: value for name, value in self.model_dump(mode="json").items() if name != "thinned" or value}
 
     def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> tuple[list[Image], list[Image]]:
         """The copies of a touch and its noisy copies, each float32 of shape (C, T') in [-1, 1], T' ≤ T.

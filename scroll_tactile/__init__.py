@@ -15,13 +15,13 @@ from scroll_tactile.embeddings import (
     ModuleEmbedding,
     Robust,
     Vision,
-    check_embedding,
 )
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Composition, Constituent, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.testing import check_embedding
 
 __all__ = [
     "Augmented",

@@ -22,9 +22,8 @@ from examples.benchmarks.timing import circumstances, take_turns
 from scroll_tactile import sensors
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings.kernels import one_torch_thread
 from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime
+from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime, one_torch_thread
 from scroll_tactile.embeddings.vision import Vision, to_planes
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.learner import TactileLearner
@@ -67,8 +66,6 @@ WAYS = [
     _Way("torch", "bfloat16"),
     _Way("onnxruntime", "float32"),
     _Way("onnxruntime", "float32", ALL),
-    _Way("openvino", "float32"),
-    _Way("openvino", "bfloat16"),
 ]
 
 
@@ -87,7 +84,7 @@ def run_vision(
     """
     net = ResNet.random(seed) if weights is None else load_network(weights)
     state = net.state_dict()
-    here = [name for name in ("onnxruntime", "openvino") if find_spec(name) and find_spec("onnx")]
+    here = [name for name in ("onnxruntime",) if find_spec(name) and find_spec("onnx")]
     ways = [way for way in WAYS if way.runtime in ("torch", *here)]
     records: list[Record] = []
     for sensor in (sensors.BIOTAC, sensors.ROBOSKIN):
@@ -141,8 +138,6 @@ def _bare(net: ResNet, planes: torch.Tensor, here: list[str]) -> dict[str, Calla
     made: dict[str, Run] = {}
     if "onnxruntime" in here:
         made["bare session, onnxruntime, one thread"] = make_runtime("onnxruntime", net, 4)
-    if "openvino" in here:
-        made["bare request, openvino, one thread"] = make_runtime("openvino", net, 4)
 
     def forward() -> None:
         with torch.inference_mode():

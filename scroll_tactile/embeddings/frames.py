@@ -1,4 +1,11 @@
-"""The embedding for cameras: of each frame its light and its surface, or what a trained network sees of that."""
+"""The embedding for cameras: of each frame its light and its surface, or what a trained network sees of that.
+
+The lamps beside the gel colour a slope by its direction, so the colours show the shape of what is pressed into it, and
+their gradients its relief (Yuan, Dong and Adelson 2017, GelSight). The light is averaged over a few cells of the frame.
+Gradients are taken at five scales, each the last one's sums over 2 × 2 pixels, and counted: how often each direction
+occurs in each strength (after histograms of oriented gradients, Dalal and Triggs 2005), and how often the surface is
+bent so much, up or down. All of it is counts and sums of integers: the same bits on every machine.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +13,50 @@ import hashlib
 import os
 from collections.abc import Mapping
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch.nn import functional
 
 from scroll_tactile.embeddings.banks import LEVELS, to_levels
+from scroll_tactile.embeddings.kernels import angles
 from scroll_tactile.embeddings.protocol import Capabilities, canary
+from scroll_tactile.embeddings.registry import picture_to_json
 from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
-from scroll_tactile.embeddings.surfaces import COLOURS, LIGHT, SURFACE, light, surface
-from scroll_tactile.embeddings.vision import to_planes
-from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.contact import Rest
 
-__all__ = ["Frames"]
+if TYPE_CHECKING:
+    import torch
 
+    from scroll_tactile.embeddings.resnet import ResNet
+
+__all__ = ["COLOURS", "LIGHT", "SURFACE", "Frames", "light", "surface"]
+
+IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
 
-STAGES = (1, 2, 3)  # of the network
+NETWORK_STAGES = (1, 2, 3)
 # Columns of a frame in the standard deviation of the blur that is taken off before the network sees it.
 SMOOTH = 20
 GAIN = 4.0  # relief is faint: a few levels of 255
 BLURRED = 3  # standard deviations that the blur reaches
 REACH = 1.2  # between two frames' counts, at which cosines tell them apart: about the usual distance
 STEPS = 2**12  # of a cosine
+
+COLOURS = 3
+SCALES = 5
+OCTANTS = 8
+STRENGTHS = (2, 4, 8, 16, 32)  # of a gradient or a curvature, in 1/255 of the range
+STEP = 2 * LEVELS / 255  # levels in 1/255 of the range
+CELLS = (6, 8)  # rows and columns that colours are averaged over
+
+_HISTOGRAM = OCTANTS * (len(STRENGTHS) + 1)
+_CURVATURES = 2 * 2 * len(STRENGTHS)  # of two kinds, up and down
+LIGHT = COLOURS * CELLS[0] * CELLS[1]
+"""The number of features of the light."""
+SURFACE = COLOURS * SCALES * (_HISTOGRAM + _CURVATURES)
+"""The number of features of slopes and bumps."""
 
 
 class Frames:
@@ -42,7 +67,7 @@ class Frames:
         every frame counts, and is read as it is.
     weights: of a trained ResNet, as for `Vision`. The relief is read by its stages 1 to 3, each one's mean and standard
         deviation over the frame scaled to length 1: 1040 features, and `Vision`'s promise: the same bytes on one
-        machine. Without: by counts of slopes and bumps (see `embeddings.surfaces`), 1164 features, the same bytes on
+        machine. Without: by counts of slopes and bumps (see above), 1164 features, the same bytes on
         any machine.
 
     cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007) of the counts, without the light, take
@@ -72,7 +97,8 @@ class Frames:
         seed: int = 1,
         runtime: RuntimeName = "torch",
     ) -> None:
-        whole = all(isinstance(one, int) and not isinstance(one, bool) and one >= 0 for one in (cosines, seed))
+        numbers = (cosines, seed)
+        whole = all(isinstance(number, int) and not isinstance(number, bool) and number >= 0 for number in numbers)
         if not whole or (cosines and weights is not None):
             raise InputError(
                 "expected cosines and a seed as whole numbers of 0 or more, and no weights beside cosines; came "
@@ -85,29 +111,46 @@ class Frames:
         self.cosines = cosines
         self.seed = seed
         self.runtime: RuntimeName = runtime
-        self._net = None if weights is None else load_network(weights)
-        self._source = "weights" if isinstance(weights, Mapping) else repr(weights and os.fspath(weights))
+        self._net: ResNet | None = None
+        self._source: str | None = None
         self.dimension = cosines or LIGHT + SURFACE
-        if self._net is not None:
-            self._net.requires_grad_(False)
-            self._run = make_runtime(runtime, self._net, STAGES[-1])
-            self.dimension = LIGHT + 2 * sum(self._net.widths[stage] for stage in STAGES)
+        if weights is not None:
+            from scroll_tactile.embeddings.weights import load_network, source_name
+
+            self._source = source_name(weights)
+            self._net = load_network(weights).requires_grad_(False)
+            self._run = make_runtime(runtime, self._net, NETWORK_STAGES[-1])
+            self.dimension = LIGHT + 2 * sum(self._net.widths[stage] for stage in NETWORK_STAGES)
 
     def __repr__(self) -> str:
         rest = "<picture>" if isinstance(self.rest, np.ndarray) else repr(self.rest)
         waves = f", cosines={self.cosines}, seed={self.seed}" if self.cosines else ""
-        return f"Frames({self._source}, rest={rest}{waves})"
+        weights = None if self._net is None else self._source or "<state dict>"
+        return f"Frames({weights!r}, rest={rest}{waves})"
+
+    def configuration(self) -> dict[str, Any]:
+        """What makes an equal one, in JSON's types; see `embeddings.registry`."""
+        weights = None
+        if self._net is not None:
+            from scroll_tactile.embeddings.weights import digest_of
+
+            weights = {"name": self._source, "sha256": digest_of(self._net)}
+        rest = picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
+        settings = {"cosines": self.cosines, "seed": self.seed, "runtime": self.runtime}
+        return {"kind": "frames", "weights": weights, "rest": rest, **settings}
 
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the resting image, the network and its runtime, and of the features of three fixed images."""
-        digest = hashlib.sha256(f"frames 1 {LEVELS} {SMOOTH} {GAIN} {STAGES} {self.cosines} {self.seed}".encode())
+        digest = hashlib.sha256(
+            f"frames 1 {LEVELS} {SMOOTH} {GAIN} {NETWORK_STAGES} {self.cosines} {self.seed}".encode()
+        )
         digest.update(self.rest.tobytes() if isinstance(self.rest, np.ndarray) else repr(self.rest).encode())
         if self._net is not None:
+            from scroll_tactile.embeddings.weights import hash_tensors
+
             digest.update(f"{self._net.depth} {self._net.stem} {self.runtime} {version_of(self.runtime)}".encode())
-            for name, tensor in sorted(self._net.state_dict().items()):
-                digest.update(f"\n{name} {tuple(tensor.shape)}".encode())
-                digest.update(tensor.contiguous().numpy().tobytes())
+            hash_tensors(digest, self._net)
         for channels, columns in ((3, 1), (24, 9), (120, 64)):
             digest.update(self.embed(canary(channels, columns)).astype("<f4").tobytes())
         return digest.hexdigest()
@@ -130,36 +173,48 @@ class Frames:
 
     @cached_property
     def _waves(self) -> tuple[torch.Tensor, torch.Tensor]:
+        import torch
+
         rng = np.random.default_rng([self.seed, self.cosines])
         weights = rng.standard_normal((self.cosines, SURFACE)) / REACH
         return torch.from_numpy(weights), torch.from_numpy(rng.uniform(0, 2 * np.pi, self.cosines))
 
     def _waved(self, counts: FloatArray) -> FloatArray:
         """Cosines of counts, rounded so coarsely that a machine's own last bits rarely matter."""
+        import torch
+
         weights, phases = self._waves
         with steady():
             waves = torch.cos(weights @ torch.from_numpy(counts).double() + phases)
-            told: FloatArray = (torch.round(waves * STEPS) / STEPS).float().numpy()
-            return told
+            rounded: FloatArray = (torch.round(waves * STEPS) / STEPS).float().numpy()
+            return rounded
 
     def _seen(self, planes: npt.NDArray[np.float32]) -> FloatArray:
         """What the network sees of the relief: of each stage the mean and the spread of its maps, of length 1 each."""
+        import torch
+        from torch.nn import functional
+
+        from scroll_tactile.embeddings.vision import to_planes
+
         with steady():
             shown = torch.tensor(planes[None], dtype=torch.float32)
             shown = (GAIN * (shown - _blurred(shown, max(1, planes.shape[2] // SMOOTH)))).clamp(-1, 1)
             maps = self._run(to_planes(shown).numpy())
             parts = []
-            for stage in STAGES:
+            for stage in NETWORK_STAGES:
                 found = torch.from_numpy(maps[stage])[0].flatten(1)
                 parts += [found.mean(dim=1), found.std(dim=1, correction=0)]
-            told = torch.cat([functional.normalize(part, dim=0) for part in parts])
+            normalised = torch.cat([functional.normalize(part, dim=0) for part in parts])
             # Rounding may pass 1 by a unit in the last place.
-            features: FloatArray = np.minimum(told.numpy(), np.float32(1))
+            features: FloatArray = np.minimum(normalised.numpy(), np.float32(1))
             return features
 
 
 def _blurred(planes: torch.Tensor, deviation: int) -> torch.Tensor:
     """Planes (1, 3, H, W) less what is finer than a Gaussian; beyond its edges a plane goes on as at them."""
+    import torch
+    from torch.nn import functional
+
     reach = BLURRED * deviation
     taps = torch.exp(-torch.arange(-reach, reach + 1).square() / (2 * deviation**2))
     taps = (taps / taps.sum()).expand(COLOURS, 1, 1, -1)
@@ -183,3 +238,70 @@ def _checked(rest: Rest | npt.ArrayLike) -> Rest:
         )
     picture.setflags(write=False)
     return picture
+
+
+def light(frame: IntArray) -> FloatArray:
+    """Mean colours of 6 × 8 cells, in [-1, 1], float32 of shape (LIGHT,), of a frame of levels in ±LEVELS, (3, H, W).
+
+    Of a frame with fewer rows or columns than cells some pixels are in several of them.
+    """
+    (top, under), (left, after) = (_edges(size, count) for size, count in zip(frame.shape[1:], CELLS, strict=True))
+    total = np.pad(frame.cumsum(axis=1).cumsum(axis=2), ((0, 0), (1, 0), (1, 0)))
+    rows = total[:, under] - total[:, top]
+    sums = rows[:, :, after] - rows[:, :, left]
+    means: FloatArray = (sums / (LEVELS * np.outer(under - top, after - left))).astype(np.float32).ravel()
+    return means
+
+
+def _edges(size: int, count: int) -> tuple[IntArray, IntArray]:
+    first = np.arange(count) * size // count
+    return first, np.maximum(first + 1, (np.arange(count) + 1) * size // count)
+
+
+def surface(frame: IntArray) -> FloatArray:
+    """How sloped and bent it is, in [0, 1], float32 of shape (SURFACE,), of a frame of levels in ±LEVELS, (3, H, W).
+
+    A frame may be of any size, down to a single pixel: it goes on beyond its edges as at them.
+    """
+    parts: list[FloatArray] = []
+    sums = frame
+    for scale in range(SCALES):
+        if scale:
+            sums = _halved(sums)
+        parts += _at_scale(sums, STEP * 4**scale)
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def _at_scale(sums: IntArray, step: float) -> list[FloatArray]:
+    """Counts of one scale; step: what a difference of 1/255 of the range is in these sums."""
+    wide = np.pad(sums, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    up, down, left, right = wide[:, :-2, 1:-1], wide[:, 2:, 1:-1], wide[:, 1:-1, :-2], wide[:, 1:-1, 2:]
+    bump = 4 * sums - up - down - left - right
+    saddle = wide[:, 2:, 2:] + wide[:, :-2, :-2] - wide[:, 2:, :-2] - wide[:, :-2, 2:]
+    edges = [int(step * strength) for strength in STRENGTHS]
+    return [_directions(right - left, down - up, edges), _curvatures(bump, edges), _curvatures(saddle, edges)]
+
+
+def _directions(along: IntArray, across: IntArray, edges: list[int]) -> FloatArray:
+    """How often each octant of directions occurs in each strength: (3, _HISTOGRAM)."""
+    squared = along * along + across * across
+    octant = (along < 0) * 4 + (across < 0) * 2 + (np.abs(along) < np.abs(across))
+    strength = sum((squared > edge * edge).astype(np.int64) for edge in edges)
+    kind = (octant * (len(edges) + 1) + strength).reshape(COLOURS, -1)
+    counts = np.stack([np.bincount(plane, minlength=_HISTOGRAM) for plane in kind])
+    shares: FloatArray = angles(kind.shape[1])[counts]
+    return shares
+
+
+def _curvatures(bent: IntArray, edges: list[int]) -> FloatArray:
+    """How often the surface is bent by more than each edge, up and down: (2 · edges, 3)."""
+    counts = [np.count_nonzero(beyond, axis=(1, 2)) for edge in edges for beyond in (bent > edge, bent < -edge)]
+    shares: FloatArray = angles(bent[0].size)[np.stack(counts)]
+    return shares
+
+
+def _halved(sums: IntArray) -> IntArray:
+    """Sums over 2 × 2 pixels; of an odd row or column at the end, twice itself."""
+    padded = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, sums.shape[2] % 2)), mode="edge")
+    halved: IntArray = padded[:, ::2, ::2] + padded[:, 1::2, ::2] + padded[:, ::2, 1::2] + padded[:, 1::2, 1::2]
+    return halved

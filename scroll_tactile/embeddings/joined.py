@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows, is_embedding
+from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import InputError
 
 __all__ = ["Joined"]
@@ -33,7 +35,7 @@ class Joined:
     def __init__(self, *embeddings: Embedding) -> None:
         if len(embeddings) < 2:
             raise InputError(f"expected at least two embeddings to join; came {len(embeddings)}")
-        strange = [one for one in embeddings if not isinstance(one, Embedding)]
+        strange = [part for part in embeddings if not is_embedding(part)]
         if strange:
             raise InputError(f"expected embeddings, such as Joined(Kernels(), Vision()); came {strange[0]!r:.100}")
         self.parts: tuple[Embedding, ...] = embeddings
@@ -61,6 +63,11 @@ class Joined:
     def __repr__(self) -> str:
         return f"Joined({', '.join(map(repr, self.parts))})"
 
+    def configuration(self) -> dict[str, Any] | None:
+        """What makes an equal one, in JSON's types; None with a part that does not ship with scroll-tactile."""
+        parts = [configuration_of(part) for part in self.parts]
+        return None if None in parts else {"kind": "joined", "parts": parts}
+
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the parts' fingerprints, bounds and dimensions, in their order."""
@@ -80,7 +87,7 @@ class Joined:
         embedded = [embed_windows(part, image, windows) for part in self.parts]
         return {
             width: np.concatenate(
-                [np.divide(one[width], part.bound) for one, part in zip(embedded, self.parts, strict=True)], axis=1
+                [np.divide(rows[width], part.bound) for rows, part in zip(embedded, self.parts, strict=True)], axis=1
             )
             for width in windows
         }

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from scroll_tactile.embeddings.banks import LEVELS, TAPS, Bank, bank, bank_size, to_levels
-from scroll_tactile.embeddings.levels import triangle_features, window_statistics
+from scroll_tactile.embeddings.banks import (
+    LEVELS,
+    TAPS,
+    Bank,
+    bank,
+    bank_size,
+    to_levels,
+    triangle_features,
+    window_statistics,
+)
 from scroll_tactile.embeddings.protocol import Capabilities, canary
+from scroll_tactile.embeddings.runtimes import one_torch_thread
+from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
 
-__all__ = ["Kernels"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["LEAST_FEATURES", "MOST_FEATURES", "Kernels", "angles"]
 
 SHORTEST = 12  # columns; a shorter image is continued by its mirror image
 SHORT = 32  # columns
@@ -25,7 +37,8 @@ SHORT = 32  # columns
 # without in 64 %. Wider windows have none: there they cost a tenth of a point.
 SHARE_IN_SHORT = 0.3
 REACH = 0.6  # of a window: a dilated kernel that spans more has too few positions left
-MOST_FEATURES = 8192  # the shortest windows have one dilation, whose bank has 378 kernels of 24 thresholds
+LEAST_FEATURES: Final = 64
+MOST_FEATURES: Final = 8192  # the shortest windows have one dilation, whose bank has 378 kernels of 24 thresholds
 DEFAULT_SEED = 1  # measured with the seeds 0 to 5: BioTac-20 98.6 to 99.2 %, RoboSkin-20 97.6 to 98.3 %
 MOST_COLUMNS = 2048  # of a whole image convolved at once; longer ones are read window by window
 
@@ -48,6 +61,8 @@ class Kernels:
     seed: of the kernels; no seed was better on both sensors than the default, the worst lay half a point below it.
     dimension: d, the number of features, 64 to 8192.
 
+    Raises InputError for a dimension or a seed out of range, and for an image that has not two axes or is empty.
+
     >>> import numpy as np
     >>> Kernels(dimension=1008).embed(np.zeros((19, 400), dtype=np.float32)).shape
     (1008,)
@@ -58,15 +73,19 @@ class Kernels:
     capabilities = Capabilities(embeds_windows=True)
 
     def __init__(self, *, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
-        if not 64 <= dimension <= MOST_FEATURES:
-            raise ValueError(f"dimension must lie between 64 and {MOST_FEATURES}; came {dimension}")
+        if not LEAST_FEATURES <= dimension <= MOST_FEATURES:
+            raise InputError(f"dimension must lie between {LEAST_FEATURES} and {MOST_FEATURES}; came {dimension}")
         if seed < 0:
-            raise ValueError(f"seed must not be negative; came {seed}")
+            raise InputError(f"seed must not be negative; came {seed}")
         self.seed = seed
         self.dimension = dimension
 
     def __repr__(self) -> str:
         return f"Kernels(seed={self.seed}, dimension={self.dimension})"
+
+    def configuration(self) -> dict[str, Any]:
+        """What makes an equal one, in JSON's types; see `embeddings.registry`."""
+        return {"kind": "kernels", "seed": int(self.seed), "dimension": int(self.dimension)}
 
     @cached_property
     def fingerprint(self) -> str:
@@ -96,7 +115,7 @@ class Kernels:
         width, continued by its mirror image.
         """
         if image.ndim != 2 or 0 in image.shape:
-            raise ValueError(f"expected a tactile image of shape (C, T); came {image.shape}")
+            raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
         columns = image.shape[1]
         if columns > MOST_COLUMNS and any(width < columns for width in windows):
             return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
@@ -117,6 +136,8 @@ class Kernels:
     def _read(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]]
     ) -> dict[int, npt.NDArray[np.float32]]:
+        import torch
+
         channels, readings = levels.shape
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         image = torch.from_numpy(np.ascontiguousarray(levels))
@@ -144,24 +165,6 @@ class Kernels:
     def _proportions(self, width: int) -> int:
         """How many of the features are proportions in a window of this width; the rest are of levels."""
         return self.dimension - (round(self.dimension * SHARE_IN_SHORT) if width <= SHORT else 0)
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Run torch on one thread of its own accord.
-
-    A touch is two milliseconds of small products: a second thread saves a fifth of it on an idle machine, and on a
-    busy one, where threads wait for each other at every product, made it take forty times as long.
-    """
-    threads = torch.get_num_threads()
-    if threads == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _suffices(columns: int, width: int) -> bool:
@@ -197,13 +200,15 @@ def _counts(
     where: tuple[tuple[int, tuple[int, ...]], ...],
 ) -> npt.NDArray[np.int64]:
     """How often each feature's threshold is exceeded in each window: integers of shape (windows, count)."""
+    import torch
+
     rounds = -(-count // len(kernels))
     responses = kernels.respond(min(count, len(kernels)), image)
     exceeded = torch.empty((count, responses.shape[1]), dtype=torch.float32, device="cpu")
-    for at in range(rounds):
-        first = at * len(kernels)
+    for i in range(rounds):
+        first = i * len(kernels)
         size = min(len(kernels), count - first)
-        thresholds = kernels.thresholds[at, :size, None]
+        thresholds = kernels.thresholds[i, :size, None]
         torch.gt(responses[:size], thresholds, out=exceeded[first : first + size])
     counted = _pooling(readings, kernels.dilation, where) @ exceeded.T
     integers: npt.NDArray[np.int64] = counted.numpy().astype(np.int64)
@@ -213,6 +218,8 @@ def _counts(
 @lru_cache(maxsize=16)  # of at most 1 MB each
 def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> torch.Tensor:
     """0/1 matrix of shape (windows, positions): which of the convolution's positions lie within a window."""
+    import torch
+
     span = (TAPS - 1) * dilation
     place = torch.arange(readings - span, device="cpu")
     columns = [(place >= start) & (place < start + width - span) for width, starts in where for start in starts]

@@ -1,4 +1,4 @@
-"""What is felt where, and when: coarse maps of a touch, for sensors whose channels lie in a known layout."""
+"""What happens where, and when: coarse maps of a touch, for sensors whose channels lie in a known layout."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import hashlib
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from scipy.ndimage import gaussian_filter, shift
 
-from scroll_tactile.embeddings.kernels import one_torch_thread
 from scroll_tactile.embeddings.protocol import Capabilities, canary
+from scroll_tactile.embeddings.runtimes import one_torch_thread
 from scroll_tactile.errors import InputError
 
-__all__ = ["Maps"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["Maps", "View"]
 
 FloatArray = npt.NDArray[np.float64]
 View = Literal["as-felt", "centre", "corner"]
@@ -98,6 +100,11 @@ class Maps:
             f"reach={self.reach}, seed={self.seed})"
         )
 
+    def configuration(self) -> dict[str, Any]:
+        """What makes an equal one, in JSON's types; see `embeddings.registry`."""
+        settings = {"parts": self.parts, "cosines": self.cosines, "reach": self.reach, "seed": self.seed}
+        return {"kind": "maps", "layout": list(self.layout), "views": list(self.views), **settings}
+
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the settings and of the features of two fixed images."""
@@ -111,6 +118,8 @@ class Maps:
     @cached_property
     def _waves(self) -> list[tuple[torch.Tensor, FloatArray]]:
         """Weights, (cosines, maps' values), and phases, (cosines,), of each view."""
+        import torch
+
         rng = np.random.default_rng([self.seed, *self.layout, self.parts, self.cosines])
         each, more = divmod(self.cosines, self._read)
         made = []
@@ -128,6 +137,8 @@ class Maps:
         plain = _means(values, self.parts).ravel() if len(self.layout) == 1 else self._grids(values)
         if not self.cosines:
             return plain
+        import torch
+
         views = plain.reshape(self._read, self._seen)
         with one_torch_thread():  # in one order, whatever the threads
             turned = [
@@ -171,11 +182,11 @@ def _means(values: FloatArray, parts: int) -> FloatArray:
     length = values.shape[1]
     edges = np.linspace(0, length, parts + 1).round().astype(int)
     firsts = np.minimum(edges[:-1], length - 1)
-    return np.stack([values[:, at : max(at + 1, to)].mean(axis=1) for at, to in zip(firsts, edges[1:], strict=True)])
+    return np.stack([values[:, i : max(i + 1, end)].mean(axis=1) for i, end in zip(firsts, edges[1:], strict=True)])
 
 
 def _moved(maps: FloatArray, by: FloatArray) -> FloatArray:
     """Maps, shape (M, rows, columns), moved by so many rows and columns and blurred."""
     wide = np.pad(maps, ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
-    told = np.stack([shift(gaussian_filter(one, SPREAD), by, order=1) for one in wide])
-    return told[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    moved = np.stack([shift(gaussian_filter(values, SPREAD), by, order=1) for values in wide])
+    return moved[:, MARGIN:-MARGIN, MARGIN:-MARGIN]

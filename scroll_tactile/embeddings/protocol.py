@@ -24,6 +24,7 @@ __all__ = [
     "canary",
     "capabilities_of",
     "embed_windows",
+    "is_embedding",
     "parts_of",
     "require_rest",
     "window_plan",
@@ -129,6 +130,11 @@ class CompositeEmbedding(Embedding, Protocol):
     def parts(self) -> tuple[Embedding, ...]:
         """The embeddings, in the order of their features."""
         ...
+
+
+def is_embedding(value: object) -> bool:
+    """Whether a value has what the `Embedding` protocol asks for; unlike `isinstance`, it computes no fingerprint."""
+    return {"name", "dimension", "bound", "fingerprint", "embed"} <= set(dir(value))
 
 
 def capabilities_of(embedding: object) -> Capabilities:

@@ -7,6 +7,7 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from torch.nn import functional
 from scroll_tactile.embeddings.protocol import TOGETHER, Capabilities, canary
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
-from scroll_tactile.embeddings.weights import load_network
+from scroll_tactile.embeddings.weights import digest_of, hash_tensors, load_network, source_name
 from scroll_tactile.errors import InputError
 
 __all__ = ["TunableVision", "Vision", "pool_windows", "to_planes"]
@@ -43,7 +44,7 @@ class Vision:
         torchvision's or Meta-Dataset's (URL) layout; a state dict; or None for a random network, the control that shows
         what the weights are worth.
     stages: which, ascending: 0 the stem, 1 to 4 the layers. Nothing after the last of them is computed.
-    runtime: "torch", or "onnxruntime" or "openvino", which are faster and need their extras.
+    runtime: "torch", or "onnxruntime", which is faster and needs the extra onnx.
     precision: "bfloat16" is faster on processors that have it, with an error of half a percent.
     seed, depth: of the random network; the depth of given weights is seen from them.
 
@@ -85,29 +86,35 @@ class Vision:
             )
         self.runtime: RuntimeName = runtime
         self.precision: Precision = precision
+        self.seed = seed
+        self._source = source_name(weights)
         if weights is None:
             assert seed is not None
             self._net = ResNet.random(seed, depth)
-            self._source = f"None, seed={seed}"
         else:
             self._net = load_network(weights)
-            self._source = "<state dict>" if isinstance(weights, Mapping) else repr(os.fspath(weights))
         self._net.requires_grad_(False)
         self._run = make_runtime(runtime, self._net, self.stages[-1], precision)
         self.dimension = sum(self._net.widths[stage] for stage in self.stages)
 
     def __repr__(self) -> str:
         settings = f"stages={self.stages}, runtime={self.runtime!r}, precision={self.precision!r}"
-        return f"Vision({self._source}, {settings}, depth={self._net.depth})"
+        source = repr(self._source or "<state dict>") if self.seed is None else f"None, seed={self.seed}"
+        return f"Vision({source}, {settings}, depth={self._net.depth})"
+
+    def configuration(self) -> dict[str, Any]:
+        """What makes an equal one, in JSON's types; of weights their file's name and their hash."""
+        weights = {"name": self._source, "sha256": digest_of(self._net)} if self.seed is None else None
+        network = {"weights": weights, "seed": self.seed, "depth": self._net.depth, "stem": self._net.stem}
+        reading = {"stages": list(self.stages), "runtime": self.runtime, "precision": self.precision}
+        return {"kind": "vision", **network, **reading}
 
     @cached_property
     def fingerprint(self) -> str:
         """A hash of all the tensors, the settings, the runtime's version and the features of three fixed images."""
         settings = (self._net.depth, self._net.stem, self.stages, self.runtime, version_of(self.runtime))
         digest = hashlib.sha256(f"vision 1 {settings} {self.precision} {MEAN} {DEVIATION} {TOGETHER}".encode())
-        for name, tensor in sorted(self._net.state_dict().items()):
-            digest.update(f"\n{name} {tuple(tensor.shape)}".encode())
-            digest.update(tensor.contiguous().numpy().tobytes())
+        hash_tensors(digest, self._net)
         for channels, columns in ((3, 9), (19, 30), (60, 75)):
             digest.update(self.embed(canary(channels, columns)).astype("<f4").tobytes())
         return digest.hexdigest()
@@ -151,14 +158,14 @@ class Vision:
         """
         features = np.empty((len(images), self.dimension), np.float32)
         sizes: dict[tuple[int, ...], list[int]] = {}
-        for at, image in enumerate(images):
+        for i, image in enumerate(images):
             self._require_image(image)
-            sizes.setdefault(image.shape, []).append(at)
+            sizes.setdefault(image.shape, []).append(i)
         for (_, columns), members in sizes.items():
             for first in range(0, len(members), BATCH):
                 batch = members[first : first + BATCH]
                 with torch.inference_mode(), torch.autocast("cpu", enabled=False):
-                    planes = to_planes(torch.from_numpy(np.stack([images[at] for at in batch]).astype(np.float32)))
+                    planes = to_planes(torch.from_numpy(np.stack([images[i] for i in batch]).astype(np.float32)))
                     features[batch] = self._pooled(planes, [(0, columns)], columns)[:, 0]
         return features
 

@@ -21,7 +21,17 @@ import torch
 from scroll_tactile.embeddings.resnet import BLOCKS, BOTTLENECK, ResNet, Stem
 from scroll_tactile.errors import WeightsError
 
-__all__ = ["CACHE_VARIABLE", "PUBLISHED", "cache_folder", "load_network", "network_of", "read_tensors"]
+__all__ = [
+    "CACHE_VARIABLE",
+    "PUBLISHED",
+    "cache_folder",
+    "digest_of",
+    "hash_tensors",
+    "load_network",
+    "network_of",
+    "read_tensors",
+    "source_name",
+]
 
 Tensors = dict[str, torch.Tensor]
 
@@ -50,6 +60,25 @@ def load_network(source: str | os.PathLike[str] | Mapping[str, torch.Tensor]) ->
         return network_of(source, "the given state dict")
     path = _published(source) if isinstance(source, str) and source in PUBLISHED else Path(source)
     return network_of(read_tensors(path), str(path))
+
+
+def source_name(source: str | os.PathLike[str] | Mapping[str, torch.Tensor] | None) -> str | None:
+    """What a source of weights is called on any machine: a published name or a file's, None for tensors or nothing."""
+    return None if source is None or isinstance(source, Mapping) else Path(source).name
+
+
+def hash_tensors(digest: hashlib._Hash, net: ResNet) -> None:
+    """Add a network's tensors to a hash: names, shapes and bytes, in the order of the names."""
+    for name, tensor in sorted(net.state_dict().items()):
+        digest.update(f"\n{name} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.contiguous().numpy().tobytes())
+
+
+def digest_of(net: ResNet) -> str:
+    """Hex of a SHA-256 over a network's tensors, whatever file they came from."""
+    digest = hashlib.sha256()
+    hash_tensors(digest, net)
+    return digest.hexdigest()
 
 
 def read_tensors(path: Path) -> Mapping[str, Any]:

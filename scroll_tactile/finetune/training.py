@@ -13,8 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from scroll_tactile.embeddings.kernels import one_torch_thread
-from scroll_tactile.embeddings.runtimes import full_float32
+from scroll_tactile.embeddings.runtimes import full_float32, one_torch_thread
 from scroll_tactile.errors import FineTuneError
 from scroll_tactile.finetune.network import Backbone, Lesson, TouchFeatures, adapted
 from scroll_tactile.memory.tuned import TuneMode

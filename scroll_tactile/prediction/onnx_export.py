@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from scroll_tactile.embeddings.onnx_graph import Graph
 from scroll_tactile.embeddings.protocol import TOGETHER
 from scroll_tactile.embeddings.resnet import ResNet, folded
+from scroll_tactile.embeddings.runtimes import Graph
 from scroll_tactile.embeddings.vision import DEVIATION, MEAN, MOST_COLUMNS, Vision
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner

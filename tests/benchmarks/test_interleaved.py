@@ -6,7 +6,7 @@ import pytest
 from commands import run
 
 from examples.benchmarks.interleaved import AsIs, run_interleaved
-from scroll_tactile.embeddings import check_embedding
+from scroll_tactile.testing import check_embedding
 
 
 def test_its_embedding_keeps_the_promises_of_one():

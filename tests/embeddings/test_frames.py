@@ -6,8 +6,8 @@ from commands import refused, run
 
 from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, check_embedding, sensors
 from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
+from scroll_tactile.embeddings.frames import LIGHT, STRENGTHS, SURFACE, light, surface
 from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.surfaces import LIGHT, STRENGTHS, SURFACE, light, surface
 from scroll_tactile.errors import (
     ChannelCountError,
     EmbeddingMismatchError,

@@ -5,8 +5,9 @@ import pytest
 
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Joined, Kernels, Maps, Vision, check_embedding
+from scroll_tactile.embeddings import Joined, Kernels, Maps, Vision
 from scroll_tactile.errors import InputError
+from scroll_tactile.testing import check_embedding
 
 KERNELS = Kernels(dimension=64)
 VISION = Vision(None, seed=0, stages=(1, 2))

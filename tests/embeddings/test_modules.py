@@ -9,8 +9,9 @@ from torch import nn
 
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Capabilities, Embedding, Kernels, ModuleEmbedding, check_embedding
+from scroll_tactile.embeddings import Capabilities, Embedding, Kernels, ModuleEmbedding
 from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.testing import check_embedding
 
 POOL = nn.Sequential(nn.AdaptiveAvgPool2d((4, 8)), nn.Flatten())
 

@@ -9,8 +9,8 @@ from test_learner_machine import PAD, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Robust, check_embedding
-from scroll_tactile.embeddings.noisy import is_noisy, noisy_statistics
+from scroll_tactile.embeddings import Robust
+from scroll_tactile.embeddings.robust import is_noisy, noisy_statistics
 from scroll_tactile.errors import EmbeddingMismatchError, InputError
 from scroll_tactile.pipelines.robustness import dead, noise
 from scroll_tactile.prediction.filling import Filling, sampled_readings
@@ -19,6 +19,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE
 from scroll_tactile.statistics.grid import to_codes
 from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.testing import check_embedding
 
 SMALL = Robust(Kernels(seed=0, dimension=64))
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4, "augmentation": Augmented(copies=1, noisy=2)}

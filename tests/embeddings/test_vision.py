@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Embedding, Vision, check_embedding
+from scroll_tactile.embeddings import Embedding, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import TOGETHER, pool_windows, to_planes
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, WeightsError
 from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.testing import check_embedding
 
 REAL = Path.home() / ".cache" / "scroll-tactile" / "weights" / "resnet18_imagenet_vq.safetensors"
 RANDOM = Vision(None, seed=0)

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.embeddings import Embedding, Kernels, banks, embed_windows, kernels, levels
+from scroll_tactile.embeddings import Embedding, Kernels, banks, embed_windows, kernels
 
 SMALL = Kernels(dimension=64)
 BOTH = [SMALL, Kernels()]  # the default as well: it uses several thresholds of a kernel, and larger banks
@@ -23,7 +23,7 @@ def image(channels, columns, seed=0):
 
 
 def forget_caches():
-    for module in (banks, kernels, levels):
+    for module in (banks, kernels):
         for item in vars(module).values():
             if hasattr(item, "cache_clear"):
                 item.cache_clear()
@@ -95,13 +95,13 @@ def test_windows_of_a_very_long_image(columns):
 def test_what_was_embedded_before_or_beside_changes_no_bit():
     images = [image(channels, columns) for channels, columns in [(19, 400), (60, 75), (1, 1), (19, 30)]]
     forget_caches()
-    first = [SMALL.embed(one).tobytes() for one in images]
+    first = [SMALL.embed(picture).tobytes() for picture in images]
     forget_caches()
     for other in (Kernels(seed=3, dimension=64), Kernels(dimension=100)):
-        for one in images:
-            other.embed(one)
-    assert [SMALL.embed(one).tobytes() for one in reversed(images)] == first[::-1]
-    assert [Kernels(dimension=64).embed(one).tobytes() for one in images] == first
+        for picture in images:
+            other.embed(picture)
+    assert [SMALL.embed(picture).tobytes() for picture in reversed(images)] == first[::-1]
+    assert [Kernels(dimension=64).embed(picture).tobytes() for picture in images] == first
 
 
 @pytest.fixture
@@ -131,24 +131,24 @@ def restored():
 @pytest.mark.usefixtures("restored")
 def test_the_settings_of_the_callers_program_change_no_bit(setting, cold):
     cases = [(embedding, image(19, 400)) for embedding in BOTH] + [(SMALL, image(19, 30))]
-    expected = [embedding.embed(one).tobytes() for embedding, one in cases]
+    expected = [embedding.embed(picture).tobytes() for embedding, picture in cases]
     setting()
     if cold:
         forget_caches()
-    assert [embedding.embed(one).tobytes() for embedding, one in cases] == expected
+    assert [embedding.embed(picture).tobytes() for embedding, picture in cases] == expected
 
 
 @pytest.mark.parametrize("cold", [False, True], ids=["warm", "cold"])
 def test_automatic_mixed_precision_around_the_call_changes_no_bit(cold):
     cases = [image(19, 400), image(60, 15)]
-    expected = [SMALL.embed(one).tobytes() for one in cases]
+    expected = [SMALL.embed(picture).tobytes() for picture in cases]
     if cold:
         forget_caches()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = [SMALL.embed(one).tobytes() for one in cases]
+        found = [SMALL.embed(picture).tobytes() for picture in cases]
     assert found == expected
     with torch.enable_grad():
-        assert [SMALL.embed(one).tobytes() for one in cases] == expected
+        assert [SMALL.embed(picture).tobytes() for picture in cases] == expected
 
 
 def test_read_only_and_non_contiguous_images():
@@ -170,13 +170,13 @@ def test_read_only_and_non_contiguous_images():
 
 @pytest.mark.parametrize("embedding", BOTH, ids=repr)
 @pytest.mark.parametrize(
-    "one",
+    "picture",
     [np.full((19, 60), value, dtype=np.float32) for value in (-1, 0, 1)]
     + [np.sign(image(19, 60)), np.tile(np.float32([-1, 1]), (5, 15)), image(1, 1), image(4, 700)],
     ids=["low", "middle", "high", "extremes", "alternating", "one value", "long"],
 )
-def test_features_lie_within_the_bound_and_on_the_grid(embedding, one):
-    features = embedding.embed(one)
+def test_features_lie_within_the_bound_and_on_the_grid(embedding, picture):
+    features = embedding.embed(picture)
     assert features.shape == (embedding.dimension,)
     assert features.min() >= 0
     assert features.max() <= 1 == embedding.bound
@@ -216,8 +216,8 @@ print(kernels.embed(image).tobytes().hex()[:200], kernels.fingerprint, Kernels()
 
 def test_a_fresh_process_gives_the_same_features_and_fingerprint():
     said = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True, timeout=60).stdout
-    one = np.linspace(-1, 1, 19 * 400, dtype=np.float32).reshape(19, 400)
-    assert said.split() == [SMALL.embed(one).tobytes().hex()[:200], SMALL.fingerprint, Kernels().fingerprint]
+    picture = np.linspace(-1, 1, 19 * 400, dtype=np.float32).reshape(19, 400)
+    assert said.split() == [SMALL.embed(picture).tobytes().hex()[:200], SMALL.fingerprint, Kernels().fingerprint]
 
 
 def test_global_random_generators_are_left_alone():
@@ -250,9 +250,9 @@ class Means:
 
     name, dimension, bound, fingerprint = "means", 2, 1.0, "aa"
 
-    def embed(self, one):
-        assert one.flags.c_contiguous
-        return np.array([one.mean(), one.std()])
+    def embed(self, picture):
+        assert picture.flags.c_contiguous
+        return np.array([picture.mean(), picture.std()])
 
 
 def test_an_embedding_of_ones_own_reads_windows_one_by_one():

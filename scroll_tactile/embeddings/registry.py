@@ -1,0 +1,333 @@
+"""From an embedding to its configuration in JSON and back, so that a memory can say what it was made with.
+
+A configuration is read from a disk and may be damaged or hostile: its types, sizes and totals are checked before
+anything is made, and what is made holds no features yet. It names a file of weights and the hash of its tensors, and no
+path: weights are a published name's, or a file's in the cache folder of weights.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, Self, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+
+from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES, Kernels
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.errors import EmbeddingError, WeightsError
+from scroll_tactile.sensors import Sensor
+
+if TYPE_CHECKING:
+    from scroll_tactile.embeddings.frames import Frames
+    from scroll_tactile.embeddings.vision import Vision
+
+__all__ = ["MOST_DEPTH", "MOST_PARTS", "configuration_of", "from_configuration", "guess", "picture_to_json"]
+
+MOST_DEPTH: Final = 16  # mappings and lists within each other
+MOST_PARTS: Final = 8  # of a Joined
+MOST_COSINES = 2**14
+MOST_WEIGHTS = 2**27  # of all cosines together: 1 GiB
+MOST_PIXELS = 2**24  # of a resting picture, times colours: 64 MiB
+
+_KINDS: dict[str, tuple[str, str]] = {
+    kind: (f"{__package__}.{kind}", name)
+    for kind, name in {
+        "frames": "Frames",
+        "joined": "Joined",
+        "kernels": "Kernels",
+        "maps": "Maps",
+        "robust": "Robust",
+        "vision": "Vision",
+    }.items()
+}
+
+_Seed = Annotated[int, Field(ge=0, lt=2**63)]
+_Hex = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_Runtime = Literal["torch", "onnxruntime"]
+
+
+class _Configuration(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+class _Weights(_Configuration):
+    """A file's name without its folder, or a published one; None for tensors that came from no file."""
+
+    name: Annotated[str, Field(min_length=1, max_length=255, pattern=r"^[^/\\\x00]+$")] | None
+    sha256: _Hex
+
+
+class _Picture(_Configuration):
+    """A resting image: float32 of shape (height, width, 3), deflated."""
+
+    shape: Annotated[list[Annotated[int, Field(ge=1, le=2**14)]], Field(min_length=3, max_length=3)]
+    float32: Annotated[str, Field(max_length=8 * MOST_PIXELS)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.shape[2] != 3 or math.prod(self.shape) > MOST_PIXELS:
+            raise ValueError(f"a resting picture is (height, width, 3), of at most {MOST_PIXELS} values")
+        return self
+
+
+class _Kernels(_Configuration):
+    kind: Literal["kernels"]
+    seed: _Seed
+    dimension: Annotated[int, Field(ge=LEAST_FEATURES, le=MOST_FEATURES)]
+
+
+class _Frames(_Configuration):
+    kind: Literal["frames"]
+    weights: _Weights | None
+    rest: Literal["first"] | _Picture | None
+    cosines: Annotated[int, Field(ge=0, le=MOST_COSINES)]
+    seed: _Seed
+    runtime: _Runtime
+
+
+class _Vision(_Configuration):
+    kind: Literal["vision"]
+    weights: _Weights | None
+    seed: _Seed | None
+    depth: Literal[18, 34, 50]
+    stem: Literal["torchvision", "universal"]
+    stages: Annotated[list[Annotated[int, Field(ge=0, le=4)]], Field(min_length=1, max_length=5)]
+    runtime: _Runtime
+    precision: Literal["float32", "bfloat16"]
+
+
+class _Maps(_Configuration):
+    kind: Literal["maps"]
+    layout: Annotated[list[Annotated[int, Field(ge=1, le=2**12)]], Field(min_length=1, max_length=2)]
+    views: Annotated[list[Literal["as-felt", "centre", "corner"]], Field(min_length=1, max_length=3)]
+    parts: Annotated[int, Field(ge=1, le=2**10)]
+    cosines: Annotated[int, Field(ge=0, le=MOST_COSINES)]
+    reach: Annotated[int | FiniteFloat, Field(gt=0)]  # 3 and 3.0 have other fingerprints
+    seed: _Seed
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        values = math.prod(self.layout) * (self.parts + 3)
+        if len(self.views) * values > MOST_COSINES and not self.cosines:
+            raise ValueError(
+                f"maps of {values} values in {len(self.views)} views are more than {MOST_COSINES} features"
+            )
+        if self.cosines * values > MOST_WEIGHTS:
+            raise ValueError(f"{self.cosines} cosines of {values} values need more than {MOST_WEIGHTS} weights")
+        return self
+
+
+class _Joined(_Configuration):
+    kind: Literal["joined"]
+    parts: Annotated[list[_Any], Field(min_length=2, max_length=MOST_PARTS)]
+
+
+class _Robust(_Configuration):
+    kind: Literal["robust"]
+    inner: _Any
+    seed: _Seed
+
+
+_Any: TypeAlias = Annotated[_Kernels | _Frames | _Vision | _Maps | _Joined | _Robust, Field(discriminator="kind")]
+_Joined.model_rebuild()
+_Robust.model_rebuild()
+_ANY: TypeAdapter[_Any] = TypeAdapter(_Any)
+
+
+class _Configured(Protocol):
+    def configuration(self) -> dict[str, Any] | None: ...
+
+
+def configuration_of(embedding: Embedding) -> dict[str, Any] | None:
+    """What makes an equal embedding, in JSON's types; None for one that `from_configuration` could not make.
+
+    These are embeddings of the user's own, also where they derive from or wrap one that ships with scroll-tactile.
+    """
+    if (type(embedding).__module__, type(embedding).__qualname__) not in _KINDS.values():
+        return None
+    configuration = cast(_Configured, embedding).configuration()
+    try:
+        return None if configuration is None else dict(_validated(configuration).model_dump(mode="json"))
+    except EmbeddingError:  # a seed of a hundred digits, say
+        return None
+
+
+def from_configuration(configuration: Mapping[str, Any]) -> Embedding:
+    """Make the embedding of a configuration that `configuration_of` gave.
+
+    Published weights are fetched where the cache has none. No fingerprint is computed: compare it.
+
+    Raises EmbeddingError that names what is wrong or missing and what to pass instead, WeightsError for weights that
+    cannot be had or read, InputError where a package for its runtime is missing.
+    """
+    return _made(_validated(configuration))
+
+
+def guess(name: str, dimension: int, fingerprint: str, sensor: Sensor) -> Embedding | None:
+    """Find the embedding of a memory that was made before configurations were kept, among those in common use.
+
+    Tried are those of that name and dimension with default settings; None where none has the fingerprint. Nothing is
+    fetched: published weights count where the cache has them.
+    """
+    if isinstance(dimension, bool) or not isinstance(dimension, int) or not 1 <= dimension <= MOST_COSINES:
+        return None
+    for make in _candidates(name, dimension, sensor):
+        try:
+            embedding = make()
+            if (embedding.name, embedding.dimension) == (name, dimension) and embedding.fingerprint == fingerprint:
+                return embedding
+        except (ValueError, WeightsError):  # no such dimension, or weights that are damaged
+            continue
+    return None
+
+
+def picture_to_json(picture: npt.NDArray[np.float32]) -> dict[str, Any]:
+    """A resting picture (height, width, 3) in JSON's types, to the bit."""
+    deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
+    return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
+
+
+def _picture(held: _Picture) -> npt.NDArray[np.float32]:
+    size = 4 * math.prod(held.shape)
+    try:
+        inflate = zlib.decompressobj()
+        values = inflate.decompress(base64.b64decode(held.float32, validate=True), size + 1)
+    except (binascii.Error, ValueError, zlib.error) as error:
+        raise EmbeddingError(f"the resting picture in a Frames' configuration is damaged ({error})") from error
+    if len(values) != size:
+        raise EmbeddingError(
+            f"the resting picture in a Frames' configuration is damaged: expected {size} bytes; came "
+            f"{'more' if len(values) > size else len(values)}. Pass embedding=Frames(rest=…) with the picture itself"
+        )
+    return np.frombuffer(values, "<f4").reshape(held.shape)
+
+
+def _validated(configuration: Mapping[str, Any]) -> _Any:
+    _require_shallow(configuration)
+    try:
+        return _ANY.validate_python(configuration)
+    except ValidationError as error:
+        # Of a union's alternatives the one that went deepest is the one that was meant.
+        wrong = max(reversed(error.errors(include_url=False)), key=lambda each: len(each["loc"]))
+        place = ".".join(str(step) for step in wrong["loc"]) or "it"
+        raise EmbeddingError(
+            f"expected the configuration of an embedding that ships with scroll-tactile, of kind {', '.join(_KINDS)}; "
+            f"{place}: {wrong['msg']}, came {wrong['input']!r:.80}. Pass the embedding itself: embedding=…"
+        ) from error
+
+
+def _require_shallow(configuration: object) -> None:
+    """Raise EmbeddingError where mappings and lists lie too deep within each other; without recursion."""
+    waiting = [(configuration, 0)]
+    while waiting:
+        value, depth = waiting.pop()
+        if depth > MOST_DEPTH:
+            raise EmbeddingError(
+                f"expected an embedding's configuration of at most {MOST_DEPTH} levels; came more. Pass the embedding "
+                "itself: embedding=…"
+            )
+        inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+        waiting += [(each, depth + 1) for each in inside]
+
+
+def _made(held: _Any) -> Embedding:
+    make = getattr(import_module(_KINDS[held.kind][0]), _KINDS[held.kind][1])
+    settings = held.model_dump(exclude={"kind"})
+    if isinstance(held, _Joined):
+        return cast(Embedding, make(*map(_made, held.parts)))
+    if isinstance(held, _Robust):
+        return cast(Embedding, make(_made(held.inner), seed=held.seed))
+    if isinstance(held, _Frames):
+        rest = _picture(held.rest) if isinstance(held.rest, _Picture) else held.rest
+        return _weighted(make, held.weights, **settings | {"rest": rest})
+    if isinstance(held, _Vision):
+        if held.weights is not None:
+            del settings["depth"]
+        del settings["stem"]
+        return _weighted(make, held.weights, **settings)
+    return cast(Embedding, make(**settings))
+
+
+def _weighted(make: Callable[..., Frames | Vision], held: _Weights | None, **settings: Any) -> Embedding:
+    if held is None:
+        return make(**settings | {"weights": None})
+    source = _source(held, make.__name__)
+    embedding = make(**settings | {"weights": source})
+    found = embedding.configuration()["weights"]["sha256"]
+    if found != held.sha256:
+        raise EmbeddingError(
+            f"expected weights whose tensors have the SHA-256 {held.sha256[:12]}…; those of {source} have "
+            f"{found[:12]}…. Pass embedding={make.__name__}(weights=…) with the weights that the memory was made with"
+        )
+    return embedding
+
+
+def _source(held: _Weights, kind: str) -> str | Path:
+    """The published name, or the file of that name in the cache folder of weights."""
+    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
+
+    if held.name in PUBLISHED:
+        return held.name
+    try:
+        folder: Path | None = cache_folder()
+    except WeightsError:  # without pooch there is no such folder, unless the environment names it
+        folder = None
+    if held.name is not None and folder is not None and (folder / held.name).is_file():
+        return folder / held.name
+    came = "a state dict" if held.name is None else f"the file {held.name!r}"
+    put = "" if held.name is None or folder is None else f", or put that file into {folder}"
+    raise EmbeddingError(
+        f"expected the weights of a {kind} that came from {came} and whose tensors have the SHA-256 "
+        f"{held.sha256[:12]}…; they are not at hand. Pass embedding={kind}(weights=…) with them{put}"
+    )
+
+
+def _candidates(name: str, dimension: int, sensor: Sensor) -> Iterator[Callable[[], Embedding]]:
+    """Ways to make the embeddings of a name in common use, the likely first."""
+    from scroll_tactile.embeddings.frames import Frames
+    from scroll_tactile.embeddings.maps import Maps
+    from scroll_tactile.embeddings.robust import Robust
+
+    if name == "kernels":
+        yield lambda: Kernels(dimension=dimension)
+    elif name == "robust kernels":
+        yield lambda: Robust(Kernels(dimension=dimension))
+    elif name == "frames":
+        yield Frames
+        yield lambda: Frames(rest=None)
+        yield lambda: Frames(cosines=dimension)
+        yield lambda: Frames(rest=None, cosines=dimension)
+    elif name == "maps":
+        layout = sensor.layout if sensor.layout is not None and len(sensor.layout) < 3 else (sensor.channels,)
+        yield lambda: Maps(layout=layout)
+        yield lambda: Maps(layout=layout, cosines=dimension)
+    elif name in ("vision", "kernels+vision"):
+        for weights in _cached():
+            yield partial(_vision, weights, beside_kernels=name != "vision")
+
+
+def _vision(weights: str, *, beside_kernels: bool) -> Embedding:
+    from scroll_tactile.embeddings.joined import Joined
+    from scroll_tactile.embeddings.vision import Vision
+
+    return Joined(Kernels(), Vision(weights)) if beside_kernels else Vision(weights)
+
+
+def _cached() -> list[str]:
+    """The published weights that the cache has."""
+    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
+
+    try:
+        folder = cache_folder()
+    except WeightsError:
+        return []
+    return [name for name, url in PUBLISHED.items() if (folder / url.rsplit("/", 1)[1]).is_file()]

@@ -1,0 +1,253 @@
+"""What an embedding was made with, as JSON, and the same embedding made of it again."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision, sensors
+from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration, guess
+from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.errors import EmbeddingError, WeightsError
+
+PICTURE = np.random.default_rng(0).uniform(0, 255, (24, 32, 3)).astype(np.float32)
+KERNELS = {"kind": "kernels", "dimension": 64, "seed": 0}
+MAPS = Maps(layout=(2, 3)).configuration()
+FRAMES = Frames().configuration()
+VISION = {
+    "kind": "vision",
+    "weights": None,
+    "seed": 0,
+    "depth": 18,
+    "stem": "torchvision",
+    "stages": [1],
+    "runtime": "torch",
+    "precision": "float32",
+}
+
+SHIPPED = {
+    "kernels": lambda: Kernels(dimension=64, seed=3),
+    "frames": lambda: Frames(rest=None),
+    "frames with a picture": lambda: Frames(rest=PICTURE),
+    "frames by cosines": lambda: Frames(cosines=64, seed=2),
+    "maps": lambda: Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64, reach=3, seed=2),
+    "random vision": lambda: Vision(None, seed=1, stages=(0, 2)),
+    "robust": lambda: Robust(Kernels(dimension=64), seed=5),
+    "joined": lambda: Joined(Kernels(dimension=64), Robust(Joined(Kernels(dimension=64, seed=2), Maps(layout=(5,))))),
+}
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of weights."""
+    monkeypatch.setenv("SCROLL_TACTILE_CACHE", str(tmp_path))
+    (tmp_path / "weights").mkdir()
+    return tmp_path / "weights"
+
+
+@pytest.mark.parametrize("kind", SHIPPED)
+def test_what_ships_is_made_again_from_json(kind):
+    embedding = SHIPPED[kind]()
+    configuration = json.loads(json.dumps(configuration_of(embedding)))
+    again = from_configuration(configuration)
+    assert type(again) is type(embedding)
+    assert repr(again) == repr(embedding)
+    assert again.fingerprint == embedding.fingerprint
+    assert configuration_of(again) == configuration
+
+
+def test_no_configuration_computes_a_fingerprint_or_embeds(monkeypatch):
+    def refuse(*arguments, **named):
+        raise AssertionError("embedded")
+
+    for kind in (Kernels, Frames, Maps, Vision):
+        monkeypatch.setattr(kind, "embed", refuse)
+    for make in SHIPPED.values():
+        from_configuration(configuration_of(make()))
+
+
+def mine():
+    return ModuleEmbedding(torch.nn.Flatten(), name="mine", dimension=171)
+
+
+@pytest.mark.parametrize(
+    "embedding",
+    [
+        mine(),
+        Joined(Kernels(dimension=64), mine()),
+        Robust(mine()),
+        type("Mine", (Kernels,), {})(dimension=64),
+        Kernels(dimension=64, seed=2**70),
+    ],
+    ids=repr,
+)
+def test_what_could_not_be_made_again_has_no_configuration(embedding):
+    assert configuration_of(embedding) is None
+
+
+@pytest.mark.parametrize(
+    ("configuration", "said"),
+    [
+        (KERNELS | {"dimension": 0}, "kernels.dimension: Input should be greater than or equal to 64, came 0"),
+        (KERNELS | {"dimension": -5}, "greater than or equal to 64"),
+        (KERNELS | {"dimension": 10**9}, "less than or equal to 8192, came 1000000000"),
+        (KERNELS | {"dimension": True}, "valid integer, came True"),
+        (KERNELS | {"dimension": "64"}, "valid integer, came '64'"),
+        (KERNELS | {"seed": 2**80}, "kernels.seed"),
+        (KERNELS | {"width": 3}, "kernels.width: Extra inputs are not permitted"),
+        ({"kind": "kernels"}, "Field required"),
+        ({}, "Unable to extract tag"),
+        ([], "came \\[\\]"),
+        (None, "came None"),
+        ({"kind": "thermal"}, "of kind frames, joined, kernels, maps, robust, vision; it: .*'thermal'"),
+        ({"kind": "joined", "parts": [KERNELS] * 9}, "at most 8 items"),
+        ({"kind": "joined", "parts": [KERNELS]}, "at least 2 items"),
+        ({"kind": "robust", "inner": KERNELS | {"seed": -1}, "seed": 0}, "robust.inner.kernels.seed"),
+        (MAPS | {"layout": [10**9]}, "maps.layout.0"),
+        (MAPS | {"layout": [4096, 4096]}, "more than 16384 features"),
+        (MAPS | {"layout": [4096, 4096], "cosines": 1000}, "weights"),
+        (MAPS | {"reach": float("nan")}, "finite number"),
+        (FRAMES | {"cosines": MOST_COSINES + 1}, "frames.cosines"),
+        (FRAMES | {"rest": {"shape": [2**14, 2**14, 3], "float32": ""}}, "of at most 16777216 values"),
+        (FRAMES | {"rest": {"shape": [1, 1, 3], "float32": "%%"}}, "picture in a Frames' configuration is damaged"),
+        (FRAMES | {"rest": Frames(rest=PICTURE).configuration()["rest"] | {"shape": [1, 1, 3]}}, "12 bytes; came more"),
+        (VISION | {"runtime": "openvino"}, "'torch' or 'onnxruntime', came 'openvino'"),
+        (VISION | {"depth": 10**6}, "vision.depth"),
+        (VISION | {"weights": {"name": "../../etc/passwd", "sha256": "0" * 64}}, "vision.weights.name"),
+        (VISION | {"weights": {"name": "a", "sha256": "0"}}, "vision.weights.sha256"),
+    ],
+)
+def test_a_hostile_configuration_is_refused_before_anything_is_made(configuration, said):
+    with pytest.raises(EmbeddingError, match=said):
+        from_configuration(configuration)
+
+
+def test_a_configuration_of_a_million_levels_is_refused():
+    nested = KERNELS
+    for _ in range(10**6):
+        nested = {"kind": "robust", "inner": nested, "seed": 0}
+    with pytest.raises(EmbeddingError, match="at most 16 levels"):
+        from_configuration(nested)
+    while isinstance(nested.get("inner"), dict):  # freed level by level: dicts are freed by recursion
+        nested = nested.pop("inner")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=4),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from([KERNELS, MAPS, FRAMES, VISION | {"weights": {"name": None, "sha256": "0" * 64}}]), st.data())
+def test_any_one_field_of_any_value_gives_an_embedding_or_a_typed_error(configuration, data):
+    changed = configuration | {data.draw(st.sampled_from(sorted(configuration))): data.draw(JSON)}
+    try:
+        embedding = from_configuration(changed)
+    except (EmbeddingError, ValueError):  # InputError is a ValueError
+        return
+    assert configuration_of(embedding) is not None
+
+
+class TestWeights:
+    @pytest.fixture
+    def file(self, tmp_path):
+        path = tmp_path / "mine.pth"
+        torch.save(ResNet.random(3).state_dict(), path)
+        return path
+
+    def test_a_file_is_named_without_its_folder(self, file):
+        vision = Vision(file, stages=(1,))
+        assert configuration_of(vision)["weights"]["name"] == "mine.pth"
+        assert str(file.parent) not in json.dumps(configuration_of(vision)) + repr(vision)
+        assert repr(Vision(file, stages=(1,))) == repr(vision)
+
+    @pytest.mark.parametrize("make", [lambda file: Vision(file, stages=(1, 2)), Frames], ids=["vision", "frames"])
+    def test_a_file_in_the_cache_is_found(self, file, cache, make):
+        embedding = make(file)
+        file.rename(cache / file.name)
+        again = from_configuration(configuration_of(embedding))
+        assert again.fingerprint == embedding.fingerprint
+
+    def test_weights_that_are_not_at_hand_are_named_with_what_to_pass(self, file, cache):
+        named = configuration_of(Vision(file))
+        digits = named["weights"]["sha256"][:12]
+        with pytest.raises(EmbeddingError, match=rf"file 'mine.pth' .* {digits}.*Pass embedding=Vision\(weights=…\)"):
+            from_configuration(named)
+        with pytest.raises(EmbeddingError, match="came from a state dict"):
+            from_configuration(configuration_of(Vision(ResNet.random(3).state_dict())))
+
+    def test_other_weights_of_the_same_name_are_refused(self, file, cache):
+        named = configuration_of(Vision(file))
+        torch.save(ResNet.random(4).state_dict(), cache / file.name)
+        with pytest.raises(EmbeddingError, match="expected weights whose tensors have the SHA-256"):
+            from_configuration(named)
+
+    def test_damaged_published_weights_are_refused_and_nothing_is_fetched_for_a_guess(self, cache):
+        (cache / "resnet18-f37072fd.pth").write_bytes(b"not weights")
+        published = VISION | {"weights": {"name": "resnet18", "sha256": "0" * 64}, "seed": None}
+        with pytest.raises(WeightsError, match="is damaged"):
+            from_configuration(published)
+        assert guess("vision", 448, "0" * 64, sensors.BIOTAC) is None
+
+
+class TestGuess:
+    @pytest.mark.parametrize(
+        ("embedding", "sensor"),
+        [
+            (Kernels(), sensors.BIOTAC),
+            (Kernels(dimension=64), sensors.BIOTAC),
+            (Robust(Kernels(dimension=64)), sensors.BIOTAC),
+            (Robust(), sensors.BIOTAC),
+            (Frames(), sensors.GELSIGHT),
+            (Frames(rest=None), sensors.GELSIGHT),
+            (Frames(cosines=64), sensors.GELSIGHT),
+            (Maps(layout=(6, 10)), sensors.ROBOSKIN),
+            (Maps(layout=(19,)), sensors.BIOTAC),
+        ],
+        ids=repr,
+    )
+    def test_what_is_in_common_use_is_found_by_its_fingerprint(self, embedding, sensor):
+        found = guess(embedding.name, embedding.dimension, embedding.fingerprint, sensor)
+        assert repr(found) == repr(embedding)
+
+    @pytest.mark.parametrize(
+        ("name", "dimension", "fingerprint"),
+        [
+            ("kernels", 64, "0" * 64),
+            ("kernels", 10**9, ""),
+            ("kernels", 0, ""),
+            ("kernels", True, ""),
+            ("kernels", "64", ""),
+            (None, 64, ""),
+            ("mine", 64, ""),
+            ("robust kernels", 63, ""),
+            ("maps", 7, ""),
+        ],
+    )
+    def test_of_anything_else_it_finds_none(self, name, dimension, fingerprint):
+        assert guess(name, dimension, fingerprint, sensors.BIOTAC) is None
+
+
+def test_torch_is_not_imported_before_something_is_embedded():
+    check = """
+import sys, types
+package = types.ModuleType("scroll_tactile"); package.__path__ = [sys.argv[1]]  # its own __init__ is another's
+sys.modules["scroll_tactile"] = package
+from scroll_tactile.embeddings import Frames, Joined, Kernels, Maps, Robust
+from scroll_tactile.embeddings.registry import configuration_of, from_configuration
+import scroll_tactile.datasets.simulator, scroll_tactile.datasets.gel, scroll_tactile.testing
+for embedding in (Kernels(), Frames(), Robust(), Maps(layout=(3,)), Joined(Kernels(), Kernels(seed=2))):
+    from_configuration(configuration_of(embedding))
+assert "torch" not in sys.modules
+Kernels().fingerprint
+assert "torch" in sys.modules
+"""
+    import scroll_tactile
+
+    subprocess.run([sys.executable, "-c", check, scroll_tactile.__path__[0]], check=True, timeout=120)

@@ -1,10 +1,10 @@
-"""What a touch is made of: heads for each constituent over the readouts of a model, and how far they are believed.
+"""The composition of a touch: heads for each constituent over the readouts of a model, and how far they are believed.
 
-A touch may be of a material that was felt: then what it is made of is what that one is made of, weighed by what the
-touch feels like. Or it is of one never felt: then the heads speak, ridge regressions over the materials. Which of the
-two is told by the novelty. All three are measured on the pool's touches, each scored by readouts of the folds that it
-is not in, and by heads that never felt its material. All of it is a function of the statistics, the pool and the
-descriptions: a material described after the touching gives the same as one described before, to the bit.
+A touch may be of a material that was observed: then its composition is that material's, weighed by the probabilities
+of the materials. Or it is of one never observed: then the heads answer, ridge regressions over the materials. The
+novelty tells the two apart. All three are measured on the sampled touches, each scored by readouts of the folds that it
+is not in, and by heads that never observed its material. All of it is a function of the statistics, the sample and the
+descriptions: a material described after it was touched gives the same as one described before, to the bit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from scroll_tactile.memory.descriptions import Target, targets_of
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.constituents import Bench, Head, Stage, combined, space_of
+from scroll_tactile.prediction.constituents import ConstituentHead, HeadFitter, StageHeads, combined, space_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Constituent
 from scroll_tactile.signals.windows import Scale
@@ -36,22 +36,22 @@ class Composer:
 
     model: Model
     targets: dict[str, Target]
-    stages: list[Stage]
+    stages: list[StageHeads]
 
     @classmethod
     def of(cls, model: Model, memory: Memory) -> Composer:
-        """Fit the heads of what is described in a memory over what was felt there, and the model made of it."""
+        """Fit the heads of what is described in a memory over what was observed there, and the model made of it."""
         targets = targets_of(memory.descriptions)
         with one_thread():
-            stages = [Bench(model, memory, stage).fit(targets) for stage in range(len(model.calibrations))]
+            stages = [HeadFitter(model, memory, stage).fit(targets) for stage in range(len(model.calibrations))]
         return cls(model, targets, stages)
 
     def needed(self, columns: int) -> list[Scale]:
         """The scales whose windows the heads read of a touch of so many columns."""
-        return self.model.stages[self._reached(columns)]
+        return self.model.stages[self._stage(columns)]
 
-    def _reached(self, columns: int) -> int:
-        return min(len(self.model.plan.stages(columns)), len(self.stages)) - 1
+    def _stage(self, columns: int) -> int:
+        return min(len(self.model.reading.stages(columns)), len(self.stages)) - 1
 
     def compose(
         self,
@@ -63,56 +63,63 @@ class Composer:
     ) -> tuple[tuple[Constituent, ...], float]:
         """Each constituent that is wanted, and the probability that the touch is of a material never felt.
 
-        feels_like: probability of each material felt. means: for each scale the touch's mean features in the codes'
-        unit, (d,). columns: felt so far. expected: the probability of that before the touch.
+        feels_like: probability of each material observed. means: for each scale the touch's mean features in the codes'
+        unit, (d,). columns: felt so far. expected: the probability of a material never observed before the touch.
         """
-        at = self._reached(columns)
-        stage, scales = self.stages[at], self.model.stages[at]
+        stage = self._stage(columns)
+        heads, scales, calibration = self.stages[stage], self.model.stages[stage], self.model.calibrations[stage]
         projected = {scale: self.model.selections[scale].readout.project(means[scale]) for scale in scales}
-        space = space_of(self.model, at)
-        z = combined(self.model, at, space.names, projected)
+        z = combined(self.model, stage, space_of(self.model, stage).names, projected)
         distances = [float(self.model.selections[scale].readout.novelty(projected[scale])) for scale in scales]
-        told = float(stage.novel(self.model.calibrations[at].novelty(np.array(distances))))
+        new = float(heads.novel(calibration.novelty(np.array(distances))))
         # Bayes: the curve is that of as many new touches as known ones.
-        odds = told * expected, (1 - told) * (1 - expected)
+        odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
-        feels_like = _sharpened(feels_like, stage.sharpness)
-        whole = [self._constituent(name, stage, feels_like, z, unfamiliar) for name in self.targets]
-        made_of = {one.name: one for one in _summing_to_one(whole, self.targets)}
-        return tuple(made_of[name] for name in wanted), unfamiliar
+        feels_like = _sharpened(feels_like, heads.sharpness)
+        return self._constituents(wanted, heads, feels_like, z, unfamiliar), unfamiliar
 
     def through_noise(self, wanted: Sequence[str], feels_like: Mapping[str, float]) -> tuple[Constituent, ...]:
         """Each constituent that is wanted, of a touch felt through noise: by the described materials it feels like.
 
-        The heads read what noise hides, so they are not asked.
+        The heads read what noise hides, so they have no part in it.
         """
-        whole = [self._constituent(name, self.stages[-1], feels_like, None, 0.0) for name in self.targets]
-        made_of = {one.name: one for one in _summing_to_one(whole, self.targets)}
-        return tuple(made_of[name] for name in wanted)
+        return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0)
+
+    def _constituents(
+        self,
+        wanted: Sequence[str],
+        heads: StageHeads,
+        feels_like: Mapping[str, float],
+        z: FloatArray | None,
+        unfamiliar: float,
+    ) -> tuple[Constituent, ...]:
+        constituents = [self._constituent(name, heads, feels_like, z, unfamiliar) for name in self.targets]
+        by_name = {constituent.name: constituent for constituent in _summing_to_one(constituents, self.targets)}
+        return tuple(by_name[name] for name in wanted)
 
     def _constituent(
-        self, name: str, stage: Stage, feels_like: Mapping[str, float], z: FloatArray | None, unfamiliar: float
+        self, name: str, heads: StageHeads, feels_like: Mapping[str, float], z: FloatArray | None, unfamiliar: float
     ) -> Constituent:
         target = self.targets[name]
 
-        def weighed(head: Head | str, known: Mapping[str, float]) -> float | None:
+        def weighed(head: ConstituentHead | str, known: Mapping[str, float]) -> float | None:
             if isinstance(head, str):
                 return None
-            felt = {material: feels_like[material] for material in known if material in feels_like}
-            believed = (1 - unfamiliar) * sum(felt.values())
-            told = (1 - unfamiliar) * sum(chance * known[material] for material, chance in felt.items())
+            observed = {material: feels_like[material] for material in known if material in feels_like}
+            believed = (1 - unfamiliar) * sum(observed.values())
+            value = (1 - unfamiliar) * sum(chance * known[material] for material, chance in observed.items())
             if z is None:
-                return min(told / believed, 1.0) if believed else None
-            return min(max(told + (1 - believed) * head(z), 0.0), 1.0)
+                return min(value / believed, 1.0) if believed else None
+            return min(max(value + (1 - believed) * head(z), 0.0), 1.0)
 
         having = [(material, feels_like.get(material, 0.0)) for material, has in target.presence.items() if has]
-        felt = sorted((one for one in having if one[1] > 0), key=lambda one: (-one[1], one[0]))
-        presence, share = stage.presence[name], stage.share[name]
+        evidence = sorted((item for item in having if item[1] > 0), key=lambda item: (-item[1], item[0]))
+        presence, share = heads.presence[name], heads.share[name]
         return Constituent(
             name,
             weighed(presence, target.presence),
             weighed(share, target.share),
-            tuple(felt[:MOST_EVIDENCE]),
+            tuple(evidence[:MOST_EVIDENCE]),
             presence if isinstance(presence, str) else "",
         )
 
@@ -125,10 +132,10 @@ def _sharpened(chances: Mapping[str, float], sharpness: float) -> Mapping[str, f
     return {name: chance / total for name, chance in raised.items()} if total > 0 else chances
 
 
-def _summing_to_one(told: list[Constituent], targets: Mapping[str, Target]) -> list[Constituent]:
+def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Target]) -> list[Constituent]:
     """Shares made parts of one: of all that is a mass, or, where some share is not known, not more than one."""
-    shares = [one.share for one in told if targets[one.name].share]
+    shares = [constituent.share for constituent in constituents if targets[constituent.name].share]
     total = sum(share for share in shares if share is not None)
     if total == 0 or (total <= 1 and None in shares):
-        return told
-    return [one if one.share is None else replace(one, share=one.share / total) for one in told]
+        return constituents
+    return [part if part.share is None else replace(part, share=part.share / total) for part in constituents]

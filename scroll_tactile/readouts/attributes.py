@@ -9,7 +9,7 @@ classes is white, each material counting as one row:
 
 The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α: what Σ_y c_y t_yᵀ is to the paper's readout, with the
 scatter between materials, and not between touches, against it. A material of which a target is unknown is in no sum
-but the scatter within classes. With B the inverse of that matrix, the head that never felt material i follows from it
+but the scatter within classes. With B the inverse of that matrix, the head without material i follows from it
 (Allen 1974, PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches of materials that the head does not know.
 """
 
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import expit
 
-__all__ = ["GAMMAS", "Curve", "Solved", "fit_curve", "solve"]
+__all__ = ["GAMMAS", "Curve", "RidgeSystem", "fit_curve", "solve"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ GAMMAS = (1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0, 10.0)  # as shares of the mean
 
 
 @dataclass(frozen=True)
-class Solved:
+class RidgeSystem:
     """A factorised system of one set of known materials and one γ.
 
     inverse: B, shape (K + 1, K + 1), the intercept last.
@@ -38,19 +38,19 @@ class Solved:
 
     inverse: FloatArray
 
-    def head(self, targets: FloatArray) -> FloatArray:
+    def weights(self, targets: FloatArray) -> FloatArray:
         """(α, b), shape (K + 1,), of targets of the known materials, shape (K,)."""
-        head: FloatArray = self.inverse[:, :-1] @ targets
-        return head
+        weights: FloatArray = self.inverse[:, :-1] @ targets
+        return weights
 
-    def without(self, head: FloatArray, place: int) -> FloatArray:
-        """The head had material `place` never been felt, shape (K + 1,), its own α 0."""
-        left: FloatArray = head - self.inverse[:, place] * (head[place] / self.inverse[place, place])
-        left[place] = 0.0
-        return left
+    def weights_without(self, weights: FloatArray, place: int) -> FloatArray:
+        """(α, b), shape (K + 1,), had material `place` never been observed; its own α is 0."""
+        others: FloatArray = weights - self.inverse[:, place] * (weights[place] / self.inverse[place, place])
+        others[place] = 0.0
+        return others
 
 
-def solve(gram: FloatArray, gamma: float) -> Solved:
+def solve(gram: FloatArray, gamma: float) -> RidgeSystem:
     """Factorise the system of known materials with G_KK, shape (K, K), K ≥ 2, and γ, a share of G's diagonal."""
     count = len(gram)
     centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
@@ -59,7 +59,7 @@ def solve(gram: FloatArray, gamma: float) -> Solved:
     system = np.zeros((count + 1, count + 1))
     system[:count, :count] = (gram + gram.T) / 2 + gamma * size * np.eye(count)
     system[count, :count] = system[:count, count] = 1.0
-    return Solved(np.asarray(np.linalg.inv(system), dtype=np.float64))
+    return RidgeSystem(np.asarray(np.linalg.inv(system), dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Curve:
     slope: float
     offset: float
 
-    def __call__(self, at: npt.ArrayLike) -> FloatArray:
+    def __call__(self, values: npt.ArrayLike) -> FloatArray:
         """Probabilities, of the same shape."""
-        chances: FloatArray = expit(self.slope * np.asarray(at, dtype=np.float64) + self.offset)
-        return chances
+        probabilities: FloatArray = expit(self.slope * np.asarray(values, dtype=np.float64) + self.offset)
+        return probabilities
 
 
 def fit_curve(
@@ -83,17 +83,17 @@ def fit_curve(
     values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: what the prior counts as. turning: whether the value
     at which it passes a half may be another than the prior's.
     """
-    at, wanted = np.asarray(values, dtype=np.float64), np.asarray(targets, dtype=np.float64)
-    if not len(at):
+    truth = np.asarray(targets, dtype=np.float64)
+    if not len(truth):
         return prior
     half = -prior.offset / prior.slope
-    from_half = at - half
+    from_half = np.asarray(values, dtype=np.float64) - half
 
     def loss(point: FloatArray) -> tuple[float, FloatArray]:
         logits = point[0] * from_half + point[1]
-        miss = expit(logits) - wanted
+        miss = expit(logits) - truth
         pull = (point - start) / prior.slope
-        value = float(np.sum(np.logaddexp(0.0, logits) - wanted * logits)) + rows * float(pull @ pull) / 2
+        value = float(np.sum(np.logaddexp(0.0, logits) - truth * logits)) + rows * float(pull @ pull) / 2
         return value, np.array([miss @ from_half, miss.sum()]) + rows * pull / prior.slope
 
     start = np.array([prior.slope, 0.0])

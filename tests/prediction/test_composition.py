@@ -293,9 +293,9 @@ class TestHeads:
             # γ is a share of the diagonal's mean: the same ridge for both.
             centred = [part - part.mean(axis=0) for part in (means, means[left])]
             size, smaller = (np.square(part).sum() / len(part) for part in centred)
-            head = solve(gram, 0.1)
-            told = head.without(head.head(targets), place)
-            fresh = solve(gram[np.ix_(left, left)], 0.1 * size / smaller).head(targets[left])
+            system = solve(gram, 0.1)
+            told = system.weights_without(system.weights(targets), place)
+            fresh = solve(gram[np.ix_(left, left)], 0.1 * size / smaller).weights(targets[left])
             np.testing.assert_allclose(np.delete(told, place), fresh, atol=1e-9)
             assert told[place] == 0
 
@@ -305,7 +305,7 @@ class TestHeads:
         centred = means - means.mean(axis=0)
         ridge = 0.3 * np.square(centred).sum() / 6
         slope = np.linalg.solve(centred.T @ centred + ridge * np.eye(9), centred.T @ (targets - targets.mean()))
-        head = solve(means @ means.T, 0.3).head(targets)
+        head = solve(means @ means.T, 0.3).weights(targets)
         new = rng.normal(size=9)
         expected = targets.mean() + (new - means.mean(axis=0)) @ slope
         assert head[:-1] @ (means @ new) + head[-1] == pytest.approx(expected)

@@ -47,6 +47,24 @@ def test_safetensors_and_torch_files_give_the_network_back(net, state, tmp_path)
         assert (loaded.depth, loaded.stem, loaded.training) == (18, "torchvision", False)
 
 
+@pytest.mark.parametrize("suffix", ["safetensors", "pth"])
+def test_every_value_is_read_under_its_own_name_and_in_its_own_place(net, tmp_path, suffix):
+    """Each value differs from all others, so that no exchange or transposition reads the same."""
+    expected = {}
+    for number, (name, tensor) in enumerate(sorted(net.state_dict().items())):
+        values = number + np.linspace(0.25, 0.75, tensor.numel(), dtype=np.float64).reshape(tuple(tensor.shape))
+        expected[name] = values if tensor.is_floating_point() else np.full(tuple(tensor.shape), number)
+    written = {name: torch.tensor(values).to(net.state_dict()[name].dtype) for name, values in expected.items()}
+    path = tmp_path / f"weights.{suffix}"
+    save_file(written, path) if suffix == "safetensors" else torch.save(written, path)
+    held, loaded = weights.read_tensors(path), load_network(path).state_dict()
+    assert held.keys() == expected.keys()
+    for name, values in expected.items():
+        assert held[name].numpy().tobytes() == written[name].numpy().tobytes(), name
+        if not name.endswith("num_batches_tracked"):
+            np.testing.assert_array_equal(loaded[name].numpy(), values.astype(np.float32), err_msg=name)
+
+
 def test_the_given_tensors_are_copied(state):
     loaded = load_network(state)
     kept = loaded.conv1.weight.clone()

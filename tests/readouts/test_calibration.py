@@ -1,7 +1,11 @@
 """Weights, temperature and thresholds on touches made for it."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.special import logsumexp
 
 from scroll_tactile.readouts.calibration import Calibration, calibrate, fit_weights
 from scroll_tactile.readouts.shrinkage import select
@@ -88,6 +92,34 @@ def test_without_touches_the_prior_stays_and_a_few_move_it_little():
     assert (one < 1000 * prior).all()
 
 
+def documented_loss(weights, scores, targets, prior):
+    """Held-out log loss, and half a touch's worth of (w / prior − 1)² / 2 for each scale."""
+    value = 0.25 * float(np.square(weights / prior - 1).sum())
+    for row, target in zip(scores, targets, strict=True):
+        logits = weights @ row
+        value += float(logsumexp(logits) - logits[target])
+    return value
+
+
+@pytest.mark.parametrize("prior", [[0.05, 0.05], [10.0, 0.3], [1.0, 4.0]])
+@pytest.mark.parametrize("touches", [1, 4, 30])
+def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
+    prior = np.array(prior)
+    rng = np.random.default_rng(touches)
+    scores = [rng.normal(size=(2, int(rng.integers(2, 5)))) / prior[:, None] for _ in range(touches)]
+    targets = [int(rng.integers(row.shape[1])) for row in scores]
+    found = fit_weights(scores, targets, prior)
+    # Without gradients: Nelder and Mead's simplex, in units of the prior, the bound by |·|.
+    expected = minimize(
+        lambda shares: documented_loss(np.abs(shares) * prior, scores, targets, prior),
+        np.ones(2),
+        method="Nelder-Mead",
+        options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 5000, "maxfev": 5000},
+    )
+    assert documented_loss(found, scores, targets, prior) == pytest.approx(expected.fun, rel=1e-6)
+    np.testing.assert_allclose(found / prior, np.abs(expected.x), atol=2e-3)
+
+
 def test_touches_with_different_numbers_of_classes_count_together():
     wide, targets = logits(600, 5)
     narrow, others = logits(600, 3, seed=1)
@@ -107,6 +139,17 @@ def test_the_threshold_lets_about_the_asked_share_of_known_touches_pass(share, t
         above.append((rng.normal(size=2000) > threshold).mean())
     # Conformal: never more on average, and less by at most one place among the held-out touches.
     assert share - 1 / (touches + 1) - 0.01 <= np.mean(above) <= share + 0.01
+
+
+@pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
+def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
+    """Of n + 1 exchangeable touches the new one lies above rank r with probability (n + 1 − r) / (n + 1)."""
+    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, touches + 1))
+    alarms = [Fraction(touches + 1 - rank, touches + 1) for rank in range(1, touches + 1)]
+    kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
+    # Where not even the largest keeps it, twice that.
+    assert calibration.threshold(share) == (kept[0] if kept else 2 * touches)
 
 
 def test_a_smaller_share_means_a_higher_threshold():

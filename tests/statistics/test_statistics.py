@@ -191,6 +191,27 @@ def test_only_what_was_felt_can_be_removed():
     same(statistics, of([]))
 
 
+def test_a_touch_of_another_length_cannot_be_removed_or_taken_out():
+    codes = {5: np.ones((2, 3), np.int32)}
+    statistics, longer = of([]), of([])
+    statistics.add("wool", 0, codes, 40)
+    longer.add("wool", 0, codes, 50)
+    before = statistics.digest()
+    with pytest.raises(UnknownMaterialError, match="50 columns"):
+        statistics.remove("wool", 0, codes, 50)
+    assert statistics.digest() == before
+    assert (statistics.materials, statistics.longest) == ({"wool": 1}, 40)
+    # All counts and sums agree; only the lengths do not.
+    with pytest.raises(InputError, match="contain"):
+        statistics - longer
+    joint = statistics + longer
+    joint.remove("wool", 0, codes, 50)
+    same(joint, statistics)
+    assert joint.longest == 40
+    joint.remove("wool", 0, codes, 40)
+    assert joint.longest == 0
+
+
 def test_statistics_of_other_shapes_do_not_mix():
     for other in (Statistics(4, SCALES), Statistics(DIMENSION, (5,))):
         with pytest.raises(MismatchError, match="features"):

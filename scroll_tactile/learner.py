@@ -11,11 +11,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.embeddings.registry import usual_embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar, ranked_exemplars
-from scroll_tactile.memory.identity import Identity, usual_exemplars
+from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
 from scroll_tactile.memory.state import Memory
@@ -28,7 +27,6 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.statistics import Statistics
 from store import NotAStoreError, Store
 
 if TYPE_CHECKING:
@@ -74,7 +72,9 @@ class TactileLearner:
     ) -> None:
         _require_augmentable(sensor, augmentation)
         chosen = usual_embedding(sensor) if embedding is None else embedding
-        self._set_up(sensor, chosen, augmentation, Settings(**settings), usual_exemplars(sensor))
+        given = Settings(**settings)
+        exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
+        self._set_up(sensor, chosen, augmentation, given, exemplars)
         self._ledger = Ledger(self._empty_memory)
 
     def _set_up(
@@ -88,14 +88,12 @@ class TactileLearner:
         self._sensor = sensor
         self._embedding = embedding
         self._augmentation = augmentation
-        if settings.exemplars is None:
-            settings = settings.model_copy(update={"exemplars": exemplars})
-        self._settings = settings
+        self._settings = settings.model_copy(update={"exemplars": exemplars})
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: Identity | None = None
         self._snapshot_of: str | None = None
-        self._current = CurrentModel(settings, sensor.channels, embedding.bound)
+        self._current = CurrentModel(self._settings, sensor.channels, embedding.bound)
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self) -> Memory:
@@ -114,8 +112,8 @@ class TactileLearner:
     ) -> TactileLearner:
         """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
 
-        A memory that is there says itself what it was made with: sensor, embedding (one that ships with scroll-tactile),
-        augmentation and exemplars may be left out. Nothing is embedded before the first touch is.
+        A memory that is there says itself what it was made with: sensor, augmentation, exemplars and an embedding that
+        ships with scroll-tactile may be left out. Nothing is embedded before the first touch is.
         mode: "read" for one that another process writes; it shows what was committed when it was opened.
 
         Raises SensorMismatchError, EmbeddingMismatchError, MismatchError for a memory made with others, or with an
@@ -128,7 +126,7 @@ class TactileLearner:
         store = _opened(path, sensor, embedding, augmentation, chosen.exemplars, mode)
         try:
             identity = Identity.read(store)
-            identity.require(store.path, sensor=sensor, exemplars=chosen.exemplars, augmentation=augmentation)
+            identity.require(store.path, sensor, augmentation)
             if embedding is not None:
                 identity.require_embedding(store.path, embedding)
             learner = cls.__new__(cls)
@@ -148,13 +146,14 @@ class TactileLearner:
             arrays, attributes = self._ledger.memory.to_arrays()
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
-            return {"made_with": made_with, "arrays": arrays, "attributes": attributes, "of": name}
+            held = arrays, attributes, self._ledger.memory.sequence
+            return {"made_with": made_with, "held": held, "of": name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
         self._set_up(sensor, embedding, augmentation, settings, settings.exemplars)
         self._snapshot_of = state["of"]
-        self._ledger = Ledger(lambda: self._empty_memory().filled(state["arrays"], state["attributes"]))
+        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]))
         logger.info("a snapshot of %s, in memory only", state["of"])
 
     def __repr__(self) -> str:
@@ -193,15 +192,16 @@ class TactileLearner:
         return None if self._ledger.store is None else self._ledger.store.path
 
     @property
-    def statistics(self) -> Statistics:
-        """The exact sums that it has learned; to be read, and not to be added to."""
+    def memory(self) -> Memory:
+        """What it has learned: statistics, samples, exemplars and f*; to be read, and never to be changed."""
         with self._ledger.lock:
-            return self._ledger.memory.statistics
+            return self._ledger.memory
 
     @property
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order."""
-        return self.statistics.materials
+        with self._ledger.lock:
+            return self._ledger.memory.statistics.materials
 
     def observe(self, material: str, stream: Readings) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.

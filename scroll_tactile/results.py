@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-__all__ = ["Compacted", "Composition", "Constituent", "Merged", "Prediction", "Receipt"]
+__all__ = ["Compacted", "Composition", "Constituent", "Merged", "Observation", "Prediction", "Receipt"]
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,21 @@ class Receipt:
     seconds: float
     clipped: int
     durable: bool
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the journal says of one observation.
+
+    sequence, material, key: as in its receipt. time: when it was observed, in seconds since 1970. state: "kept";
+    "compacted": learned, and its features given up; or "retracted".
+    """
+
+    sequence: int
+    material: str
+    key: bytes
+    time: float
+    state: Literal["kept", "compacted", "retracted"]
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ def stream(touch):
     return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
 
 
-def fed(felt, described=()):
-    learner = TactileLearner(**SETTINGS)
+def fed(felt, described=(), **settings):
+    learner = TactileLearner(**SETTINGS | settings)
     for material, one in dict(described).items():
         learner.describe(material, one)
     for material, touch in felt:
@@ -52,12 +52,11 @@ def fed(felt, described=()):
 
 def require_same(learner, felt, described=()):
     """All that is kept of what was felt is, to the byte, what a memory keeps that felt it in another order."""
-    whole = fed(sorted(felt), described)
-    whole.readout = learner.readout
+    whole = fed(sorted(felt), described, readout=learner.settings.readout)
     assert learner.digest() == whole.digest()
     assert learner.exemplars == whole.exemplars
     ours, theirs = (
-        [(material, key, touch.sums.tobytes(), touch.pairs.tobytes()) for material, key, touch in one._memory.pool]
+        [(material, key, touch.sums.tobytes(), touch.pairs.tobytes()) for material, key, touch in one.memory.sample]
         for one in (learner, whole)
     )
     assert ours == theirs
@@ -150,7 +149,7 @@ class History(RuleBasedStateMachine):
         self.learner.describe(material, one)
         assert self.learner.digest() == before
         self.say(material, one)
-        assert self.learner._memory.sequence == self.last
+        assert self.learner.memory.sequence == self.last
 
     @rule(material=materials)
     def forget(self, material):
@@ -274,8 +273,8 @@ class History(RuleBasedStateMachine):
         """The statistics of two memories that share the touches are, together, those of the one that felt all."""
         sides = [data.draw(st.booleans()) for _ in self.felt]
         parts = [fed(one.pair for one, side in zip(self.felt, sides, strict=True) if side == part) for part in (0, 1)]
-        ours, theirs = (part._memory.statistics for part in parts)
-        whole = self.learner._memory.statistics
+        ours, theirs = (part.memory.statistics for part in parts)
+        whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
         assert whole - whole == Statistics(SMALL.dimension, whole.scales)
@@ -290,7 +289,7 @@ class History(RuleBasedStateMachine):
             for _ in range(2):
                 require_same(self.learner, [one.pair for one in self.felt], self.described)
                 self.learner.close()
-                self.learner = self.open(self.path, self.learner.readout)
+                self.learner = self.open(self.path, self.learner.settings.readout)
             self.learner.close()
             self.reader.close()
         self.pools.stop()

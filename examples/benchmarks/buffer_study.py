@@ -45,8 +45,8 @@ def run_buffers(
     note("learning")
     for touch in lessons:
         learner.observe(*touch)
-    assert learner._memory.exemplars is not None
-    kept = list(learner._memory.exemplars)
+    assert learner.memory.exemplars is not None
+    kept = list(learner.memory.exemplars)
     codes, keys = np.stack([one.code for one in kept]), [one.key for one in kept]
     f = float(np.mean([learner.predict(stream).material == name for name, stream in exam]))
     records = []
@@ -74,7 +74,7 @@ def _tuned(
     of = {one.key: one for one in kept}
     exemplars = {name: [of[key] for key in those] for name, those in buffer.items()}
     tuned, _ = fine_tune(learner.embedding, learner.model(), exemplars, learner.sensor, seed=seed)
-    reader = TunedReader(learner.embedding, learner._reading, tuned)
+    reader = TunedReader(learner.embedding, learner.plan, tuned)
     right = []
     for name, stream in exam:
         logits = reader.logits(tactile_image(stream))

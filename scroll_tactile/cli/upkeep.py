@@ -13,8 +13,8 @@ from rich.markup import escape
 
 from scroll_tactile.cli.terminal import Commands, progress_bar, say
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.memory.plain import export_plain
 from scroll_tactile.pipelines.memories import open_for_upkeep
+from scroll_tactile.pipelines.plain_export import export_plain
 from store import StoreError, check_store, repair_store
 
 __all__ = ["memory"]

@@ -29,9 +29,10 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.statistics import FOLDS
 
-__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune"]
+__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune", "require_tunable"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -94,15 +95,22 @@ def fine_tune(
     return replace(tuned, report=Tuned.described(report)), report
 
 
+def require_tunable(plan: WindowPlan, embedding: Embedding) -> None:
+    """Raise InputError for an embedding that reads more than windows."""
+    if plan.beginning or plan.noisy or plan.filled:
+        raise InputError(
+            f"f* is made of windows alone, and {embedding!r} reads beginnings, noise and dead channels by statistics "
+            "that training would not know: it would be asked about less than f. Fine-tune a memory of the embedding "
+            "inside it"
+        )
+
+
 def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[str, Sequence[Exemplar]]) -> None:
     for what, number, least in (("epochs", epochs, 1), ("seed", seed, 0)):
         if isinstance(number, bool) or not isinstance(number, int) or number < least:
             raise InputError(f"expected {what} as a whole number of {least} or more; came {number!r}")
     if sum(map(len, exemplars.values())) == 0:
-        raise InputError(
-            "expected exemplars to fine-tune on; the buffer is empty. Open a memory with exemplars > 0, or, where "
-            "exemplar_bytes was given, with at least eight times the bytes of a touch's readings"
-        )
+        raise InputError("expected exemplars to fine-tune on; the buffer is empty. Make a memory with exemplars > 0")
     if len(exemplars) < 2:
         raise InputError(
             f"expected at least two materials, to be told apart; the buffer has exemplars of {list(exemplars)} only"

@@ -209,6 +209,11 @@ class TunedReader:
         """Whether f* can answer for a touch of so many columns."""
         return self._touches.reads(columns)
 
+    def logits_of(self, image: npt.NDArray[np.float32], candidates: Sequence[str]) -> dict[str, float] | None:
+        """The `logits` of a touch; None where f* cannot answer for these candidates, or for so many columns."""
+        able = set(candidates) <= set(self.tuned.names) and self.reads(image.shape[1])
+        return self.logits(image) if able else None
+
     def logits(self, image: npt.NDArray[np.float32]) -> dict[str, float]:
         """Material → logit, for a touch that reaches the last stage; image: (C, T) in [-1, 1]."""
         with steady():

@@ -68,14 +68,19 @@ def _value(where: str, name: str, value: Any) -> float | bool | None:
     return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
 
 
-def require_constituents(wanted: Collection[str], known: Collection[str]) -> list[str]:
-    """The constituents that are asked for, in alphabetical order.
+def require_constituents(descriptions: Mapping[str, Description], wanted: Collection[str] | None) -> list[str]:
+    """The constituents that are asked for, in alphabetical order; all that the descriptions name where it is None.
 
-    Raises DescriptionError for one that no description names, or none.
+    Raises DescriptionError where nothing was described, for one that no description names, or none.
     """
+    known = {name for description in descriptions.values() for name in description}
+    if not known:
+        raise DescriptionError("nothing was described yet: say with describe() what some material is made of")
+    if wanted is None:
+        return sorted(known)
     if isinstance(wanted, str):
         raise DescriptionError(f"expected constituents as a sequence of names; came the string {wanted!r}")
-    missing = sorted(set(wanted) - set(known))
+    missing = sorted(set(wanted) - known)
     if missing or not wanted:
         raise DescriptionError(f"expected constituents out of {sorted(known)}; came {missing or 'none'}")
     return sorted(set(wanted))

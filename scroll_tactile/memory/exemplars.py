@@ -20,8 +20,9 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import Sample
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "mean_code", "quotas", "rank"]
+__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "mean_code", "quotas", "rank", "ranked_exemplars"]
 
 IntArray = npt.NDArray[np.int64]
 
@@ -273,3 +274,13 @@ def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray],
     brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-int(one.scale), one.key))
     codes, mean = np.stack([one.code for one in first]), means(candidates[0].material, widest)
     return ([first[at] for at in herd(codes, [one.key for one in first], mean, count)] + brief)[:count]
+
+
+def ranked_exemplars(sample: ExemplarSample, statistics: Statistics) -> dict[str, list[Exemplar]]:
+    """The buffer, as `rank`, against the exact means of all that was observed."""
+
+    def mean(material: str, scale: Scale) -> IntArray:
+        total = statistics.sums(scale, [material]).sum(axis=(0, 1))
+        return mean_code(total, int(statistics.counts(scale, [material]).sum()))
+
+    return rank(sample, mean)

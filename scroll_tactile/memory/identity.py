@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, window_plan
 from scroll_tactile.embeddings.kernels import Kernels
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, require_rest, window_plan
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
 from scroll_tactile.sensors import Sensor
@@ -19,7 +19,7 @@ from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS
 from store import DamageError, Store
 
-__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "Grid", "Identity"]
+__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "Grid", "Identity", "usual_embedding", "usual_exemplars"]
 
 USUAL_EXEMPLARS = 400  # streams
 ROBUST = "robust kernels"
@@ -56,7 +56,7 @@ class EmbeddingIdentity(_Kept):
 
 
 class Grid(_Kept):
-    """The grid of codes, and the widths of windows that statistics are kept of; frames: a camera's windows are those."""
+    """The grid of codes, and the widths of windows; frames: whether they are a camera's frames."""
 
     bits: int
     folds: int
@@ -84,16 +84,17 @@ class Identity(_Kept):
     ) -> Self:
         """The identity of a new memory.
 
-        exemplars: streams in its buffer; None: the usual number, and none for a camera.
+        exemplars: streams in its buffer; None: the usual number, and none for a camera. Raises InputError for an
+        embedding that cannot read the sensor.
         """
+        require_rest(embedding, sensor)
         plan = window_plan(sensor, embedding)
-        usual = 0 if sensor.camera else USUAL_EXEMPLARS
         return cls(
             sensor=sensor,
             embedding=EmbeddingIdentity.of(embedding),
             grid=Grid(bits=BITS, folds=FOLDS, scales=plan.widths, frames=plan.frames),
             reading=(plan.partial, plan.judged),
-            exemplars=(usual if exemplars is None else exemplars, None),
+            exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
             augmentation=augmentation,
         )
 
@@ -110,7 +111,9 @@ class Identity(_Kept):
         except (ValidationError, ValueError) as error:
             first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
             where = ".".join(map(str, first["loc"]))
-            raise DamageError(f"the identity of {store.path} cannot be read: {where}: {first['msg']}") from error
+            raise DamageError(
+                f"the identity of {store.path} cannot be read: {where}: {first['msg']}", path=store.path
+            ) from error
 
     def to_json(self) -> dict[str, Any]:
         """In JSON's types, as a store keeps it; what is not there is left out, as the versions before it left it."""
@@ -122,6 +125,25 @@ class Identity(_Kept):
             kept["augmentation"] = self.augmentation.to_json()
         kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
         return kept
+
+    def exemplar_count(self, store: Store, asked: int | None) -> int:
+        """Streams in the buffer: as the memory was made with. Raises MismatchError where another number is asked for.
+
+        A memory from before there were exemplars keeps those of what was observed since it was first opened with some.
+        One that was made with a limit of bytes keeps what it has, and from now on the usual number.
+        """
+        kept = self.exemplars
+        if kept is None and (generation := store.latest()) is not None:
+            kept = cast("tuple[int | None, int | None] | None", generation.attributes.get("capacity"))
+        if kept is None:
+            return usual_exemplars(self.sensor) if asked is None else asked
+        count = usual_exemplars(self.sensor) if kept[0] is None else kept[0]
+        if asked not in (None, count):
+            raise MismatchError(
+                f"{store.path} was made with exemplars={count}; it was opened with {asked}. What was not kept cannot "
+                "be had back: leave them out"
+            )
+        return count
 
     def own_embedding(self, path: Path) -> Embedding:
         """The embedding that it was made with, made again from its configuration; nothing is embedded.
@@ -139,9 +161,7 @@ class Identity(_Kept):
             )
         return found
 
-    def require(
-        self, path: Path, *, sensor: Sensor | None, exemplars: int | None, augmentation: Augmented | None
-    ) -> None:
+    def require(self, path: Path, sensor: Sensor | None, augmentation: Augmented | None) -> None:
         """Raise MismatchError for what was asked for (not None) and differs from what the memory was made with."""
         if sensor is not None and sensor != self.sensor:
             differing = [
@@ -153,14 +173,10 @@ class Identity(_Kept):
                 f"{path} holds the memory of sensor {self.sensor.name!r}; it was opened for {sensor.name!r} "
                 f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
             )
-        if exemplars is not None and self.exemplars is not None and exemplars != self.exemplars[0]:
-            raise MismatchError(
-                f"{path} was made with exemplars={self.exemplars[0]}; it was opened with {exemplars}. What was not "
-                "kept cannot be had back: leave them out"
-            )
         if augmentation is not None and augmentation != self.augmentation:
+            made = "no augmentation" if self.augmentation is None else repr(self.augmentation)
             raise MismatchError(
-                f"{path} was made with {self.augmentation or 'no augmentation'}; it was opened with {augmentation}. "
+                f"{path} was made with {made}; it was opened with {augmentation!r}. "
                 "Its touches were not observed with those copies: leave the augmentation out, or take another path"
             )
 
@@ -208,3 +224,15 @@ class AbsentEmbedding:
             f"the memory was opened without its embedding {self.name!r}, to look after it only: open it with "
             "TactileLearner.open(path, embedding=...)"
         )
+
+
+def usual_embedding(sensor: Sensor) -> Embedding:
+    """The embedding of a memory that asks for none."""
+    from scroll_tactile.embeddings.frames import Frames
+
+    return Frames() if sensor.camera else Kernels()
+
+
+def usual_exemplars(sensor: Sensor) -> int:
+    """Streams in the buffer of a memory that asks for no number; a camera's are large, and none are kept."""
+    return 0 if sensor.camera else USUAL_EXEMPLARS

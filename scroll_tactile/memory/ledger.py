@@ -186,16 +186,16 @@ class Ledger:
         # back, every opening would have to read it.
         store.base()
         memory, sequences = self._memory, spans(record.sequence for record in taken)
-        before = memory.pool, memory.exemplars, memory.tuned
+        before = memory.sample, memory.exemplars, memory.tuned
 
         def revert() -> None:
             for record in taken:
                 memory.put_back(record)
-            memory.pool, memory.exemplars, memory.tuned = before
+            memory.sample, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
             for record in taken:
-                memory.withdraw(record)
+                memory.retract(record)
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
@@ -261,7 +261,7 @@ class Ledger:
                 with self._mutation():
                     store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
                     memory.base = upto
-                    memory.withdrawn = {sequence for sequence in memory.withdrawn if sequence > upto}
+                    memory.retracted = {sequence for sequence in memory.retracted if sequence > upto}
                 give_back_scratch()
             return Compacted(memory.base, before, sum(store.size().values()))
 
@@ -280,7 +280,7 @@ class Ledger:
             self._changed()
             return True
 
-    def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, taken_back: int) -> None:
+    def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
         """Make f* the memory's, durably, where nothing was taken back of what it was made from.
 
         made_from, upto, taken_back: the memory, its sequence and its count when the training began.
@@ -288,7 +288,7 @@ class Ledger:
         with self.lock:
             self.require_writing()
             memory = self.memory
-            if memory is not made_from or memory.taken_back != taken_back:
+            if memory is not made_from or memory.retractions != retractions:
                 raise FineTuneError("what f* was being made from was taken back meanwhile: fine-tune again")
             before = memory.tuned, memory.tuned_upto
             memory.tuned, memory.tuned_upto = tuned, upto

@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
+from pydantic import BaseModel
+
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.rows import unspanned
-from scroll_tactile.memory.state import DESCRIBE, FELT, MERGE, OBSERVE, RETRACT, Memory, apply_description
-from scroll_tactile.results import Receipt
+from scroll_tactile.memory.state import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, Memory, apply_description
+from scroll_tactile.results import Observation, Receipt
 from store import Head, Record, Store
 
-__all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations_of", "withdrawn_in"]
+__all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations", "observations_of"]
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
@@ -24,7 +27,7 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
     sequence = receipt.sequence if isinstance(receipt, Receipt) else receipt
     if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= store.last:
         raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
-    if sequence in memory.withdrawn:
+    if sequence in memory.retracted:
         raise ObservationError(f"observation {sequence} of {store.path} was taken back already")
     if sequence <= memory.base:
         raise ObservationError(
@@ -57,6 +60,23 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
             "compacted, and their features given up. Retract the others one by one, by their receipts"
         )
     return found
+
+
+def observations(store: Store) -> list[Observation]:
+    """All observations of a journal, in order, and what became of them."""
+    heads, compacted = list(store.heads()), store.compacted
+    gone = _retracted_in(heads)
+
+    def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
+        if head.sequence in gone:
+            return "retracted"
+        return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
+
+    return [
+        Observation(head.sequence, head.label, head.key, head.time, state(head))
+        for head in heads
+        if head.kind in (OBSERVE, MEMBER)
+    ]
 
 
 def compaction_point(store: Store, memory: Memory, keep: int) -> int:
@@ -98,7 +118,7 @@ class Incoming:
         base, there = theirs.compacted, _standing(theirs)
         known = {(head.label, head.key) for head in _standing(ours) if head.kind != MERGE}
         both = [head for head in there if head.kind != MERGE and (head.label, head.key) in known]
-        fixed = [head for head in both if head.sequence <= base or head.kind == FELT]
+        fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
             raise ObservationError(
                 f"{len(fixed)} streams that both memories felt, such as one of {fixed[0].label!r}, cannot be counted "
@@ -125,11 +145,11 @@ class Incoming:
             memory.describe(material, one)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
-            if kind != FELT:
+            if kind != MEMBER:
                 memory.replay(ours.record(head.sequence), ours)
             memory.sequence = head.sequence
             each(done, total)
-        return sum(head.kind in (OBSERVE, FELT) for head in self.rows)
+        return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
 
     def _rows_to_append(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         base = self.source.base()
@@ -141,13 +161,13 @@ class Incoming:
         for head in self.rows:
             if base is not None and head.sequence <= base.upto:
                 if head.kind != MERGE:  # a merge before the base is a part of it
-                    yield FELT, head.label, head.key, {}, None, head.time
+                    yield MEMBER, head.label, head.key, {}, None, head.time
             else:
                 record = self.source.record(head.sequence)
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
 
 
-def withdrawn_in(heads: Iterable[Head]) -> set[int]:
+def _retracted_in(heads: Iterable[Head]) -> set[int]:
     """All sequences that these rows took back."""
     return {at for head in heads if head.kind == RETRACT for at in unspanned(head.attributes["sequences"])}
 
@@ -155,8 +175,8 @@ def withdrawn_in(heads: Iterable[Head]) -> set[int]:
 def _standing(store: Store) -> list[Head]:
     """The rows by which anything is known, compacted ones too, without what was ever taken back."""
     heads = list(store.heads())
-    gone = withdrawn_in(heads)
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, FELT) and head.sequence not in gone]
+    gone = _retracted_in(heads)
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in gone]
 
 
 def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
@@ -179,23 +199,30 @@ def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) ->
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
     if ours.path.resolve() == theirs.path.resolve():
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
+    mine, other = Identity.read(ours), Identity.read(theirs)
     for part in ("sensor", "embedding", "reading", "grid", "augmentation"):
-        mine, other = ours.identity.get(part), theirs.identity.get(part)
-        if mine != other:
+        here, there = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
+        if here != there:
             raise MismatchError(
-                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is {_formatted(mine)}, "
-                f"there {_formatted(other)}. Merge memories of one sensor and one embedding"
+                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is "
+                f"{_formatted(here)}, there {_formatted(there)}. Merge memories of one sensor and one embedding"
             )
     whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
-    if whole and memory.exemplars is not None and ours.identity.get("exemplars") != theirs.identity.get("exemplars"):
+    if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
         raise MismatchError(
-            f"{theirs.path} was compacted and keeps exemplars {theirs.identity.get('exemplars')} (streams, bytes); "
-            f"{ours.path} keeps {ours.identity.get('exemplars')}, and those that are missing cannot be had back"
+            f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
+            f"{ours.path} keeps {mine.exemplars}, and those that are missing cannot be had back"
         )
 
 
+def _without_configuration(part: Any) -> Any:
+    """The part of an identity; of an embedding what tells two apart, for memories made before have no configuration."""
+    return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
+
+
 def _formatted(part: Any) -> str:
-    if isinstance(part, dict):
-        fields = {name: value[:12] if name == "fingerprint" else value for name, value in part.items()}
-        return ", ".join(f"{name} {value!r}" for name, value in fields.items() if value is not None)
-    return repr(part)
+    if not isinstance(part, BaseModel):
+        return repr(part)
+    fields = ((name, getattr(part, name)) for name in type(part).model_fields)
+    shown = ((name, value[:12] if name == "fingerprint" else value) for name, value in fields)
+    return ", ".join(f"{name} {value!r}" for name, value in shown if value is not None)

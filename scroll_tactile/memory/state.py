@@ -6,7 +6,6 @@ import ctypes
 import logging
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -24,12 +23,11 @@ from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
     "DESCRIBE",
-    "FELT",
+    "MEMBER",
     "MERGE",
     "OBSERVE",
     "READINGS",
     "RETRACT",
-    "Capacity",
     "Memory",
     "apply_description",
     "give_back_scratch",
@@ -41,29 +39,17 @@ logger = logging.getLogger(__name__)
 OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kept, its readings are the arrays
 RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
 MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
-FELT = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
+MEMBER = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
 DESCRIBE = "describe"  # what a material is made of; the attribute "constituents" holds it, or null to take it away
-KINDS = [OBSERVE, RETRACT, MERGE, FELT, DESCRIBE]
+KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
 READINGS = "readings"  # the array of a row that keeps a stream raw
 ATTEMPTS = 20  # of a reader to read what a writer goes on changing
-
-
-@dataclass(frozen=True)
-class Capacity:
-    """Of the exemplar buffer: in streams, or in bytes of raw readings; 0 streams: nothing is kept raw."""
-
-    streams: int | None = 400
-    nbytes: int | None = None
-
-    def pool(self) -> ExemplarSample | None:
-        """An empty pool of this capacity; None where nothing is to be kept."""
-        return None if self.streams == 0 else ExemplarSample(self.streams, capacity_bytes=self.nbytes)
 
 
 class Memory:
     """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
 
-    dimension: d. plan: which windows are read of a touch, and judge. capacity: of the exemplar buffer.
+    dimension: d. plan: which windows are read of a touch, and judge. exemplars: streams in its buffer, or 0.
     tuned: f*, of the last fine-tune; None before one, or where what it was made from was taken back.
     tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
     excluded: of a base, the sequences up to it that had been taken back when it was made.
@@ -73,21 +59,21 @@ class Memory:
     saved: the last sequence that a generation is known to hold.
     """
 
-    def __init__(self, dimension: int, plan: WindowPlan, capacity: Capacity | None = None) -> None:
+    def __init__(self, dimension: int, plan: WindowPlan, exemplars: int = 0) -> None:
         self.plan = plan
-        self.capacity = capacity or Capacity()
+        self.capacity = exemplars
         self.statistics = Statistics(dimension, plan.scales)
-        self.pool = TouchSample()
-        self.exemplars = self.capacity.pool()
+        self.sample = TouchSample()
+        self.exemplars = ExemplarSample(exemplars) if exemplars else None
         self.tuned: Tuned | None = None
         self.tuned_upto = 0
-        self.withdrawn: set[int] = set()
+        self.retracted: set[int] = set()
         self.excluded: set[int] = set()
         self.base = 0
         self.generation: int | None = None
         self.saved = 0
         self.sequence = 0
-        self.taken_back = 0
+        self.retractions = 0
         self.descriptions: dict[str, Description] = {}
         self._stale = False
 
@@ -105,8 +91,8 @@ class Memory:
         Raises CapacityError before anything is added.
         """
         self.statistics.add(material, fold_of(key), codes, columns)
-        if self.pool.wants(material, key):
-            self.pool.add(material, key, self._touch(columns, codes))
+        if self.sample.wants(material, key):
+            self.sample.add(material, key, self._touch(columns, codes))
         if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key, readings.nbytes):
             self.exemplars.add(Exemplar.of(material, key, readings, codes))
         self.sequence = sequence
@@ -124,7 +110,7 @@ class Memory:
         elif record.kind == RETRACT:
             for sequence in unspanned(record.attributes["sequences"]):
                 if sequence > self.base:
-                    self.withdraw(store.record(sequence))
+                    self.retract(store.record(sequence))
                 elif sequence not in self.excluded:  # not by `compact`, which leaves them out: by a repair
                     logger.warning(
                         "%s: observation %d was taken back by row %d, and is still in: its features were lost to "
@@ -135,7 +121,7 @@ class Memory:
                     )
         elif record.kind == MERGE:
             self._join(record.arrays, cast(dict[str, Any], record.attributes))
-        elif record.kind not in (FELT, DESCRIBE):
+        elif record.kind not in (MEMBER, DESCRIBE):
             raise MismatchError(
                 f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
                 f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
@@ -146,13 +132,13 @@ class Memory:
         """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
         _describe(self.descriptions, material, constituents)
 
-    def withdraw(self, record: Record) -> None:
+    def retract(self, record: Record) -> None:
         """Take an observation out of the sums; `refill` then mends the pools."""
         material, key = record.label, record.key
         self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
-        self.withdrawn.add(record.sequence)
-        self.taken_back += 1
-        if self.pool.depends_on(material, key) or (self.exemplars and self.exemplars.depends_on(material, key)):
+        self.retracted.add(record.sequence)
+        self.retractions += 1
+        if self.sample.depends_on(material, key) or (self.exemplars and self.exemplars.depends_on(material, key)):
             self._stale = True
         if record.sequence <= self.tuned_upto:
             self.tuned = None
@@ -160,19 +146,19 @@ class Memory:
     def retractable(self, store: Store, material: str | None = None) -> list[Head]:
         """The observations in the journal, of one material or all, that can be taken back and were not; in order."""
         rows = store.heads(self.base, kind=OBSERVE, label=material)
-        return [head for head in rows if head.sequence not in self.withdrawn]
+        return [head for head in rows if head.sequence not in self.retracted]
 
     def put_back(self, record: Record) -> None:
-        """Undo `withdraw` in the sums, exactly; the samples and f* are the caller's to put back."""
+        """Undo `retract` in the sums, exactly; the samples and f* are the caller's to put back."""
         self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), _columns(record))
-        self.withdrawn.discard(record.sequence)
+        self.retracted.discard(record.sequence)
         self._stale = False
 
     def refill(self, store: Store) -> None:
         """Choose pool and exemplars again, as if what was withdrawn had never been felt, where that can matter."""
         if not self._stale:
             return
-        touches = {(material, key): touch for material, key, touch in self.pool}
+        touches = {(material, key): touch for material, key, touch in self.sample}
         kept = {(one.material, one.key): one for one in self.exemplars or ()}
         fresh = self._base_samples(store)
         # No further than was read: a writer may have gone on since.
@@ -192,8 +178,8 @@ class Memory:
         def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
             return kept.get((material, key)) or _exemplar(store.record(sequence))
 
-        fresh.pool.refill(felt, touch)
-        self.pool = fresh.pool
+        fresh.sample.refill(felt, touch)
+        self.sample = fresh.sample
         if fresh.exemplars is not None:
             fresh.exemplars.refill((one for one in felt if one[2]), exemplar)
             self.exemplars = fresh.exemplars
@@ -217,11 +203,11 @@ class Memory:
                 "memory repair)",
                 damage,
             )
-            kinds = (OBSERVE, FELT)
+            kinds = (OBSERVE, MEMBER)
             compacted = {
                 (one.label, one.key) for one in store.heads() if one.sequence <= self.base and one.kind in kinds
             }
-            fresh.pool.update({}, ((name, key, one, 0) for name, key, one in self.pool if (name, key) in compacted))
+            fresh.sample.update({}, ((name, key, one, 0) for name, key, one in self.sample if (name, key) in compacted))
             if fresh.exemplars is not None:
                 for one in self.exemplars or ():
                     if (one.material, one.key) in compacted:
@@ -243,27 +229,27 @@ class Memory:
         other = self._empty()
         other._take(arrays, attributes)
         self.statistics = self.statistics + other.statistics
-        self.pool.update({}, ((material, key, touch, 0) for material, key, touch in other.pool))
+        self.sample.update({}, ((material, key, touch, 0) for material, key, touch in other.sample))
         if self.exemplars is not None and other.exemplars is not None:
             self.exemplars.update(other.exemplars)
 
     def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be taken back."""
         arrays, names = self.statistics.to_arrays()
-        pooled, materials = self.pool.to_arrays()
+        pooled, materials = self.sample.to_arrays()
         attributes: dict[str, Any] = {
             "dimension": self.statistics.dimension,
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "pool": materials,
-            "capacity": [self.capacity.streams, self.capacity.nbytes],
+            "capacity": [self.capacity, None],
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= pooled
         # A base is gone on from with the rows behind it, which tell again what of them was taken back.
-        gone = sorted(self.withdrawn if base_at is None else ())
-        out = [sequence for sequence in sorted(self.withdrawn) if base_at is not None and sequence <= base_at]
+        gone = sorted(self.retracted if base_at is None else ())
+        out = [sequence for sequence in sorted(self.retracted) if base_at is not None and sequence <= base_at]
         arrays["withdrawn"], arrays["excluded"] = np.array(gone, dtype=np.int64), np.array(out, dtype=np.int64)
         for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
             if part is not None:
@@ -277,22 +263,22 @@ class Memory:
         return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
 
     @classmethod
-    def load(cls, store: Store, dimension: int, plan: WindowPlan, capacity: Capacity | None = None) -> Memory:
+    def load(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int = 0) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
             try:
-                memory = cls._loaded(store, dimension, plan, capacity)
+                memory = cls._loaded(store, dimension, plan, exemplars)
             except CompactedError:  # a writer compacted it between two looks of this reader
                 continue
             # A generation that came between the looks may hold an f* from before the rows that were read.
             if store.newest == newest:
                 return memory
-        return cls._loaded(store, dimension, plan, capacity)
+        return cls._loaded(store, dimension, plan, exemplars)
 
     @classmethod
-    def _loaded(cls, store: Store, dimension: int, plan: WindowPlan, capacity: Capacity | None) -> Memory:
-        memory = cls(dimension, plan, capacity)
+    def _loaded(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int) -> Memory:
+        memory = cls(dimension, plan, exemplars)
         memory.base = store.compacted
         # Where no generation verifies the base's own error says what is lost; without one all rows are there.
         generation = store.latest() or store.base()
@@ -325,20 +311,24 @@ class Memory:
                 break
             if record.kind == RETRACT:
                 apply_description(memory.descriptions, record)
-            elif record.sequence not in self.withdrawn:
+            elif record.sequence not in self.retracted:
                 memory.replay(record, store)
-        memory.sequence, memory.withdrawn = upto, set(self.withdrawn)
+        memory.sequence, memory.retracted = upto, set(self.retracted)
         return memory
+
+    def filled(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any], sequence: int) -> Memory:
+        """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over."""
+        self._take(arrays, attributes)
+        self.sequence = sequence
+        return self
 
     def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        self.pool = TouchSample.from_arrays(arrays, attributes["pool"])
+        self.sample = TouchSample.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarSample.from_arrays(
-                arrays, attributes["exemplars"], self.capacity.streams, capacity_bytes=self.capacity.nbytes
-            )
-        self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
+            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity)
+        self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
         self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
         if "tuned" in attributes:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]

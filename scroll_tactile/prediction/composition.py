@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scroll_tactile.memory.descriptions import Target, targets_of
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.constituents import ConstituentHead, HeadFitter, StageHeads, combined, space_of
+from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Constituent
 from scroll_tactile.signals.windows import Scale
@@ -51,24 +52,23 @@ class Composer:
         return self.model.stages[self._stage(columns)]
 
     def _stage(self, columns: int) -> int:
-        return min(len(self.model.reading.stages(columns)), len(self.stages)) - 1
+        return min(len(self.model.plan.stages(columns)), len(self.stages)) - 1
 
     def compose(
-        self,
-        wanted: Sequence[str],
-        feels_like: Mapping[str, float],
-        means: Mapping[Scale, FloatArray],
-        columns: int,
-        expected: float,
+        self, wanted: Sequence[str], feels_like: Mapping[str, float], encoded: Encoded, expected: float
     ) -> tuple[tuple[Constituent, ...], float]:
-        """Each constituent that is wanted, and the probability that the touch is of a material never felt.
+        """Each constituent that is wanted, and the probability that the touch is of a material never observed.
 
-        feels_like: probability of each material observed. means: for each scale the touch's mean features in the codes'
-        unit, (d,). columns: felt so far. expected: the probability of a material never observed before the touch.
+        feels_like: probability of each material observed. encoded: the touch, with the scales that are `needed`.
+        expected: the probability of a material never observed before the touch.
+
+        A touch through noise is composed of the described materials it feels like: the heads read what noise hides.
         """
-        stage = self._stage(columns)
+        if encoded.noisy:
+            return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0), expected
+        stage = self._stage(encoded.columns)
         heads, scales, calibration = self.stages[stage], self.model.stages[stage], self.model.calibrations[stage]
-        projected = {scale: self.model.selections[scale].readout.project(means[scale]) for scale in scales}
+        projected = {scale: self.model.selections[scale].readout.project(encoded.means[scale]) for scale in scales}
         z = combined(self.model, stage, space_of(self.model, stage).names, projected)
         distances = [float(self.model.selections[scale].readout.novelty(projected[scale])) for scale in scales]
         new = float(heads.novel(calibration.novelty(np.array(distances))))
@@ -77,13 +77,6 @@ class Composer:
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
         feels_like = _sharpened(feels_like, heads.sharpness)
         return self._constituents(wanted, heads, feels_like, z, unfamiliar), unfamiliar
-
-    def through_noise(self, wanted: Sequence[str], feels_like: Mapping[str, float]) -> tuple[Constituent, ...]:
-        """Each constituent that is wanted, of a touch felt through noise: by the described materials it feels like.
-
-        The heads read what noise hides, so they have no part in it.
-        """
-        return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0)
 
     def _constituents(
         self,

@@ -99,7 +99,7 @@ class HeadFitter:
         self.stage = stage
         self.space = space_of(model, stage)
         self.folds: dict[int, _MaterialSpace] = {}
-        self.touches = [touch for item in memory.pool if (touch := self._held_out(*item)) is not None]
+        self.touches = [touch for item in memory.sample if (touch := self._held_out(*item)) is not None]
         self._systems: dict[tuple[int | None, float, bytes], RidgeSystem] = {}
 
     def _held_out(self, material: str, key: bytes, sums: WindowSums) -> _HeldOutTouch | None:
@@ -171,7 +171,7 @@ class HeadFitter:
             dict(zip(self.model.selections[scale].names, statistics.totals(scale)[0], strict=True)) for scale in scales
         ]
         rows = []
-        for material, _, sums in self.memory.pool:
+        for material, _, sums in self.memory.sample:
             means, windows = sums.means(self.stage), set(sums.windows(self.stage))
             others = material in self.space.names and all(count[material] > 1 for count in counts)
             if means is not None and windows == {1} and others:

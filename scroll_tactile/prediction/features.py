@@ -49,7 +49,7 @@ class Encoded:
     @property
     def columns(self) -> int:
         """T, the columns of the image."""
-        return self.image.shape[1]
+        return int(self.image.shape[1])
 
 
 class FeatureExtractor:
@@ -92,9 +92,7 @@ class FeatureExtractor:
             rows[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
         return {scale: to_codes(np.concatenate(rows[scale]), self._embedding.bound) for scale in sorted(rows)}
 
-    def encode(
-        self, stream: Stream, model: Model, needed: Callable[[int], Sequence[Scale]]
-    ) -> Encoded:
+    def encode(self, stream: Stream, model: Model, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
         """What is evaluated of a `stream`: its part within the longest touch that was learned.
 
         model: of the memory; it knows that length, whether noisy touches were learned, and how dead channels are

@@ -10,9 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
-
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model

@@ -59,10 +59,10 @@ class Model:
             penalties = memory.plan.penalties or PENALTIES
             chosen = {scale: select(statistics, scale, kind, penalties) for scale in scales if scale != CHANNELS}
             selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
-            calibrations = calibrate(memory.pool, stages, selections, kind)
+            calibrations = calibrate(memory.sample, stages, selections, kind)
             noisy = None
             if all(scale in selections for scale in NOISE):
-                noisy = calibrate_stage(len(stages), memory.pool, [selections[scale] for scale in NOISE], kind)
+                noisy = calibrate_stage(len(stages), memory.sample, [selections[scale] for scale in NOISE], kind)
         give_back_scratch()
         names, longest = list(statistics.materials), statistics.longest
         return cls(kind, names, memory.plan, stages, selections, calibrations, longest, noisy, filling)
@@ -129,7 +129,9 @@ class Model:
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
-        groups = [self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
+        groups = [
+            self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]
+        ]
         return [
             (stage, members)
             for stage, members in enumerate(groups)

@@ -92,9 +92,9 @@ class Augmented(FrozenModel):
     def model_post_init(self, context: Any) -> None:
         """Refuse what would copy nothing, or thin nothing."""
         if not self.copies + self.noisy:
-            raise InputError(f"expected 1 copy or more in all; came {self}")
+            raise InputError(f"expected 1 copy or more in all; came {self!r}")
         if self.thinned and (self.speed < 2 or not self.copies):
-            raise InputError(f"expected, to be thinned, a copy and a speed of 2 or more; came {self}")
+            raise InputError(f"expected, to be thinned, a copy and a speed of 2 or more; came {self!r}")
 
     def to_json(self) -> dict[str, Any]:
         """All of it in JSON's types, as a memory keeps it.

@@ -11,8 +11,8 @@ from test_learner_machine import PAD, SETTINGS, fed, require_same, stream
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.embeddings import ModuleEmbedding
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.memory.plain import export_plain
 from scroll_tactile.pipelines.memories import open_for_upkeep
+from scroll_tactile.pipelines.plain_export import export_plain
 from store import Store
 
 FELT = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
@@ -139,8 +139,8 @@ class TestExport:
         assert [row["state"] for row in rows] == states
         with np.load(out / "statistics.npz") as arrays:
             assert arrays["materials"].tolist() == ["a", "b/ü", "c"]
-            for scale in whole._memory.statistics.scales:
-                rows = [whole._perception.features(whole_image(touch))[scale] for _, touch in left]
+            for scale in whole.memory.statistics.scales:
+                rows = [whole._extractor.features(whole_image(touch))[scale] for _, touch in left]
                 codes = np.concatenate([np.rint(np.asarray(one, float) * 2**20) for one in rows]).astype(np.int64)
                 assert np.array_equal(arrays[f"second-{scale}"], codes.T @ codes)
                 assert np.array_equal(arrays[f"sums-{scale}"].sum(axis=0), codes.sum(axis=0))

@@ -117,7 +117,7 @@ class TestEmbedding:
 class TestMemory:
     def test_what_each_observation_adds(self):
         learner = fed(FELT[:2])
-        statistics = learner._memory.statistics
+        statistics = learner.memory.statistics
         assert statistics.scales[:4] == (NOISE[0], BEGINNING, CHANNELS, NOISE[1])
         rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISE, BEGINNING, CHANNELS)]
         assert rows == [2 * 2, 2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
@@ -146,7 +146,7 @@ class TestMemory:
         learner.predict(stream((9, 60)))
         learner.observe("a", stream((8, 60)))
         assert learner.predict(stream((9, 60))).material == fresh.predict(stream((9, 60))).material
-        assert learner._present() is not learner.model()  # followed, and not fitted again
+        assert learner._current.present(learner._ledger) is not learner.model()  # followed, and not fitted again
 
     def test_f_star_is_refused(self):
         with pytest.raises(InputError, match="windows alone"):

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-import scroll_tactile.learner as learner_module
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
-from store import StoreError
+from store import Store, StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
 SCENE = Scene(sensor=PAD)
@@ -56,9 +56,6 @@ def test_the_buffer_has_its_size_and_is_shared_evenly():
     felt = {learner.observe(name, stream).key for name, stream in touches}
     assert {key for keys in learner.exemplars.values() for key in keys} <= felt
     assert taught("kernels", exemplars=0).exemplars == {}
-    small = taught("kernels", exemplar_bytes=20_000)
-    kept = sum(one.readings.nbytes for one in small._memory.exemplars)
-    assert 0 < kept <= 20_000
 
 
 @kinds
@@ -79,7 +76,7 @@ def test_f_stays_as_it_was_and_f_star_answers_only_where_it_did_better(kind):
 
 def kept(learner):
     """Make the learner answer with its f*, whatever came of it."""
-    learner._memory.tuned = dataclasses.replace(learner._memory.tuned, kept=True)
+    learner.memory.tuned = dataclasses.replace(learner.memory.tuned, kept=True)
     return learner
 
 
@@ -90,7 +87,7 @@ def test_an_f_star_that_is_kept_gives_the_probabilities(kind):
     kept(learner)
     probe = SCENE.touch(NAMES[2], 60)
     answer = learner.predict(probe, tuned=True)
-    reader = TunedReader(learner.embedding, learner._reading, learner._memory.tuned)
+    reader = TunedReader(learner.embedding, learner.plan, learner.memory.tuned)
     logits = reader.logits(tactile_image(probe))
     chances = np.exp(np.array([logits[name] for name in sorted(NAMES)]))
     expected = dict(zip(sorted(NAMES), chances / chances.sum(), strict=True))
@@ -136,7 +133,7 @@ def test_one_exemplar_is_one_read_of_the_store(tmp_path):
     with taught("kernels", path=tmp_path / "m") as learner:
         learner.fine_tune(epochs=1)
         stored, lengths = learner._ledger.store.latest(), []
-        for one in learner._memory.exemplars:
+        for one in learner.memory.exemplars:
             first = sum(lengths)
             rows = learner._ledger.store.read_rows(
                 "exemplar-readings", first, first + len(one.readings), generation=stored.number
@@ -221,8 +218,8 @@ def test_what_cannot_be_fine_tuned_says_why(tmp_path):
     ):
         with pytest.raises(errors.InputError, match="expected"):
             full.fine_tune(**settings)
-    for settings in ({"exemplars": -1}, {"exemplars": 2.5}, {"exemplar_bytes": -3}):
-        with pytest.raises(errors.InputError, match="whole number"):
+    for settings in ({"exemplars": -1}, {"exemplars": 2.5}, {"exemplar_bytes": 3}):
+        with pytest.raises(errors.InputError, match="exemplar"):
             TactileLearner(sensor=PAD, **settings)
     closed = taught("kernels", path=tmp_path / "m")
     closed.close()
@@ -275,7 +272,7 @@ def test_the_start_is_f_itself():
         learner = taught("kernels", readout=readout)
         model = learner.model()
         start = training.start_of(model, model.names)
-        features = TouchFeatures(learner.embedding, learner._reading)
+        features = TouchFeatures(learner.embedding, learner.plan)
         image = tactile_image(SCENE.touch(NAMES[3], 40))
         frozen = features.frozen(image)
         logits = start.bias + sum(frozen[width] @ start.heads[width] for width in start.heads)
@@ -323,13 +320,11 @@ def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, mon
         assert again.tuned_digest() == before
 
 
-def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path, monkeypatch):
+def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path):
     embedding = EMBEDDINGS["kernels"]()
-    made = learner_module.identity_of
-    without = lambda *given: {name: one for name, one in made(*given).items() if name != "exemplars"}  # noqa: E731
-    with monkeypatch.context() as patched:
-        patched.setattr(learner_module, "identity_of", without)
-        TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=embedding).close()
+    identity = Identity.of(PAD, embedding, None).to_json()
+    del identity["exemplars"]
+    Store.open(tmp_path / "m", identity=identity).close()
     with TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=8) as learner:
         for name, stream in touches:
             learner.observe(name, stream)

@@ -9,7 +9,7 @@ from test_taking_back import FELT, filled, spoil
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory.plain import export_plain
+from scroll_tactile.pipelines.plain_export import export_plain
 from store import ReadOnlyError, Store, StoreClosedError, StoreError, StoreFullError
 
 SAID = {"a": {"silk": 0.25, "wool": 0.75}, "b": {"silk": 1.0}, "d": {"soft": True, "wool": 0.5, "jute": None}}
@@ -93,7 +93,7 @@ def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
         if int(folder.name) != base:
             spoil(path, int(folder.name))
     with TactileLearner.open(path, **SETTINGS) as again:
-        assert again._memory.generation == base
+        assert again.memory.generation == base
         require_same(again, FELT, {name: one for name, one in SAID.items() if name != "a"})
 
 
@@ -176,9 +176,9 @@ class TestMerge:
 
 def test_without_a_path_it_is_said_all_the_same():
     learner = fed(FELT, SAID)
-    sequence = learner._memory.sequence
+    sequence = learner.memory.sequence
     learner.describe("c", {"silk": 1.0})
-    assert learner._memory.sequence == sequence == len(FELT)
+    assert learner.memory.sequence == sequence == len(FELT)
     require_same(learner, FELT, SAID | {"c": {"silk": 1.0}})
 
 

@@ -65,7 +65,7 @@ def filled(seeds):
 
 
 def content(memory):
-    pool = [(m, k, t.sums.tobytes(), t.pairs.tobytes()) for m, k, t in memory.pool]
+    pool = [(m, k, t.sums.tobytes(), t.pairs.tobytes()) for m, k, t in memory.sample]
     return memory.statistics.digest(), pool, memory.sequence
 
 
@@ -119,4 +119,4 @@ def test_a_full_memory_refuses_and_stays_as_it_was():
 def test_the_same_touch_twice_counts_twice_and_is_pooled_once():
     memory = filled([1, 1])
     assert memory.statistics.materials == {"b": 2}
-    assert len(memory.pool) == 1
+    assert len(memory.sample) == 1

@@ -499,7 +499,7 @@ def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
     assert newest != base
     (path / "generations" / f"{newest:08d}" / "observations" / "c" / "0" / "0").unlink()
     with TactileLearner.open(path, **SETTINGS) as learner:
-        assert learner._memory.generation == base
+        assert learner.memory.generation == base
         require_same(learner, expected)
         learner.retract(later)
         require_same(learner, expected[:-1])
@@ -555,7 +555,7 @@ def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(p
             require_same(reader, without(0))
             learner.observe("d", stream((9, 60)))
             learner.retract(receipts[1])
-            memory = reader._memory
+            memory = reader.memory
             memory._stale = True  # as when the retraction is replayed while the writer goes on
             memory.refill(reader._ledger.store)
             require_same(reader, without(0))
@@ -601,8 +601,8 @@ def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
         assert again.materials == whole.materials
         for at in (11, 8):
             gone = FELT[at][0], learner_key(FELT[at])
-            assert gone not in {(one.material, one.key) for one in again._memory.exemplars}
-            assert gone not in {(name, key) for name, key, _ in again._memory.pool}
+            assert gone not in {(one.material, one.key) for one in again.memory.exemplars}
+            assert gone not in {(name, key) for name, key, _ in again.memory.sample}
     assert "pool and exemplars now hold only what they held" in caplog.text
     assert repair_store(path).lost
     with TactileLearner.open(path, **SETTINGS) as again:

@@ -129,7 +129,7 @@ class TestSharpness:
         taught = self.taught("abcd")
         for name in "abcd":
             taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
-        composer = taught._fitted_composer(taught.model())
+        composer = taught._current.composer(taught._ledger, taught.model())
         assert composer.stages[0].sharpness == 1  # of many windows a touch
         sharpness = composer.stages[-1].sharpness
         assert sharpness > 1.1
@@ -155,7 +155,11 @@ class TestSharpness:
         taught = felt(["c", "l", "s"], 4)
         for name in "cls":
             taught.describe(name, described(mixtures()[name]))
-        assert [stage.sharpness for stage in taught._fitted_composer(taught.model()).stages] == [1.0, 1.0, 1.0]
+        assert [stage.sharpness for stage in taught._current.composer(taught._ledger, taught.model()).stages] == [
+            1.0,
+            1.0,
+            1.0,
+        ]
 
 
 class TestDescribing:
@@ -224,7 +228,7 @@ class TestDescribing:
             taught.compose(touch(mixtures()["s"], 0))
         taught.describe("s", {"silk": 1.0})
         said = taught.compose(touch(mixtures()["s"], 0))
-        assert (said["silk"].presence, said["silk"].unlearned) == (None, "nothing was felt yet")
+        assert (said["silk"].presence, said["silk"].unlearned) == (None, "nothing was observed yet")
         assert said.prediction.material is None
         taught.observe("s", touch(mixtures()["s"], 0))
         assert taught.compose(touch(mixtures()["s"], 1))["silk"].presence is None

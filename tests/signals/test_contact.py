@@ -7,8 +7,7 @@ from scroll_tactile import Frames, Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.embeddings.protocol import require_rest
 from scroll_tactile.errors import InputError, MismatchError, NoContactError, StreamError
-from scroll_tactile.memory.identity import identity_of
-from scroll_tactile.memory.state import Capacity
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pressed
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
@@ -94,9 +93,9 @@ def test_an_embedding_that_cannot_read_the_sensor_leaves_no_memory_behind(tmp_pa
 
 
 def test_a_cameras_memory_says_that_its_windows_are_frames_and_one_that_does_not_is_refused(tmp_path):
-    identity = identity_of(SMALL, Kernels(dimension=64), Capacity(0))
+    identity = Identity.of(SMALL, Kernels(dimension=64), 0).to_json()
     assert identity["grid"].pop("frames") is True
-    assert "frames" not in identity_of(sensors.BIOTAC, Kernels(dimension=64), Capacity(0))["grid"]
+    assert "frames" not in Identity.of(sensors.BIOTAC, Kernels(dimension=64), 0).to_json()["grid"]
     Store.open(tmp_path / "old", identity=identity).close()
     with pytest.raises(MismatchError, match="was made with"):
         TactileLearner.open(tmp_path / "old", sensor=SMALL, embedding=Kernels(dimension=64))

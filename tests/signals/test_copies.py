@@ -25,7 +25,7 @@ def both(augmentation, image, key):
 
 
 def contents(learner):
-    pool = [(name, key, touch.sums.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner._memory.pool]
+    pool = [(name, key, touch.sums.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
     answers = [learner.predict(stream(touch)) for touch in ((7, 25), (9, 60))]
     return learner.digest(), learner.exemplars, pool, answers
 
@@ -118,7 +118,7 @@ class TestCopies:
         ],
     )
     def test_strengths_that_cannot_be_are_refused(self, wrong):
-        with pytest.raises(InputError, match="came Augmented"):
+        with pytest.raises(InputError, match=r"expected .*; came "):
             Augmented(**wrong)
 
 
@@ -127,8 +127,8 @@ class TestAugmentedObservation:
         augmented, plain = fed(FELT), fed(FELT, augmentation=None)
         assert augmented.materials == plain.materials == {"a": 3, "b": 3}
         assert augmented.digest() != plain.digest()
-        own = [touch.sums.tobytes() for *_, touch in plain._memory.pool]
-        assert [touch.sums.tobytes() for *_, touch in augmented._memory.pool] == own
+        own = [touch.sums.tobytes() for *_, touch in plain.memory.sample]
+        assert [touch.sums.tobytes() for *_, touch in augmented.memory.sample] == own
 
     def test_every_order_gives_the_same_bytes(self):
         few = FELT[:4]
@@ -162,10 +162,10 @@ class TestAugmentedObservation:
 
     def test_copies_make_no_touch_longer(self):
         learner = fed([("a", (seed, 16)) for seed in range(4)], augmentation=Augmented(copies=3, speed=4))
-        assert learner._memory.statistics.longest == 16
-        shortest, longest = learner._reading.windows
-        assert learner._memory.statistics.names(shortest) == ["a"]
-        assert learner._memory.statistics.names(longest) == []
+        assert learner.memory.statistics.longest == 16
+        shortest, longest = learner.plan.windows
+        assert learner.memory.statistics.names(shortest) == ["a"]
+        assert learner.memory.statistics.names(longest) == []
 
 
 class TestIdentity:

@@ -184,7 +184,7 @@ class Objects:
         said = [learner.compose(self.recordings.streams[at], unfamiliar=1.0) for at in exam]
         keys = list(next(iter(self.attributes.values())))
         taught = {name: values for name, values in self.attributes.items() if name not in group}
-        heads = fit_heads(learner._memory.statistics, Scale("window", self._width), taught, keys)
+        heads = fit_heads(learner.memory.statistics, Scale("window", self._width), taught, keys)
         means = [in_units(self._read(self._waves, at), self._waves.bound).mean(axis=0) for at in exam]
         told: dict[str, dict[str, Any]] = {}
         for key in keys:

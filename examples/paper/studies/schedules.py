@@ -171,11 +171,11 @@ def _learn(
 def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
     """One learner, in memory, that has felt what all of these have."""
     joint = TactileLearner(sensor=learners[0].sensor, embedding=learners[0].embedding)
-    memory = joint._memory
+    memory = joint.memory
     for learner in learners:
-        memory.statistics = memory.statistics + learner._memory.statistics
-        for material, key, touch in learner._memory.pool:
-            memory.pool.add(material, key, touch)
+        memory.statistics = memory.statistics + learner.memory.statistics
+        for material, key, touch in learner.memory.sample:
+            memory.sample.add(material, key, touch)
     return joint
 
 

@@ -13,7 +13,7 @@ from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.prediction.features import Perception
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.readouts.shrinkage import Selection, select
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
@@ -52,7 +52,7 @@ class WidestFeatures:
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
         self._reading = reading
-        self._perception = Perception(sensor, embedding, reading, None)
+        self._perception = FeatureExtractor(sensor, embedding, reading, None)
         self._kept: dict[bytes, npt.NDArray[np.floating]] = {}
 
     def __call__(self, stream: Stream) -> npt.NDArray[np.floating]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 import os
@@ -16,11 +17,8 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.merge import withdrawn_in
-from scroll_tactile.memory.state import FELT, OBSERVE
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
-from store import Store
 
 __all__ = ["export_plain"]
 
@@ -54,65 +52,42 @@ def export_plain(
 
 
 def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, int], object]) -> None:
-    ledger = learner._ledger
-    with ledger.lock:
-        statistics, ranked, digest = ledger.memory.statistics, learner._ranked(), learner.digest()
-        if ledger.store is not None:
-            progress("observations", 0, 1)
-            _rows(target / "observations.csv", ["sequence", "material", "key", "time", "state"], _told(ledger.store))
-        if learner.descriptions:
-            header = ["material", "constituent", "present", "share"]
-            _rows(target / "descriptions.csv", header, _described(learner.descriptions))
-        progress("statistics", 0, 1)
-        with (target / "statistics.npz").open("wb") as file:
-            np.savez(file, allow_pickle=False, **_arrays(statistics))
-    exemplars = [(name, rank, one) for name, those in ranked.items() for rank, one in enumerate(those)]
+    # A snapshot: every file is then of one state, whatever is observed meanwhile.
+    held, journal = copy.deepcopy(learner), learner.observations()
+    if learner.path is not None:
+        progress("observations", 0, 1)
+        rows = [[row.sequence, row.material, row.key.hex(), _date(row.time), row.state] for row in journal]
+        _rows(target / "observations.csv", ["sequence", "material", "key", "time", "state"], rows)
+    if held.descriptions:
+        header = ["material", "constituent", "present", "share"]
+        _rows(target / "descriptions.csv", header, _described(held.descriptions))
+    progress("statistics", 0, 1)
+    with (target / "statistics.npz").open("wb") as file:
+        np.savez(file, allow_pickle=False, **_arrays(held.memory.statistics))
+    ranked = held.ranked_exemplars().items()
+    exemplars = [(name, rank, exemplar) for name, kept in ranked for rank, exemplar in enumerate(kept)]
     (target / "exemplars").mkdir()
     index: list[list[Any]] = []
-    for at, (name, rank, one) in enumerate(exemplars, start=1):
-        file_name = f"exemplars/{at:06d}.npy"
-        index.append([name, rank, one.key.hex(), file_name])
-        np.save(target / file_name, one.readings, allow_pickle=False)
-        progress("exemplars", at, len(exemplars))
+    for number, (name, rank, exemplar) in enumerate(exemplars, start=1):
+        file_name = f"exemplars/{number:06d}.npy"
+        index.append([name, rank, exemplar.key.hex(), file_name])
+        np.save(target / file_name, exemplar.readings, allow_pickle=False)
+        progress("exemplars", number, len(exemplars))
     _rows(target / "exemplars.csv", ["material", "rank", "key", "file"], index)
-    embedding = learner.embedding
     about = {
-        "digest": digest,
+        "digest": held.digest(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "materials": learner.materials,
-        "sensor": learner.sensor.model_dump(mode="json"),
-        "embedding": {
-            "name": embedding.name,
-            "dimension": embedding.dimension,
-            "bound": embedding.bound,
-            "fingerprint": embedding.fingerprint,
-        },
+        "materials": held.materials,
+        "sensor": held.sensor.model_dump(mode="json"),
+        "embedding": {name: getattr(held.embedding, name) for name in ("name", "dimension", "bound", "fingerprint")},
         "unit": f"bound / 2**{BITS}",
         "folds": FOLDS,
     }
     (target / "memory.json").write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _told(store: Store) -> list[list[Any]]:
-    heads, compacted = list(store.heads()), store.compacted
-    gone = withdrawn_in(heads)
-
-    def state(sequence: int, kind: str) -> str:
-        if sequence in gone:
-            return "retracted"
-        return "compacted" if sequence <= compacted or kind == FELT else "kept"
-
-    return [
-        [
-            one.sequence,
-            one.label,
-            one.key.hex(),
-            datetime.fromtimestamp(one.time, UTC).isoformat(timespec="milliseconds"),
-            state(one.sequence, one.kind),
-        ]
-        for one in heads
-        if one.kind in (OBSERVE, FELT)
-    ]
+def _date(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
 
 
 def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:

@@ -110,7 +110,7 @@ def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[st
         if isinstance(number, bool) or not isinstance(number, int) or number < least:
             raise InputError(f"expected {what} as a whole number of {least} or more; came {number!r}")
     if sum(map(len, exemplars.values())) == 0:
-        raise InputError("expected exemplars to fine-tune on; the buffer is empty. Make a memory with exemplars > 0")
+        raise InputError("expected exemplars to fine-tune on; the buffer is empty. Open a memory with exemplars > 0")
     if len(exemplars) < 2:
         raise InputError(
             f"expected at least two materials, to be told apart; the buffer has exemplars of {list(exemplars)} only"

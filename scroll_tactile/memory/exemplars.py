@@ -1,4 +1,4 @@
-"""Exemplars: the bounded set of raw streams that fine-tuning is done on, a function of what was felt, not of when.
+"""Exemplars: the bounded set of raw streams for fine-tuning, a function of what was observed and not of the order.
 
 S. Rebuffi et al. (iCaRL, CVPR 2017, algorithm 4) herd: they pick streams whose mean stays next to the class mean.
 Herding at every observation, as SCROLL does, makes the choice depend on the order. Here candidates are kept that only
@@ -107,8 +107,8 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
         raise InputError(f"expected numbers of streams, 0 or more; came capacity {capacity} and {dict(available)}")
     places, left = {}, capacity
     ascending = sorted(available, key=lambda name: (available[name], name))
-    for at, name in enumerate(ascending):
-        places[name] = min(-(-left // (len(ascending) - at)), available[name])
+    for i, name in enumerate(ascending):
+        places[name] = min(-(-left // (len(ascending) - i)), available[name])
         left -= places[name]
     return {name: places[name] for name in sorted(places)}
 
@@ -142,25 +142,22 @@ class Exemplar:
 
 
 class ExemplarSample:
-    """The candidates for the buffer: a function of the set of streams felt (see `Sample`).
+    """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
 
-    capacity: streams in the buffer; `ratio` times as many candidates are kept. None: no limit in numbers.
-    capacity_bytes: of readings kept, those of all candidates together. None: no limit in bytes. With this limit each
-        candidate is counted as large as the longest stream of its material that was felt, and a stream that takes
-        more than an eighth of it is not kept.
+    capacity: streams in the buffer; `ratio` times as many candidates are kept.
     ratio: the nearer to 1, the less there is to herd; at 1 the buffer is a random choice.
 
-    Raises InputError where neither limit is given, or one below 1.
+    Raises InputError for a capacity or ratio below 1.
     """
 
-    def __init__(
-        self, capacity: int | None = None, *, capacity_bytes: int | None = None, ratio: int = CANDIDATES
-    ) -> None:
-        if ratio < 1:
-            raise InputError(f"expected a ratio of candidates to exemplars of 1 or more; came {ratio}")
+    def __init__(self, capacity: int, *, ratio: int = CANDIDATES) -> None:
+        if min(capacity, ratio) < 1:
+            raise InputError(
+                f"expected a capacity and a ratio of candidates to exemplars of 1 or more; came {capacity} and {ratio}"
+            )
         self.capacity = capacity
         self.ratio = ratio
-        self._sample: Sample[Exemplar] = Sample(None if capacity is None else ratio * capacity, capacity_bytes)
+        self._sample: Sample[Exemplar] = Sample(ratio * capacity)
 
     def __len__(self) -> int:
         return len(self._sample)
@@ -170,117 +167,91 @@ class ExemplarSample:
         for *_, exemplar in self._sample:
             yield exemplar
 
-    @property
-    def capacity_bytes(self) -> int | None:
-        """The limit of bytes of readings kept."""
-        return self._sample.limit
+    def holds(self, material: str, key: bytes) -> bool:
+        """Whether a stream is a candidate; if not, it can be retracted without a change here."""
+        return self._sample.holds(material, key)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the readings that are kept."""
-        return sum(exemplar.readings.nbytes for exemplar in self)
-
-    def wants(self, material: str, key: bytes, nbytes: int) -> bool:
-        """Whether adding a stream whose readings have so many bytes changes the pool; where not, it can be left out."""
-        return self._sample.wants(material, key, nbytes)
+    def wants(self, material: str, key: bytes) -> bool:
+        """Whether `add` would keep a stream."""
+        return self._sample.wants(material, key)
 
     def add(self, exemplar: Exemplar) -> None:
         """Add a stream where it belongs in, and drop what falls out."""
-        self._sample.add(*_entry(exemplar))
+        self._sample.add(exemplar.material, exemplar.key, exemplar)
 
-    def depends_on(self, material: str, key: bytes) -> bool:
-        """Whether taking a stream that was felt out again can change the pool."""
-        return self._sample.depends_on(material, key)
-
-    def refill(self, felt: Iterable[tuple[str, bytes, int, int]], make: Callable[[str, bytes, int], Exemplar]) -> None:
-        """Add all streams felt; see `Sample.refill`."""
-        self._sample.refill(felt, make)
+    def refill(self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], Exemplar]) -> None:
+        """Add all streams; see `Sample.refill`."""
+        self._sample.refill(streams, make)
 
     def update(self, other: ExemplarSample) -> None:
-        """Add all that another pool stands for: this one is then as if it had felt what both did.
+        """Add all candidates of another sample: this one is then as if it had observed what both did.
 
-        Raises MismatchError where their limits differ.
+        Raises MismatchError where their capacities differ.
         """
-        if (self.capacity, self.capacity_bytes, self.ratio) != (other.capacity, other.capacity_bytes, other.ratio):
+        if (self.capacity, self.ratio) != (other.capacity, other.ratio):
             raise MismatchError(
-                f"expected a pool of {self.capacity} exemplars, {self.capacity_bytes} bytes and ratio {self.ratio}; "
-                f"came one of {other.capacity}, {other.capacity_bytes} and {other.ratio}. Open both with one capacity"
+                f"expected candidates for {self.capacity} exemplars at ratio {self.ratio}; came those for "
+                f"{other.capacity} at {other.ratio}. Open both with one capacity"
             )
-        self._sample.update(other._sample.notes(), map(_entry, other))
+        self._sample.update(other._sample)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """What a store keeps: arrays by name, and JSON beside them.
 
         The readings lie one behind another on the time axis, exemplar-lengths many of each.
         """
-        entries = list(self)
+        exemplars = list(self)
+        codes, readings = [exemplar.code for exemplar in exemplars], [exemplar.readings for exemplar in exemplars]
         arrays: dict[str, npt.NDArray[Any]] = {
-            "exemplar-keys": np.array([list(one.key) for one in entries] or [[]], np.uint8)[: len(entries)],
-            "exemplar-lengths": np.array([len(one.readings) for one in entries], np.int64),
-            "exemplar-scales": np.array([one.scale for one in entries], np.int64),
-            "exemplar-codes": np.stack([one.code for one in entries]) if entries else np.zeros((0, 0), np.int32),
-            "exemplar-readings": (
-                np.concatenate([one.readings for one in entries]) if entries else np.zeros((0, 0), np.float32)
-            ),
+            "exemplar-keys": np.array([list(exemplar.key) for exemplar in exemplars] or [[]], np.uint8)[: len(self)],
+            "exemplar-lengths": np.array([len(stream) for stream in readings], np.int64),
+            "exemplar-scales": np.array([int(exemplar.scale) for exemplar in exemplars], np.int64),
+            "exemplar-codes": np.stack(codes) if codes else np.zeros((0, 0), np.int32),
+            "exemplar-readings": np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
         }
-        return arrays, {"materials": [one.material for one in entries], "felt": self._sample.notes()}
+        # Version 0.1 reads in "felt" what a limit in bytes had dropped.
+        return arrays, {"materials": [exemplar.material for exemplar in exemplars], "felt": {}}
 
     @classmethod
     def from_arrays(
         cls,
         arrays: Mapping[str, npt.NDArray[Any]],
         attributes: Mapping[str, Any],
-        capacity: int | None = None,
+        capacity: int,
         *,
-        capacity_bytes: int | None = None,
         ratio: int = CANDIDATES,
     ) -> ExemplarSample:
-        """The pool that `to_arrays` described, or one of less capacity.
+        """The sample that `to_arrays` described, or one of less capacity.
 
-        With more capacity, or another limit of bytes, it is not the pool that feeling everything again would give.
+        With more capacity it is not the sample that observing everything again would give.
         """
-        pool = cls(capacity, capacity_bytes=capacity_bytes, ratio=ratio)
+        sample = cls(capacity, ratio=ratio)
         readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
         rows = zip(arrays["exemplar-keys"], arrays["exemplar-codes"], arrays["exemplar-scales"], strict=True)
-        exemplars = [
-            Exemplar(material, key.tobytes(), readings[at].copy(), code, Scale.numbered(int(scale)))
-            for at, (material, (key, code, scale)) in enumerate(zip(attributes["materials"], rows, strict=True))
-        ]
-        pool._sample.update(attributes["felt"], map(_entry, exemplars))
-        return pool
+        for i, (material, (key, code, scale)) in enumerate(zip(attributes["materials"], rows, strict=True)):
+            sample.add(Exemplar(material, key.tobytes(), readings[i].copy(), code, Scale.numbered(int(scale))))
+        return sample
 
 
-def _entry(one: Exemplar) -> tuple[str, bytes, Exemplar, int]:
-    return one.material, one.key, one, one.readings.nbytes
-
-
-def rank(pool: ExemplarSample, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
+def rank(sample: ExemplarSample, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.
-    Herded are the candidates of the widest scale that the material has; those felt too briefly for it come behind,
-    by scale and key. A smaller buffer is a beginning of a larger one.
+    Herded are the candidates of the widest scale that the material has; those too brief for it come behind, by scale
+    and key. A smaller buffer is a beginning of a larger one.
     """
     candidates: dict[str, list[Exemplar]] = {}
-    for one in pool:
-        candidates.setdefault(one.material, []).append(one)
-    places = quotas({name: len(those) for name, those in candidates.items()}, pool.capacity or len(pool))
-    return {name: _herded(candidates[name], means, count) for name, count in places.items() if count}
+    for exemplar in sample:
+        candidates.setdefault(exemplar.material, []).append(exemplar)
+    places = quotas({material: len(exemplars) for material, exemplars in candidates.items()}, sample.capacity)
+    return {material: _herded(candidates[material], means, count) for material, count in places.items() if count}
 
 
 def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray], count: int) -> list[Exemplar]:
-    widest = max(one.scale for one in candidates)
-    first = [one for one in candidates if one.scale == widest]
-    brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-int(one.scale), one.key))
-    codes, mean = np.stack([one.code for one in first]), means(candidates[0].material, widest)
-    return ([first[at] for at in herd(codes, [one.key for one in first], mean, count)] + brief)[:count]
-
-
-def ranked_exemplars(sample: ExemplarSample, statistics: Statistics) -> dict[str, list[Exemplar]]:
-    """The buffer, as `rank`, against the exact means of all that was observed."""
-
-    def mean(material: str, scale: Scale) -> IntArray:
-        total = statistics.sums(scale, [material]).sum(axis=(0, 1))
-        return mean_code(total, int(statistics.counts(scale, [material]).sum()))
-
-    return rank(sample, mean)
+    widest = max(exemplar.scale for exemplar in candidates)
+    wide = [exemplar for exemplar in candidates if exemplar.scale == widest]
+    brief = [exemplar for exemplar in candidates if exemplar.scale != widest]
+    brief.sort(key=lambda exemplar: (-int(exemplar.scale), exemplar.key))
+    codes, keys = np.stack([exemplar.code for exemplar in wide]), [exemplar.key for exemplar in wide]
+    order = herd(codes, keys, means(candidates[0].material, widest), count)
+    return ([wide[place] for place in order] + brief)[:count]

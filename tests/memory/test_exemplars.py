@@ -1,6 +1,7 @@
 """The buffer: herded exactly, spread evenly, and a function of what was felt, not of when."""
 
 from collections import Counter
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,9 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from examples.benchmarks.buffers import compare
+from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarSample, herd, mean_code, quotas, rank
-from scroll_tactile.statistics.sample import LARGEST_SHARE
+from scroll_tactile.memory.identity import identity_of
+from scroll_tactile.memory.state import Capacity
+from scroll_tactile.signals.windows import Scale
+from store import Store
 
 few = settings(max_examples=150, deadline=None)
 LARGEST = 2**20
@@ -157,147 +162,91 @@ def test_negative_numbers_are_refused(available, capacity):
 # --- candidates ---
 
 
-def exemplar(material, number, length, scale=1):
-    """A stream of `length` readings of four bytes; number gives its key."""
+def exemplar(material, number, scale=1):
+    """A stream of two readings of four bytes; number gives its key."""
     code = np.random.default_rng([number, ord(material[0])]).integers(-LARGEST, LARGEST, 3).astype(np.int32)
-    return Exemplar(material, bytes([number]), np.full((length, 1), number, np.float32), code, scale)
+    return Exemplar(material, bytes([number]), np.full((2, 1), number, np.float32), code, Scale("window", scale))
 
 
-def pool_of(felt, **limits):
-    pool = ExemplarSample(**limits)
-    for material, number, length in felt:
-        one = exemplar(material, number, length)
-        before = state(pool)
-        wanted = pool.wants(material, one.key, one.readings.nbytes)
-        assert state(pool) == before
-        pool.add(one)
-        assert wanted == (state(pool) != before)
-    return pool
+def sample_of(streams, capacity=3, ratio=CANDIDATES):
+    sample = ExemplarSample(capacity, ratio=ratio)
+    for material, number in streams:
+        candidate = exemplar(material, number)
+        before, wanted = state(sample), sample.wants(material, candidate.key)
+        sample.add(candidate)
+        assert wanted == (state(sample) != before)
+    return sample
 
 
-def state(pool):
-    arrays, attributes = pool.to_arrays()
+def state(sample):
+    arrays, attributes = sample.to_arrays()
     return {name: (array.shape, array.tobytes()) for name, array in arrays.items()}, attributes
 
 
-def held(pool):
-    return [(one.material, one.key[0]) for one in pool]
+def held(sample):
+    return [(candidate.material, candidate.key[0]) for candidate in sample]
 
 
-def expected(felt, capacity, capacity_bytes, ratio):
-    """The definition, from the whole set: the longest beginning that fits, in numbers and in counted bytes."""
-    sizes = {(material, number): 4 * length for material, number, length in felt}
-    if capacity_bytes is not None:
-        sizes = {who: size for who, size in sizes.items() if size <= capacity_bytes // LARGEST_SHARE}
-    numbers = {name: sorted(number for other, number in sizes if other == name) for name, _ in sizes}
-    order = sorted((at, number, name) for name, those in numbers.items() for at, number in enumerate(those))
-    largest = {name: max(size for (other, _), size in sizes.items() if other == name) for name in numbers}
-    kept, counted = [], 0
-    for _, number, name in order:
-        counted += largest[name]
-        if capacity is not None and len(kept) == ratio * capacity:
-            break
-        if capacity_bytes is not None and counted > capacity_bytes:
-            break
-        kept.append((name, number))
-    return sorted(kept)
+streams = st.lists(st.tuples(st.sampled_from("abcdef"), st.integers(0, 25)), max_size=40)
+limits = st.fixed_dictionaries({"capacity": st.integers(1, 8), "ratio": st.integers(1, 3)})
 
 
-def length_of(name, number, salt):
-    """A key belongs to one content, so length follows from it: equal ones, or each material with lengths of its own."""
-    least = {"a": 1, "b": 6, "c": 1, "d": 3, "e": 6, "f": 1}[name]
-    return 2 if salt == 0 else least + (7 * number + salt) % (1 + salt)
-
-
-streams = st.tuples(
-    st.lists(st.tuples(st.sampled_from("abcdef"), st.integers(0, 25)), max_size=40), st.integers(0, 3)
-).map(lambda drawn: [(name, number, length_of(name, number, drawn[1])) for name, number in drawn[0]])
-limits = st.one_of(
-    st.fixed_dictionaries({"capacity": st.integers(1, 8), "ratio": st.integers(1, 3)}),
-    st.fixed_dictionaries({"capacity_bytes": st.integers(150, 350)}),
-    st.fixed_dictionaries({"capacity": st.integers(1, 8), "capacity_bytes": st.integers(8, 350), "ratio": st.just(2)}),
-)
-
-
-@settings(max_examples=400, deadline=None)
-@given(streams, limits, st.randoms(use_true_random=False))
-def test_any_order_keeps_what_the_definition_says(felt, limits, random):
-    pool = pool_of(felt, **limits)
-    asked = {"capacity": None, "capacity_bytes": None, "ratio": CANDIDATES} | limits
-    assert held(pool) == expected(felt, **asked)
-    assert pool.nbytes == sum(one.readings.nbytes for one in pool) <= (pool.capacity_bytes or pool.nbytes)
-    shuffled = felt.copy()
+@few
+@given(streams, streams, limits, st.randoms(use_true_random=False))
+def test_any_order_split_merge_or_restart_keeps_what_the_definition_says(ours, theirs, limits, random):
+    """The definition: by rank of the key in its material, key, material, the first that fit."""
+    observed = {name: sorted({number for other, number in ours + theirs if other == name}) for name, _ in ours + theirs}
+    order = sorted((i, number, name) for name, numbers in observed.items() for i, number in enumerate(numbers))
+    expected = sorted((name, number) for _, number, name in order[: limits["capacity"] * limits["ratio"]])
+    together = sample_of(ours + theirs, **limits)
+    assert held(together) == expected
+    shuffled = ours + theirs
     random.shuffle(shuffled)
-    assert state(pool_of(shuffled, **limits)) == state(pool)
-
-
-@few
-@given(streams, streams, limits)
-def test_a_pool_of_two_pools_is_the_pool_of_all(ours, theirs, limits):
-    known = {(name, number): length for name, number, length in ours}
-    theirs = [(name, number, known.get((name, number), length)) for name, number, length in theirs]
-    joint = pool_of(ours, **limits)
-    joint.update(pool_of(theirs, **limits))
-    assert state(joint) == state(pool_of(ours + theirs, **limits))
-
-
-@few
-@given(streams, streams, limits)
-def test_a_pool_that_was_kept_goes_on_as_if_it_had_not_been(before, after, limits):
-    pool = pool_of(before, **limits)
-    again = ExemplarSample.from_arrays(*pool.to_arrays(), **limits)
-    assert state(again) == state(pool)
-    known = {(name, number): length for name, number, length in before}
-    for name, number, length in after:
-        for one in (pool, again):
-            one.add(exemplar(name, number, known.setdefault((name, number), length)))
-    assert state(again) == state(pool)
+    assert state(sample_of(shuffled, **limits)) == state(together)
+    merged = sample_of(ours, **limits)
+    merged.update(sample_of(theirs, **limits))
+    assert state(merged) == state(together)
+    restarted = ExemplarSample.from_arrays(*sample_of(ours, **limits).to_arrays(), **limits)
+    for stream in theirs:
+        restarted.add(exemplar(*stream))
+    assert state(restarted) == state(together)
 
 
 @few
 @given(streams, st.integers(1, 6))
-def test_a_pool_of_less_capacity_is_the_beginning_of_it(felt, capacity):
-    large = pool_of(felt, capacity=6)
-    assert held(ExemplarSample.from_arrays(*large.to_arrays(), capacity)) == held(pool_of(felt, capacity=capacity))
+def test_a_sample_of_less_capacity_is_the_beginning_of_it(observed, capacity):
+    large = sample_of(observed, capacity=6)
+    assert held(ExemplarSample.from_arrays(*large.to_arrays(), capacity)) == held(sample_of(observed, capacity))
 
 
-def test_a_short_stream_in_place_of_a_long_one_lets_nothing_back_in():
-    # While b's fifth stream is the first that finds no room, a's two are long; the short one that takes the first
-    # rank from them would make room for it, in the order in which b's is felt last.
-    felt = [("a", 5, 12), ("a", 6, 12), *[("b", number, 12) for number in range(7, 15)]]
-    short = ("a", 1, 1)
-    first, last = pool_of([short, *felt], capacity_bytes=400), pool_of([*felt, short], capacity_bytes=400)
-    assert state(first) == state(last)
-    assert ("a", 1) in held(last)
-
-
-def test_behind_a_stream_that_found_no_room_there_is_none_for_a_shorter_one():
-    # b's fourth stream finds no room; c's fourth would, but comes after it.
-    long = [*[("a", number, 10) for number in range(1, 5)], *[("b", number, 10) for number in range(5, 9)]]
-    short = [("c", number, 1) for number in range(20, 24)]
-    for order in (long + short, short + long, short[2:] + long + short[:2]):
-        pool = pool_of(order, capacity_bytes=330)
-        assert held(pool) == expected(order, None, 330, CANDIDATES)
-        assert ("b", 8) not in held(pool)
-        assert ("c", 23) not in held(pool)
-
-
-def test_one_very_long_stream_pushes_out_nothing():
-    felt = [("a", number, 10) for number in range(1, 9)]
-    assert held(pool_of([("b", 0, 1000), *felt], capacity_bytes=320)) == held(pool_of(felt, capacity_bytes=320))
-
-
-def test_pools_of_other_limits_are_not_merged():
-    with pytest.raises(MismatchError, match="came one of 3, None"):
+def test_samples_of_other_capacities_are_not_merged():
+    with pytest.raises(MismatchError, match="2 exemplars at ratio 3; came those for 3 at 3"):
         ExemplarSample(2).update(ExemplarSample(3))
 
 
-@pytest.mark.parametrize(
-    "wrong", [{}, {"capacity": 0}, {"capacity": -1}, {"capacity_bytes": 0}, {"capacity": 1, "ratio": 0}]
-)
-def test_a_pool_that_could_hold_nothing_or_everything_is_refused(wrong):
-    with pytest.raises(InputError, match="expected"):
+@pytest.mark.parametrize("wrong", [{"capacity": 0}, {"capacity": -1}, {"capacity": 1, "ratio": 0}])
+def test_a_sample_that_could_hold_nothing_is_refused(wrong):
+    with pytest.raises(InputError, match="1 or more"):
         ExemplarSample(**wrong)
+
+
+@pytest.mark.parametrize(("kept", "size"), [([None, 3000], 400), ([4, 3000], 4), ([4, None], 4)])
+def test_a_memory_that_0_1_made_with_a_limit_in_bytes_opens_with_its_count_or_the_usual_one(kept, size, tmp_path):
+    pad = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+    embedding = Kernels(dimension=64)
+    Store.open(tmp_path, identity=identity_of(pad, embedding, Capacity()) | {"exemplars": kept}).close()
+    with TactileLearner.open(tmp_path, embedding=embedding) as learner:
+        for seed in range(6):
+            learner.observe("ab"[seed % 2], np.random.default_rng(seed).random((50, 2)))
+        assert sum(map(len, learner.exemplars.values())) == min(size, 6)
+    with pytest.raises(MismatchError, match=f"exemplars={size}; it was opened with 7"):
+        TactileLearner.open(tmp_path, embedding=embedding, exemplars=7)
+
+
+def test_what_0_1_noted_of_streams_dropped_for_their_bytes_is_passed_over():
+    arrays, attributes = sample_of([("a", 1), ("a", 2), ("b", 9)]).to_arrays()
+    again = ExemplarSample.from_arrays(arrays, attributes | {"felt": {"a": [8, "02"], "b": [4000, None]}}, 3)
+    assert held(again) == [("a", 1), ("a", 2), ("b", 9)]
 
 
 def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
@@ -315,43 +264,42 @@ def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
 
 @few
 @given(streams, st.integers(1, 10), st.randoms(use_true_random=False))
-def test_the_buffer_depends_on_no_order_and_is_even(felt, capacity, random):
-    def buffer(felt, capacity=capacity):
-        ranked = rank(pool_of(felt, capacity=capacity, ratio=3), lambda material, _: np.full(3, ord(material)))
-        return {name: [one.key for one in those] for name, those in ranked.items()}
+def test_the_buffer_depends_on_no_order_and_is_even(observed, capacity, random):
+    def buffer(observed):
+        ranked = rank(sample_of(observed, capacity), lambda material, _: np.full(3, ord(material)))
+        return {name: [exemplar.key for exemplar in exemplars] for name, exemplars in ranked.items()}
 
-    found = buffer(felt)
-    shuffled = felt.copy()
+    found = buffer(observed)
+    shuffled = observed.copy()
     random.shuffle(shuffled)
     assert list(buffer(shuffled).items()) == list(found.items())
     assert list(found) == sorted(found)
-    there = Counter(name for name, _ in {(name, number) for name, number, _ in felt})
-    assert sum(map(len, found.values())) == min(capacity, sum(there.values()))
-    for name, count in there.items():
+    available = Counter(name for name, _ in set(observed))
+    assert sum(map(len, found.values())) == min(capacity, sum(available.values()))
+    for name, count in available.items():
         if len(found.get(name, [])) < count:
             assert len(found.get(name, [])) >= max(map(len, found.values())) - 1
 
 
 def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind():
-    pool = ExemplarSample(6)
-    near, far, brief, briefer = (exemplar("a", number, 2) for number in (9, 1, 7, 8))
-    scales, codes = (20, 20, 5, 5), ([1, 0, 0], [90, 0, 0], [0, 0, 0], [0, 0, 0])
-    for one, scale, code in zip((near, far, brief, briefer), scales, codes, strict=True):
-        pool.add(Exemplar("a", one.key, one.readings, np.array(code, np.int32), scale))
+    sample = ExemplarSample(6)
+    streams = {9: (20, [1, 0, 0]), 1: (20, [90, 0, 0]), 7: (5, [0, 0, 0]), 8: (5, [0, 0, 0])}
+    for number, (scale, code) in streams.items():
+        sample.add(replace(exemplar("a", number, scale), code=np.array(code, np.int32)))
     asked = []
 
     def means(material, scale):
         asked.append((material, scale))
         return np.zeros(3, np.int64)
 
-    assert [one.key[0] for one in rank(pool, means)["a"]] == [9, 1, 7, 8]
-    assert asked == [("a", 20)]
+    assert [exemplar.key[0] for exemplar in rank(sample, means)["a"]] == [9, 1, 7, 8]
+    assert asked == [("a", Scale("window", 20))]
 
 
 def test_no_candidates_make_no_buffer():
-    pool = ExemplarSample(3)
-    assert rank(pool, lambda *_: np.zeros(3, np.int64)) == {}
-    assert len(ExemplarSample.from_arrays(*pool.to_arrays(), 3)) == 0
+    sample = ExemplarSample(3)
+    assert rank(sample, lambda *_: np.zeros(3, np.int64)) == {}
+    assert len(ExemplarSample.from_arrays(*sample.to_arrays(), 3)) == 0
 
 
 def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():

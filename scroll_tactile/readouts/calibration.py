@@ -1,8 +1,13 @@
-"""From scores to probabilities, and from distances to "never felt this", by touches held out.
+"""Calibration: from scores to probabilities, and from distances to "never observed", by touches held out.
 
-Every touch of the pool is scored by the readouts of the folds that it is not in. On these scores one weight a
-scale is fitted (a temperature, and how far each scale is to be believed), and the novelty of materials that
-are known is measured. Both are functions of the statistics and the pool, so of what was felt and nothing else.
+The readouts of the folds that a sampled touch is not in score it. On these scores s one weight w_k a scale is fitted,
+which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706.04599):
+
+    p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
+
+w⁰ the prior and ρ the touches that it counts as. The novelty of known materials' touches is measured likewise, and
+an alarm's threshold is their conformal quantile (Vovk et al. 2005). All are functions of the statistics and the sample,
+so of what was observed and nothing else.
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ __all__ = ["FEWEST", "Calibration", "calibrate", "calibrate_stage", "fit_weights
 
 FloatArray = npt.NDArray[np.float64]
 
-FEWEST = 8  # held-out touches; with fewer, a stage keeps the weights and threshold that follow
+FEWEST = 8  # held-out touches; with fewer, a stage keeps the threshold and the spreads set beforehand
 PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
@@ -64,19 +69,19 @@ UNMEASURED = 5.0  # spreads: where too little could be held out to measure the d
 
 
 def calibrate(
-    pool: TouchSample, stages: Sequence[Sequence[Scale]], selections: Mapping[Scale, Selection], kind: ReadoutName
+    sample: TouchSample, stages: Sequence[Sequence[Scale]], selections: Mapping[Scale, Selection], kind: ReadoutName
 ) -> list[Calibration]:
     """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
     return [
-        calibrate_stage(stage, pool, [selections[scale] for scale in scales], kind)
+        calibrate_stage(stage, sample, [selections[scale] for scale in scales], kind)
         for stage, scales in enumerate(stages)
         if all(scale in selections for scale in scales)
     ]
 
 
-def calibrate_stage(stage: int, pool: TouchSample, selections: list[Selection], kind: ReadoutName) -> Calibration:
+def calibrate_stage(stage: int, sample: TouchSample, selections: list[Selection], kind: ReadoutName) -> Calibration:
     """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
-    scores, targets, distances = _held_out(stage, pool, selections, kind)
+    scores, targets, distances = _held_out(stage, sample, selections, kind)
     prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
     weights = fit_weights(scores, targets, prior)
     if len(distances) < FEWEST:
@@ -91,14 +96,14 @@ def calibrate_stage(stage: int, pool: TouchSample, selections: list[Selection], 
 
 
 def _held_out(
-    stage: int, pool: TouchSample, selections: list[Selection], kind: ReadoutName
+    stage: int, sample: TouchSample, selections: list[Selection], kind: ReadoutName
 ) -> tuple[list[FloatArray], list[int], FloatArray]:
     """Scores (scales, C') and target place of each held-out touch, and its distances (touches, scales)."""
     scores: list[FloatArray] = []
     targets: list[int] = []
     distances: list[FloatArray] = []
-    for material, key, touch in pool:
-        means = touch.means(stage)
+    for material, key, sums in sample:
+        means = sums.means(stage)
         judged = None if means is None else _judge(means, material, fold_of(key), selections, kind)
         if judged is not None:
             scores.append(judged[0])
@@ -112,15 +117,15 @@ def _judge(
 ) -> tuple[FloatArray, int, FloatArray] | None:
     if any(fold not in selection.held_out for selection in selections):
         return None
-    known = [[selection.names[at] for at in selection.held_out[fold][0]] for selection in selections]
+    known = [[selection.names[place] for place in selection.held_out[fold][0]] for selection in selections]
     common = sorted(set.intersection(*map(set, known)))
     if material not in common or len(common) < 2:
         return None
     rows, distances = [], []
-    for scale, selection in enumerate(selections):
+    for selection, names, mean in zip(selections, known, means, strict=True):
         readout = selection.held_out[fold][1]
-        z = readout.project(means[scale])
-        rows.append(readout.scores(z, kind)[[known[scale].index(name) for name in common]])
+        z = readout.project(mean)
+        rows.append(readout.scores(z, kind)[[names.index(name) for name in common]])
         distances.append(float(readout.novelty(z)))
     return np.stack(rows), common.index(material), np.array(distances)
 
@@ -130,10 +135,10 @@ def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray)
     if not scores:
         return prior
     groups: dict[int, list[int]] = {}
-    for at, one in enumerate(scores):
-        groups.setdefault(one.shape[1], []).append(at)
+    for touch, rows in enumerate(scores):
+        groups.setdefault(rows.shape[1], []).append(touch)
     # Scores less the target's, (touches, scales, classes), for each number of classes.
-    gaps = [np.stack([scores[at] - scores[at][:, [targets[at]]] for at in members]) for members in groups.values()]
+    gaps = [np.stack([scores[i] - scores[i][:, [targets[i]]] for i in touches]) for touches in groups.values()]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
         value, slope = 0.0, np.zeros_like(weights)
@@ -157,8 +162,8 @@ def _assumed(selections: list[Selection]) -> FloatArray:
     shapes = []
     for selection in selections:
         readout: Readout = selection.readout
-        at_means = readout.novelty(readout.gram)  # row y of G is z at the mean of class y
-        typical = float(np.mean(at_means))
+        # Row y of G is z at the mean of class y.
+        typical = float(np.mean(readout.novelty(readout.gram)))
         size = float(np.mean(np.diagonal(readout.gram)))
         shapes.append([typical, max(size, 1e-9) / UNMEASURED])
     return np.array(shapes)

@@ -1,8 +1,8 @@
-"""What readouts that never felt a touch say of it, by taking its row out of the statistics.
+"""Leave-one-out scores: of each touch by a readout that never observed it, its row taken out of the statistics.
 
-Readouts of folds know two thirds of what was felt, and are wrong more often than the one that answers; scores that
-are read as theirs deserve say too little. Let S = S_w + N λ V, W = N S⁻¹ Mᵀ and G = M W as in `readouts`. A row x of a
-material with n rows and mean m, u = x − m and q = uᵀ S⁻¹ u, leaves by
+Readouts of folds know two thirds of what was observed, and are wrong more often than the one that answers; scores that
+are calibrated on theirs are not sharp enough. Let S = S_w + N λ V, W = N S⁻¹ Mᵀ and G = M W as in `readouts`. A row x
+of a material with n rows and mean m, u = x − m and q = uᵀ S⁻¹ u, leaves by
 
     S⁻¹ + f S⁻¹ u uᵀ S⁻¹,  f = k / (1 − k q),  k = n / (n − 1)     (Sherman and Morrison 1950; Bartlett 1951)
 
@@ -31,7 +31,7 @@ FloatArray = npt.NDArray[np.float64]
 def leave_one_out_scores(
     statistics: Statistics, scale: Scale, readout: Readout, rows: FloatArray, places: Sequence[int]
 ) -> FloatArray:
-    """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been felt.
+    """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been observed.
 
     readout: of all the statistics of the scale. rows: in codes, shape (N, d), each one that was added to them.
     places: of their materials among the readout's classes, each of two rows or more, shape (N,).
@@ -41,8 +41,8 @@ def leave_one_out_scores(
     counts, sums = statistics.totals(scale)
     total = int(counts.sum())
     _, means = centred_means(counts, sums)
-    at = np.asarray(places, dtype=np.intp)
-    apart = rows - readout.center - means[at]
+    own = np.asarray(places, dtype=np.intp)
+    apart = rows - readout.center - means[own]
     system = within_scatter(statistics.total_second(scale), counts, sums)
     system[np.diag_indices_from(system)] += readout.penalties
     with one_thread():
@@ -51,18 +51,18 @@ def leave_one_out_scores(
         solved, _ = dpotrs(factor, apart.T, lower=0)
     length = np.einsum("nd,dn->n", apart, solved)
     along, gram = apart @ readout.weights / total, readout.gram / total
-    each, count = np.arange(len(at)), counts[at].astype(np.float64)
+    i, count = np.arange(len(own)), counts[own].astype(np.float64)
     gain = count / (count - 1)
     gain = gain / (1 - gain * length)
     # The products of the other materials' means with the row, then that of its own, which has lost it.
-    onto = gram[at] + along
+    onto = gram[own] + along
     reach = along.copy()  # S⁻¹ u on each mean
-    own, share = along[each, at], 1 / (count - 1)
-    onto[each, at] -= share * (own + length)
-    reach[each, at] -= share * length
-    sizes = np.tile(np.diagonal(gram), (len(at), 1))
-    sizes[each, at] += share * (share * length - 2 * own)
-    onto += (gain * (own + length))[:, None] * reach
+    mean, share = along[i, own], 1 / (count - 1)
+    onto[i, own] -= share * (mean + length)
+    reach[i, own] -= share * length
+    sizes = np.tile(np.diagonal(gram), (len(own), 1))
+    sizes[i, own] += share * (share * length - 2 * mean)
+    onto += (gain * (mean + length))[:, None] * reach
     sizes += gain[:, None] * np.square(reach)
     scores: FloatArray = total * (onto - sizes / 2)
     return scores

@@ -73,29 +73,27 @@ class _FoldTask:
 def select(
     statistics: Statistics, scale: Scale, kind: ReadoutName, penalties: Sequence[float] = PENALTIES
 ) -> Selection | None:
-    """Choose λ among the penalties and fit the readout of a scale; None where nothing was felt at it."""
+    """Choose λ among the penalties and fit the readout of a scale; None where it has no rows."""
     names = statistics.names(scale)
     if not names:
         return None
     counts, sums = statistics.counts(scale, names), statistics.sums(scale, names)
     total = statistics.total_second(scale)
-    trials = {
-        fold: trial for fold in range(FOLDS) if (trial := _fold_task(statistics, scale, fold, counts, sums, total))
-    }
-    fitted = {fold: fit_readouts(trial.task, penalties) for fold, trial in trials.items()}
-    lost = [_losses(trial, fitted[fold], kind) for fold, trial in trials.items()]
+    folds = {fold: held for fold in range(FOLDS) if (held := _fold_task(statistics, scale, fold, counts, sums, total))}
+    fitted = {fold: fit_readouts(held.task, penalties) for fold, held in folds.items()}
+    lost = [_losses(held, fitted[fold], kind) for fold, held in folds.items()]
     # Where nothing overlaps the logs are of the order of -1e308, and their sum may be -∞: that is no reason to warn.
     of_each = [sum(parts, 0.0) for parts in zip(*lost, strict=True)]
     losses = dict(zip(penalties, of_each, strict=True)) if lost else {}
     # Ties go to the larger λ, the tamer readout.
     chosen = min(sorted(losses, reverse=True), key=losses.__getitem__) if losses else DEFAULT
     readout = fit_readout(task_of(statistics, scale), chosen)
-    held_out = {fold: (trial.known, fitted[fold][penalties.index(chosen)]) for fold, trial in trials.items()}
+    held_out = {fold: (held.known, fitted[fold][penalties.index(chosen)]) for fold, held in folds.items()}
     return Selection(names, readout, held_out, losses)
 
 
 def task_of(statistics: Statistics, scale: Scale) -> Task:
-    """The task of all that was felt at a scale."""
+    """The task of all rows at a scale."""
     counts, sums = statistics.totals(scale)
     return Task.of(within_scatter(statistics.total_second(scale), counts, sums), counts, sums)
 
@@ -122,41 +120,41 @@ def _fold_task(
     return _FoldTask(known, task, in_fold, means, scatter)
 
 
-def _losses(trial: _FoldTask, readouts: Sequence[Readout], kind: ReadoutName) -> list[float]:
+def _losses(held: _FoldTask, readouts: Sequence[Readout], kind: ReadoutName) -> list[float]:
     # The weights of all λ side by side: one product in place of many thin ones.
     weights = np.hstack([readout.weights for readout in readouts])
-    spreads = np.split(dsymm(1.0, trial.scatter, weights, lower=0), len(readouts), axis=1)
+    spreads = np.split(dsymm(1.0, held.scatter, weights, lower=0), len(readouts), axis=1)
     loss = _squared_error if kind == "ridge" else _pairwise_error
     return [
-        loss(trial, readout, trial.means @ readout.weights, readout.weights.T @ spread)
+        loss(held, readout, held.means @ readout.weights, readout.weights.T @ spread)
         for readout, spread in zip(readouts, spreads, strict=True)
     ]
 
 
-def _squared_error(trial: _FoldTask, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+def _squared_error(held: _FoldTask, readout: Readout, z: FloatArray, spread: FloatArray) -> float:
     """Σ over held-out rows of ‖t − s(x)‖²: that of the class means, and the spread about them.
 
     Exact where the other folds know every material of this one; where not, the spread is that of all its rows.
     """
-    missed = np.eye(len(at)) - readout.scores(at, "ridge")
-    return float(trial.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge))
+    missed = np.eye(len(z)) - readout.scores(z, "ridge")
+    return float(held.counts @ np.square(missed).sum(axis=1) + np.sum(readout.ridge @ spread * readout.ridge))
 
 
-def _pairwise_error(trial: _FoldTask, readout: Readout, at: FloatArray, spread: FloatArray) -> float:
+def _pairwise_error(held: _FoldTask, readout: Readout, z: FloatArray, spread: FloatArray) -> float:
     """Log of the held-out rows' mean error, class against class, with scores spread as a normal distribution.
 
     Class y loses to k with probability Φ(−Δ/σ), Δ the difference of its scores' held-out mean and σ² the held-out
     variance of that difference.
     """
-    felt = np.flatnonzero(trial.counts)
-    scores = readout.scores(at, "lda")[felt]
-    margins = scores[np.arange(len(felt)), felt][:, None] - scores
-    spread = spread / trial.counts.sum()
+    own = np.flatnonzero(held.counts)
+    scores = readout.scores(z, "lda")[own]
+    margins = scores[np.arange(len(own)), own][:, None] - scores
+    spread = spread / held.counts.sum()
     diagonal = np.diagonal(spread)
-    variance = diagonal[felt][:, None] + diagonal - 2 * spread[felt]
+    variance = diagonal[own][:, None] + diagonal - 2 * spread[own]
     chances = log_ndtr(-margins / np.sqrt(np.maximum(variance, 1e-300)))
-    chances[np.arange(len(felt)), felt] = -np.inf
-    weights = np.log(trial.counts[felt] / trial.counts.sum())
+    chances[np.arange(len(own)), own] = -np.inf
+    weights = np.log(held.counts[own] / held.counts.sum())
     return float(logsumexp(chances + weights[:, None]))
 
 
@@ -177,15 +175,14 @@ def fit_readouts(task: Task, penalties: Sequence[float]) -> list[Readout]:
         reflectors = np.asfortranarray(reduced[1:, :-1])
         _turn(reflectors, tau, turned, "T")
         solved = np.empty((dimension, len(penalties) * classes), order="F")
-        for at, penalty in enumerate(penalties):
+        for i, penalty in enumerate(penalties):
             *_, part, failed = dptsv(diagonal + penalty, beside, turned)
             require_definite(penalty, failed)
-            solved[:, at * classes : (at + 1) * classes] = part
+            solved[:, i * classes : (i + 1) * classes] = part
         _turn(reflectors, tau, solved, "N")
         solved = solved[::-1]
         return [
-            Readout.of(task, penalty, solved[:, at * classes : (at + 1) * classes])
-            for at, penalty in enumerate(penalties)
+            Readout.of(task, penalty, solved[:, i * classes : (i + 1) * classes]) for i, penalty in enumerate(penalties)
         ]
 
 

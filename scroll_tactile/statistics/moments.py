@@ -134,8 +134,8 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is rounded is the scatter itself, whatever the
     distance of the means from zero. Classes of no rows are left out.
     """
-    felt = counts > 0
-    counts, sums = counts[felt], sums[felt]
+    present = counts > 0
+    counts, sums = counts[present], sums[present]
     dimension = sums.shape[1]
     means = (2 * sums + counts[:, None]) // (2 * counts[:, None])
     rests = sums - counts[:, None] * means
@@ -144,10 +144,10 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     centred.reshape(-1)[_lower(dimension)] = packed
     with one_thread():
         for first in range(0, len(counts), 1024):  # so many products of two limbs stay below 2⁵³
-            some = slice(first, first + 1024)
-            high = sums[some] >> LIMB
-            low = sums[some] - (high << LIMB)
-            mean, rest = means[some].astype(np.float64), rests[some].astype(np.float64)
+            block = slice(first, first + 1024)
+            high = sums[block] >> LIMB
+            low = sums[block] - (high << LIMB)
+            mean, rest = means[block].astype(np.float64), rests[block].astype(np.float64)
             product = (high.astype(np.float64).T @ mean).astype(np.int64)
             product <<= LIMB
             centred -= product

@@ -29,7 +29,7 @@ FOLDS = 3
 
 
 def fold_of(key: bytes) -> int:
-    """The fold of a stream, from its content hash: the same wherever and whenever it was felt."""
+    """The fold of a stream, from its content hash: the same wherever and whenever it was observed."""
     return int.from_bytes(key[:8], "little") % FOLDS
 
 
@@ -55,7 +55,7 @@ class Statistics:
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order; only those that have any."""
         counts = self._observations.sum(axis=1)
-        return {name: int(counts[at]) for name, at in sorted(self._places.items()) if counts[at]}
+        return {name: int(counts[place]) for name, place in sorted(self._places.items()) if counts[place]}
 
     @property
     def longest(self) -> int:
@@ -68,12 +68,12 @@ class Statistics:
         Raises CapacityError, before anything is added, where a sum would not be exact any more.
         """
         self.require_room(codes)
-        at = self._place(material)
+        place = self._place(material)
         for scale, rows in codes.items():
             self._seconds[scale][fold].add(rows)
-            self._rows[scale][at, fold] += len(rows)
-            self._sums[scale][at, fold] += rows.sum(axis=0, dtype=np.int64)
-        self._observations[at, fold] += 1
+            self._rows[scale][place, fold] += len(rows)
+            self._sums[scale][place, fold] += rows.sum(axis=0, dtype=np.int64)
+        self._observations[place, fold] += 1
         self._lengths[columns] += 1
 
     def require_room(self, codes: Codes) -> None:
@@ -89,25 +89,25 @@ class Statistics:
 
         Raises UnknownMaterialError for a material without an observation in this fold.
         """
-        at = self._places.get(material)
-        if at is None or not self._observations[at, fold] or not self._lengths[columns]:
+        place = self._places.get(material)
+        if place is None or not self._observations[place, fold] or not self._lengths[columns]:
             raise UnknownMaterialError(
                 f"{material!r} has no observation of {columns} columns in fold {fold} that could be taken out"
             )
         for scale, rows in codes.items():
             self._seconds[scale][fold].remove(rows)
-            self._rows[scale][at, fold] -= len(rows)
-            self._sums[scale][at, fold] -= rows.sum(axis=0, dtype=np.int64)
-        self._observations[at, fold] -= 1
+            self._rows[scale][place, fold] -= len(rows)
+            self._sums[scale][place, fold] -= rows.sum(axis=0, dtype=np.int64)
+        self._observations[place, fold] -= 1
         self._lengths = +(self._lengths - Counter([columns]))
 
     def _place(self, material: str) -> int:
-        at = self._places.get(material)
-        if at is None:
-            at = self._places[material] = len(self._places)
-            if at >= len(self._observations):
-                self._grow(max(8, 2 * at))
-        return at
+        place = self._places.get(material)
+        if place is None:
+            place = self._places[material] = len(self._places)
+            if place >= len(self._observations):
+                self._grow(max(8, 2 * place))
+        return place
 
     def _grow(self, capacity: int) -> None:
         def grown(array: IntArray) -> IntArray:
@@ -120,9 +120,9 @@ class Statistics:
         self._sums = {scale: grown(sums) for scale, sums in self._sums.items()}
 
     def names(self, scale: Scale) -> list[str]:
-        """The materials that were felt at a scale, in alphabetical order."""
+        """The materials that have rows at a scale, in alphabetical order."""
         rows = self._rows[scale].sum(axis=1)
-        return [name for name, at in sorted(self._places.items()) if rows[at]]
+        return [name for name, place in sorted(self._places.items()) if rows[place]]
 
     def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Rows of each material in each fold, shape (C, FOLDS)."""
@@ -192,12 +192,12 @@ class Statistics:
         joint._lengths.update(self._lengths)
         (joint._lengths.update if sign > 0 else joint._lengths.subtract)(other._lengths)
         for part, weight in ((self, 1), (other, sign)):
-            for name, at in part._places.items():
+            for name, place in part._places.items():
                 to = joint._place(name)
-                joint._observations[to] += weight * part._observations[at]
+                joint._observations[to] += weight * part._observations[place]
                 for scale in self.scales:
-                    joint._rows[scale][to] += weight * part._rows[scale][at]
-                    joint._sums[scale][to] += weight * part._sums[scale][at]
+                    joint._rows[scale][to] += weight * part._rows[scale][place]
+                    joint._sums[scale][to] += weight * part._sums[scale][place]
         for scale in self.scales:
             for fold in range(FOLDS):
                 ours, theirs = self._seconds[scale][fold], other._seconds[scale][fold]
@@ -245,7 +245,7 @@ class Statistics:
     ) -> Statistics:
         """The statistics that `to_arrays` described; the arrays are taken over."""
         statistics = cls(dimension, scales)
-        statistics._places = {name: at for at, name in enumerate(names)}
+        statistics._places = {name: place for place, name in enumerate(names)}
         statistics._observations = arrays["observations"]
         statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
         for scale in statistics.scales:

@@ -41,10 +41,10 @@ def calibrated(kind="lda", **settings):
 @pytest.mark.parametrize("noise", [3_000, 40_000, 300_000])
 def test_weights_are_finite_and_not_negative(kind, noise):
     stages = calibrated(kind, noises=(noise, noise))
-    assert [one.weights.shape for one in stages] == [(1,), (2,)]
-    for one in stages:
-        assert np.isfinite(one.weights).all()
-        assert (one.weights >= 0).all()
+    assert [stage.weights.shape for stage in stages] == [(1,), (2,)]
+    for stage in stages:
+        assert np.isfinite(stage.weights).all()
+        assert (stage.weights >= 0).all()
 
 
 def logits(touches, classes, seed=0, size=2.0):
@@ -56,18 +56,11 @@ def logits(touches, classes, seed=0, size=2.0):
     return [row[None, :] for row in scores], targets
 
 
-@pytest.mark.parametrize("factor", [0.01, 0.3, 1.0, 30.0])
+@pytest.mark.parametrize("factor", [0.01, 0.25, 1.0, 4.0, 30.0])
 def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
     scores, targets = logits(1500, 5)
     weights = fit_weights([one * factor for one in scores], targets, np.array([1 / factor]))
     assert weights * factor == pytest.approx(1.0, rel=0.12)
-
-
-def test_overconfident_scores_are_softened_and_timid_ones_sharpened():
-    scores, targets = logits(800, 4)
-    prior = np.array([1.0])
-    assert fit_weights([4 * one for one in scores], targets, prior)[0] < 0.5
-    assert fit_weights([one / 4 for one in scores], targets, prior)[0] > 2
 
 
 def test_scores_that_mislead_get_no_weight():
@@ -127,20 +120,6 @@ def test_touches_with_different_numbers_of_classes_count_together():
     assert weights == pytest.approx(1.0, rel=0.15)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
-@pytest.mark.parametrize("touches", [99, 256])
-def test_the_threshold_lets_about_the_asked_share_of_known_touches_pass(share, touches):
-    above = []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(rng.normal(size=touches)))
-        threshold = calibration.threshold(share)
-        assert (calibration.novelties > threshold).mean() <= share
-        above.append((rng.normal(size=2000) > threshold).mean())
-    # Conformal: never more on average, and less by at most one place among the held-out touches.
-    assert share - 1 / (touches + 1) - 0.01 <= np.mean(above) <= share + 0.01
-
-
 @pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
 def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
@@ -152,13 +131,6 @@ def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, sh
     assert calibration.threshold(share) == (kept[0] if kept else 2 * touches)
 
 
-def test_a_smaller_share_means_a_higher_threshold():
-    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(np.random.default_rng(0).normal(size=60)))
-    thresholds = [calibration.threshold(share) for share in (0.001, 0.02, 0.1, 0.5, 0.999)]
-    assert thresholds == sorted(thresholds, reverse=True)
-    assert len(set(thresholds)) == 5
-
-
 def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
     few = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(3.0))
     assert few.threshold(0.05) == few.threshold(0.5) > 0
@@ -166,20 +138,20 @@ def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_the_novelty_of_known_touches_is_standardised(kind):
-    for one in calibrated(kind):
-        assert len(one.novelties) == 120
-        assert np.mean(one.novelties) == pytest.approx(0, abs=1e-6)
-        assert np.std(one.novelties) == pytest.approx(1, abs=1e-6)
-        assert np.array_equal(np.sort(one.novelties), one.novelties)
+    for stage in calibrated(kind):
+        assert len(stage.novelties) == 120
+        assert np.mean(stage.novelties) == pytest.approx(0, abs=1e-6)
+        assert np.std(stage.novelties) == pytest.approx(1, abs=1e-6)
+        assert np.array_equal(np.sort(stage.novelties), stage.novelties)
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_small_and_dull_memories_calibrate_without_a_warning(kind):
     for settings in ({"materials": 1, "each": 1}, {"materials": 2, "each": 1}, {"noises": (0, 0), "unit": 0}):
-        for one in calibrated(kind, **settings):
-            assert np.isfinite(one.weights).all()
-            assert np.isfinite(one.threshold(0.05))
-            assert np.isfinite(one.novelty(np.array([1.0] * len(one.weights))))
+        for stage in calibrated(kind, **settings):
+            assert np.isfinite(stage.weights).all()
+            assert np.isfinite(stage.threshold(0.05))
+            assert np.isfinite(stage.novelty(np.array([1.0] * len(stage.weights))))
 
 
 def test_a_stage_whose_scale_was_never_felt_has_no_calibration():

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_learner_machine import PAD, SMALL, stream
 
-from scroll_tactile import TactileLearner
-from scroll_tactile.errors import InputError
-from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.readout import Readout, Task, fit_readout
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, WoodburyReadout
 from scroll_tactile.statistics.moments import within_scatter
@@ -42,10 +38,11 @@ def dense(statistics, penalties):
     return Readout(0.0, center.astype(float), weights, (gram + gram.T) / 2, ridge, shares, penalties)
 
 
-def distance(one, other):
+def distance(found, truth):
     fields = ("weights", "gram", "ridge", "center")
     return max(
-        np.abs(getattr(one, name) - getattr(other, name)).max() / np.abs(getattr(other, name)).max() for name in fields
+        np.abs(getattr(found, name) - getattr(truth, name)).max() / np.abs(getattr(truth, name)).max()
+        for name in fields
     )
 
 
@@ -160,95 +157,3 @@ def test_a_feature_that_begins_to_vary_is_penalised_like_the_others():
     penalties = start.penalties.copy()
     penalties[4] = np.delete(start.penalties, 4).mean()
     assert distance(tracked.readout(), dense(statistics, penalties)) < 1e-9
-
-
-class TestLearner:
-    FELT = tuple((name, (seed, 60)) for seed in range(8) for name in "abc")
-
-    def learner(self, refit, felt=FELT, **settings):
-        learner = TactileLearner(sensor=PAD, embedding=SMALL, refit=refit, **settings)
-        for name, touch in felt:
-            learner.observe(name, stream(touch))
-        return learner
-
-    def test_between_fits_only_the_readouts_follow(self, monkeypatch):
-        learner = self.learner(0.5)
-        learner.predict(stream((50, 60)))
-        fits = []
-        monkeypatch.setattr(Model, "of", lambda *_: fits.append(1))
-        for at in range(10):
-            learner.observe("abc"[at % 3], stream((20 + at, 60)))
-            learner.predict(stream((50, 60)))
-        assert fits == []
-        monkeypatch.undo()
-        model, whole = learner._current.present(learner._ledger), learner.model()
-        for scale, selection in model.selections.items():
-            penalties = selection.readout.penalties
-            counts = learner.memory.statistics
-            names = counts.names(scale)
-            assert selection.names == names
-            assert np.isclose(selection.readout.shares, whole.selections[scale].readout.shares).all()
-            assert np.isclose(selection.readout.center, whole.selections[scale].readout.center).all()
-            assert (penalties > 0).all()
-
-    def test_answers_are_those_of_the_same_lambda_solved_anew(self):
-        learner = self.learner(1.0)
-        learner.predict(stream((50, 60)))
-        for at in range(12):
-            learner.observe("abc"[at % 3], stream((20 + at, 60)))
-        quick = learner._current.present(learner._ledger)
-        for scale, selection in quick.selections.items():
-            anew = WoodburyReadout(learner.memory.statistics, scale, learner.model().selections[scale].readout)
-            anew._penalties = selection.readout.penalties
-            anew.anchor(learner.memory.statistics)
-            assert distance(selection.readout, anew.readout()) < 1e-9
-
-    @pytest.mark.parametrize(
-        "change",
-        [
-            lambda learner: learner.observe("new", stream((3, 60))),
-            lambda learner: [learner.observe("a", stream((30 + at, 60))) for at in range(9)],
-        ],
-    )
-    def test_a_new_material_or_much_growth_is_fitted_anew(self, change):
-        learner = self.learner(0.25)
-        learner.predict(stream((50, 60)))
-        change(learner)
-        # A snapshot has followed nothing: it is fitted when it is first asked.
-        assert learner.predict(stream((50, 60))) == copy.deepcopy(learner).predict(stream((50, 60)))
-
-    def test_what_is_taken_back_is_fitted_anew(self, tmp_path):
-        with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, refit=1.0) as learner:
-            receipts = [learner.observe(name, stream(touch)) for name, touch in self.FELT]
-            learner.predict(stream((50, 60)))
-            learner.observe("a", stream((40, 60)))
-            learner.retract(receipts[0])
-            assert learner.predict(stream((50, 60))) == copy.deepcopy(learner).predict(stream((50, 60)))
-
-    def test_the_papers_recursion_can_be_chosen_and_gives_the_same_answers_while_it_is_well(self):
-        exact, recursive = self.learner(1.0), self.learner(1.0, solver="recursive")
-        for learner in (exact, recursive):
-            learner.predict(stream((50, 60)))
-            for at in range(12):
-                learner.observe("abc"[at % 3], stream((20 + at, 60)))
-        assert exact.digest() == recursive.digest()
-        model = recursive._current.present(recursive._ledger)
-        for scale, selection in exact._current.present(exact._ledger).selections.items():
-            found = model.selections[scale].readout
-            assert found.weights.tobytes() != selection.readout.weights.tobytes()
-            assert distance(found, selection.readout) < 1e-8
-        answers = [learner.predict(stream((50, 60))) for learner in (exact, recursive)]
-        assert answers[0].material == answers[1].material
-        assert answers[0].probability == pytest.approx(answers[1].probability, abs=1e-8)
-
-    @pytest.mark.parametrize(
-        ("settings", "said"), [({"solver": "svd"}, "expected solver to be"), ({"solver": "recursive"}, "refit=1.0")]
-    )
-    def test_a_solver_that_there_is_not_or_that_has_nothing_to_do_is_refused(self, settings, said):
-        with pytest.raises(InputError, match=said):
-            TactileLearner(sensor=PAD, **settings)
-
-    @pytest.mark.parametrize("refit", [-0.1, 1.5, float("nan")])
-    def test_a_share_that_is_none_is_refused(self, refit):
-        with pytest.raises(InputError, match="expected refit to be"):
-            self.learner(refit)

@@ -42,9 +42,10 @@ def test_it_is_the_sum_of_products_in_exact_integers(rows):
 
 
 def test_codes_at_the_bound_are_exact_too():
-    batch = np.full((5000, 3), EDGE, dtype=np.int32)
-    batch[:, 1] = -EDGE
-    assert added(batch, dimension=3).packed().tolist() == [5000 * EDGE**2 * sign for sign in (1, -1, 1, 1, -1, 1)]
+    # Of odd codes: float64 would round a sum of so many of their products.
+    batch = np.array([[EDGE, 1 - EDGE, EDGE - 1]], dtype=np.int32).repeat(20_001, axis=0)
+    expected = [20_001 * int(x) * int(y) for i, x in enumerate(batch[0]) for y in batch[0, : i + 1]]
+    assert added(batch, dimension=3).packed().tolist() == expected
 
 
 def test_the_most_rows_fit_int64_at_the_bound():

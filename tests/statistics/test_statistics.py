@@ -191,22 +191,26 @@ def test_only_what_was_felt_can_be_removed():
     same(statistics, of([]))
 
 
-def test_a_touch_of_another_length_cannot_be_removed_or_taken_out():
+def test_touches_of_other_lengths_are_told_apart():
     codes = {5: np.ones((2, 3), np.int32)}
-    statistics, longer = of([]), of([])
-    statistics.add("wool", 0, codes, 40)
+    shorter, longer = of([]), of([])
+    shorter.add("wool", 0, codes, 40)
     longer.add("wool", 0, codes, 50)
-    before = statistics.digest()
-    with pytest.raises(UnknownMaterialError, match="50 columns"):
-        statistics.remove("wool", 0, codes, 50)
-    assert statistics.digest() == before
-    assert (statistics.materials, statistics.longest) == ({"wool": 1}, 40)
     # All counts and sums agree; only the lengths do not.
+    assert shorter != longer
+    before = shorter.digest()
+    with pytest.raises(UnknownMaterialError, match="50 columns"):
+        shorter.remove("wool", 0, codes, 50)
     with pytest.raises(InputError, match="contain"):
-        statistics - longer
-    joint = statistics + longer
+        shorter - longer
+    assert shorter.digest() == before
+    joint = shorter + longer
+    assert joint.longest == 50
+    assert (joint - longer).longest == 40
+    arrays, names = joint.to_arrays()
+    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).longest == 50
     joint.remove("wool", 0, codes, 50)
-    same(joint, statistics)
+    same(joint, shorter)
     assert joint.longest == 40
     joint.remove("wool", 0, codes, 40)
     assert joint.longest == 0

@@ -184,6 +184,16 @@ def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
         whole - part
 
 
+def test_fewer_touches_of_as_many_rows_do_not_contain_more():
+    whole, part = of([]), of([])
+    whole.add("wool", 0, {5: np.ones((2, 3), np.int32)})
+    whole.add("felt", 0, {5: np.ones((1, 3), np.int32)})
+    for _ in range(2):
+        part.add("wool", 0, {5: np.ones((1, 3), np.int32)})
+    with pytest.raises(InputError, match="contain"):
+        whole - part
+
+
 def test_only_what_was_felt_can_be_removed():
     statistics = of([])
     statistics.add("wool", 1, {5: np.ones((1, 3), np.int32)})

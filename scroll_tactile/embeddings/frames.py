@@ -37,8 +37,7 @@ IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
 
 NETWORK_STAGES = (1, 2, 3)
-# Columns of a frame in the standard deviation of the blur that is taken off before the network sees it.
-SMOOTH = 20
+SMOOTH = 20  # columns of a frame in the standard deviation of the blur that is taken off for the network
 GAIN = 4.0  # relief is faint: a few levels of 255
 BLURRED = 3  # standard deviations that the blur reaches
 REACH = 1.2  # between two frames' counts, at which cosines tell them apart: about the usual distance
@@ -53,29 +52,24 @@ CELLS = (6, 8)  # rows and columns that colours are averaged over
 
 _HISTOGRAM = OCTANTS * (len(STRENGTHS) + 1)
 _CURVATURES = 2 * 2 * len(STRENGTHS)  # of two kinds, up and down
-LIGHT = COLOURS * CELLS[0] * CELLS[1]
-"""The number of features of the light."""
-SURFACE = COLOURS * SCALES * (_HISTOGRAM + _CURVATURES)
-"""The number of features of slopes and bumps."""
+LIGHT = COLOURS * CELLS[0] * CELLS[1]  # features
+SURFACE = COLOURS * SCALES * (_HISTOGRAM + _CURVATURES)  # features of slopes and bumps
 
 
 class Frames:
     """What a camera behind a gel sees, frame by frame: its light, beside the relief of what is pressed into it.
 
-    rest: the gel at rest, from which frames are told to be in contact, and whose picture is taken off them: "first",
+    rest: the gel at rest, against which frames are in contact or not, and whose picture is taken off them: "first",
         the first frame of every stream; one picture for all, an array (height, width, 3) in the sensor's unit; or None:
         every frame counts, and is read as it is.
     weights: of a trained ResNet, as for `Vision`. The relief is read by its stages 1 to 3, each one's mean and standard
-        deviation over the frame scaled to length 1: 1040 features, and `Vision`'s promise: the same bytes on one
-        machine. Without: by counts of slopes and bumps (see above), 1164 features, the same bytes on
-        any machine.
-
+        deviation over the frame scaled to length 1: 1040 features, the same bytes on one machine. It is shown the
+        relief alone: less its blur, and four times as strong. Without weights: by counts of slopes and bumps (see
+        above), 1164 features, the same bytes on any machine.
     cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007) of the counts, without the light, take
-        the place of all: attributes of objects never touched are told better by them, objects that were touched worse.
+        the place of all: they tell attributes of new objects better, and objects that were touched worse.
         seed: of the cosines. They are rounded, so that another machine's last bits rarely matter.
     runtime: of the network, as for `Vision`.
-
-    The network is shown the relief alone: less its blur, and four times as strong.
 
     Raises InputError for a resting image that is none, cosines or a seed below 0, and cosines beside weights;
     WeightsError for weights that cannot be used.
@@ -97,8 +91,7 @@ class Frames:
         seed: int = 1,
         runtime: RuntimeName = "torch",
     ) -> None:
-        numbers = (cosines, seed)
-        whole = all(isinstance(number, int) and not isinstance(number, bool) and number >= 0 for number in numbers)
+        whole = all(type(number) is int and number >= 0 for number in (cosines, seed))
         if not whole or (cosines and weights is not None):
             raise InputError(
                 "expected cosines and a seed as whole numbers of 0 or more, and no weights beside cosines; came "
@@ -243,7 +236,7 @@ def _checked(rest: Rest | npt.ArrayLike) -> Rest:
 def light(frame: IntArray) -> FloatArray:
     """Mean colours of 6 × 8 cells, in [-1, 1], float32 of shape (LIGHT,), of a frame of levels in ±LEVELS, (3, H, W).
 
-    Of a frame with fewer rows or columns than cells some pixels are in several of them.
+    Of a frame with fewer rows or columns than cells some pixels lie in several of them.
     """
     (top, under), (left, after) = (_edges(size, count) for size, count in zip(frame.shape[1:], CELLS, strict=True))
     total = np.pad(frame.cumsum(axis=1).cumsum(axis=2), ((0, 0), (1, 0), (1, 0)))

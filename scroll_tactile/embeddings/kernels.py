@@ -33,7 +33,7 @@ __all__ = ["LEAST_FEATURES", "MOST_FEATURES", "Kernels", "angles"]
 
 SHORTEST = 12  # columns; a shorter image is continued by its mirror image
 SHORT = 32  # columns
-# The share of triangle features in short windows: with it the first 0.3 s of BioTac's touches are told apart in 87 %,
+# The share of triangle features in short windows: with it the first 0.3 s of BioTac's touches are right in 87 %,
 # without in 64 %. Wider windows have none: there they cost a tenth of a point.
 SHARE_IN_SHORT = 0.3
 REACH = 0.6  # of a window: a dilated kernel that spans more has too few positions left

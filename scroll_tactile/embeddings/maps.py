@@ -27,7 +27,7 @@ View = Literal["as-felt", "centre", "corner"]
 VIEWS: tuple[View, ...] = ("as-felt", "centre", "corner")
 SUMMARIES = 3  # maps of a whole touch: peak, mean, and how often the value moved
 
-SPREAD = 0.5  # taxels: a dot between two of them is felt by either
+SPREAD = 0.5  # taxels: a dot between two of them presses either
 PRESSED = 0.5  # of the square root of the range: a quarter of it is a taxel that is pressed
 MARGIN = 4  # taxels that a map may be moved by without losing an edge
 STEPS = 2**12  # of a random feature: coarse enough for a machine's cosine not to matter
@@ -36,7 +36,7 @@ PENALTIES = (0.03, 0.1, 0.3, 1.0)  # as shares of a feature's variance
 
 
 class Maps:
-    """Means of each channel over parts of a touch, or random cosines of them: where it is felt, and in what order.
+    """Means of each channel over parts of a touch, or random cosines of them: where it is pressed, and in what order.
 
     `Kernels` says how often a rhythm occurs in a touch, wherever it does. Here place and order count: how the pressure
     lies over the channels as the touch goes on. Of channels in a grid there are also the peak, the mean and how often
@@ -49,7 +49,7 @@ class Maps:
     cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007), dealt out evenly among the views,
     take the maps' place: they tell known shapes apart as wholes, where the maps tell of a new shape what parts it has.
     Their weights are Cauchy's, so that together they come to Σ exp(−‖x − x'‖₁ / reach) over the views: a touch that
-    was felt nearly so in any one view is near. reach: the sum of absolute differences at which that is 1/e.
+    was nearly so in any one view is near. reach: the sum of absolute differences at which that is 1/e.
     seed: of the cosines.
 
     Raises InputError for settings that cannot be, and for an image of other channels than the layout's.

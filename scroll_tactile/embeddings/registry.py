@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, Self, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -38,16 +38,13 @@ MOST_COSINES = 2**14
 MOST_WEIGHTS = 2**27  # of all cosines together: 1 GiB
 MOST_PIXELS = 2**24  # of a resting picture, times colours: 64 MiB
 
-_KINDS: dict[str, tuple[str, str]] = {
-    kind: (f"{__package__}.{kind}", name)
-    for kind, name in {
-        "frames": "Frames",
-        "joined": "Joined",
-        "kernels": "Kernels",
-        "maps": "Maps",
-        "robust": "Robust",
-        "vision": "Vision",
-    }.items()
+_KINDS = {  # each a module's name, too
+    "frames": "Frames",
+    "joined": "Joined",
+    "kernels": "Kernels",
+    "maps": "Maps",
+    "robust": "Robust",
+    "vision": "Vision",
 }
 
 _Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -55,18 +52,18 @@ _Hex = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Runtime = Literal["torch", "onnxruntime"]
 
 
-class _Configuration(BaseModel):
+class Configuration(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
-class _Weights(_Configuration):
+class WeightsConfiguration(Configuration):
     """A file's name without its folder, or a published one; None for tensors that came from no file."""
 
     name: Annotated[str, Field(min_length=1, max_length=255, pattern=r"^[^/\\\x00]+$")] | None
     sha256: _Hex
 
 
-class _Picture(_Configuration):
+class PictureConfiguration(Configuration):
     """A resting image: float32 of shape (height, width, 3), deflated."""
 
     shape: Annotated[list[Annotated[int, Field(ge=1, le=2**14)]], Field(min_length=3, max_length=3)]
@@ -79,24 +76,24 @@ class _Picture(_Configuration):
         return self
 
 
-class _Kernels(_Configuration):
+class KernelsConfiguration(Configuration):
     kind: Literal["kernels"]
     seed: _Seed
     dimension: Annotated[int, Field(ge=LEAST_FEATURES, le=MOST_FEATURES)]
 
 
-class _Frames(_Configuration):
+class FramesConfiguration(Configuration):
     kind: Literal["frames"]
-    weights: _Weights | None
-    rest: Literal["first"] | _Picture | None
+    weights: WeightsConfiguration | None
+    rest: Literal["first"] | PictureConfiguration | None
     cosines: Annotated[int, Field(ge=0, le=MOST_COSINES)]
     seed: _Seed
     runtime: _Runtime
 
 
-class _Vision(_Configuration):
+class VisionConfiguration(Configuration):
     kind: Literal["vision"]
-    weights: _Weights | None
+    weights: WeightsConfiguration | None
     seed: _Seed | None
     depth: Literal[18, 34, 50]
     stem: Literal["torchvision", "universal"]
@@ -105,7 +102,7 @@ class _Vision(_Configuration):
     precision: Literal["float32", "bfloat16"]
 
 
-class _Maps(_Configuration):
+class MapsConfiguration(Configuration):
     kind: Literal["maps"]
     layout: Annotated[list[Annotated[int, Field(ge=1, le=2**12)]], Field(min_length=1, max_length=2)]
     views: Annotated[list[Literal["as-felt", "centre", "corner"]], Field(min_length=1, max_length=3)]
@@ -126,25 +123,24 @@ class _Maps(_Configuration):
         return self
 
 
-class _Joined(_Configuration):
+class JoinedConfiguration(Configuration):
     kind: Literal["joined"]
-    parts: Annotated[list[_Any], Field(min_length=2, max_length=MOST_PARTS)]
+    parts: Annotated[list[AnyConfiguration], Field(min_length=2, max_length=MOST_PARTS)]
 
 
-class _Robust(_Configuration):
+class RobustConfiguration(Configuration):
     kind: Literal["robust"]
-    inner: _Any
+    inner: AnyConfiguration
     seed: _Seed
 
 
-_Any: TypeAlias = Annotated[_Kernels | _Frames | _Vision | _Maps | _Joined | _Robust, Field(discriminator="kind")]
-_Joined.model_rebuild()
-_Robust.model_rebuild()
-_ANY: TypeAdapter[_Any] = TypeAdapter(_Any)
-
-
-class _Configured(Protocol):
-    def configuration(self) -> dict[str, Any] | None: ...
+_Single: TypeAlias = KernelsConfiguration | FramesConfiguration | VisionConfiguration | MapsConfiguration
+AnyConfiguration: TypeAlias = Annotated[
+    _Single | JoinedConfiguration | RobustConfiguration, Field(discriminator="kind")
+]
+JoinedConfiguration.model_rebuild()
+RobustConfiguration.model_rebuild()
+ADAPTER: TypeAdapter[AnyConfiguration] = TypeAdapter(AnyConfiguration)
 
 
 def configuration_of(embedding: Embedding) -> dict[str, Any] | None:
@@ -152,9 +148,10 @@ def configuration_of(embedding: Embedding) -> dict[str, Any] | None:
 
     These are embeddings of the user's own, also where they derive from or wrap one that ships with scroll-tactile.
     """
-    if (type(embedding).__module__, type(embedding).__qualname__) not in _KINDS.values():
+    kind = type(embedding)
+    if (kind.__module__, kind.__qualname__) not in {(f"{__package__}.{stem}", name) for stem, name in _KINDS.items()}:
         return None
-    configuration = cast(_Configured, embedding).configuration()
+    configuration = cast(Any, embedding).configuration()
     try:
         return None if configuration is None else dict(_validated(configuration).model_dump(mode="json"))
     except EmbeddingError:  # a seed of a hundred digits, say
@@ -196,7 +193,7 @@ def picture_to_json(picture: npt.NDArray[np.float32]) -> dict[str, Any]:
     return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
 
 
-def _picture(held: _Picture) -> npt.NDArray[np.float32]:
+def _picture(held: PictureConfiguration) -> npt.NDArray[np.float32]:
     size = 4 * math.prod(held.shape)
     try:
         inflate = zlib.decompressobj()
@@ -211,10 +208,10 @@ def _picture(held: _Picture) -> npt.NDArray[np.float32]:
     return np.frombuffer(values, "<f4").reshape(held.shape)
 
 
-def _validated(configuration: Mapping[str, Any]) -> _Any:
+def _validated(configuration: Mapping[str, Any]) -> AnyConfiguration:
     _require_shallow(configuration)
     try:
-        return _ANY.validate_python(configuration)
+        return ADAPTER.validate_python(configuration)
     except ValidationError as error:
         # Of a union's alternatives the one that went deepest is the one that was meant.
         wrong = max(reversed(error.errors(include_url=False)), key=lambda each: len(each["loc"]))
@@ -239,17 +236,17 @@ def _require_shallow(configuration: object) -> None:
         waiting += [(each, depth + 1) for each in inside]
 
 
-def _made(held: _Any) -> Embedding:
-    make = getattr(import_module(_KINDS[held.kind][0]), _KINDS[held.kind][1])
+def _made(held: AnyConfiguration) -> Embedding:
+    make = getattr(import_module(f"{__package__}.{held.kind}"), _KINDS[held.kind])
     settings = held.model_dump(exclude={"kind"})
-    if isinstance(held, _Joined):
+    if isinstance(held, JoinedConfiguration):
         return cast(Embedding, make(*map(_made, held.parts)))
-    if isinstance(held, _Robust):
+    if isinstance(held, RobustConfiguration):
         return cast(Embedding, make(_made(held.inner), seed=held.seed))
-    if isinstance(held, _Frames):
-        rest = _picture(held.rest) if isinstance(held.rest, _Picture) else held.rest
+    if isinstance(held, FramesConfiguration):
+        rest = _picture(held.rest) if isinstance(held.rest, PictureConfiguration) else held.rest
         return _weighted(make, held.weights, **settings | {"rest": rest})
-    if isinstance(held, _Vision):
+    if isinstance(held, VisionConfiguration):
         if held.weights is not None:
             del settings["depth"]
         del settings["stem"]
@@ -257,7 +254,7 @@ def _made(held: _Any) -> Embedding:
     return cast(Embedding, make(**settings))
 
 
-def _weighted(make: Callable[..., Frames | Vision], held: _Weights | None, **settings: Any) -> Embedding:
+def _weighted(make: Callable[..., Frames | Vision], held: WeightsConfiguration | None, **settings: Any) -> Embedding:
     if held is None:
         return make(**settings | {"weights": None})
     source = _source(held, make.__name__)
@@ -271,20 +268,17 @@ def _weighted(make: Callable[..., Frames | Vision], held: _Weights | None, **set
     return embedding
 
 
-def _source(held: _Weights, kind: str) -> str | Path:
+def _source(held: WeightsConfiguration, kind: str) -> str | Path:
     """The published name, or the file of that name in the cache folder of weights."""
-    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
+    from scroll_tactile.embeddings.weights import PUBLISHED, weights_file
 
     if held.name in PUBLISHED:
         return held.name
-    try:
-        folder: Path | None = cache_folder()
-    except WeightsError:  # without pooch there is no such folder, unless the environment names it
-        folder = None
-    if held.name is not None and folder is not None and (folder / held.name).is_file():
-        return folder / held.name
+    folder, file = weights_file(held.name)
+    if file is not None:
+        return file
     came = "a state dict" if held.name is None else f"the file {held.name!r}"
-    put = "" if held.name is None or folder is None else f", or put that file into {folder}"
+    put = "" if folder is None else f", or put that file into {folder}"
     raise EmbeddingError(
         f"expected the weights of a {kind} that came from {came} and whose tensors have the SHA-256 "
         f"{held.sha256[:12]}…; they are not at hand. Pass embedding={kind}(weights=…) with them{put}"
@@ -311,23 +305,16 @@ def _candidates(name: str, dimension: int, sensor: Sensor) -> Iterator[Callable[
         yield lambda: Maps(layout=layout)
         yield lambda: Maps(layout=layout, cosines=dimension)
     elif name in ("vision", "kernels+vision"):
-        for weights in _cached():
-            yield partial(_vision, weights, beside_kernels=name != "vision")
+        from scroll_tactile.embeddings.weights import cached_weights
+
+        for weights in cached_weights():
+            yield partial(_vision, weights, 0 if name == "vision" else dimension)
 
 
-def _vision(weights: str, *, beside_kernels: bool) -> Embedding:
+def _vision(weights: str, beside: int) -> Embedding:
+    """A published network with default settings; beside kernels, where there are to be so many features in all."""
     from scroll_tactile.embeddings.joined import Joined
     from scroll_tactile.embeddings.vision import Vision
 
-    return Joined(Kernels(), Vision(weights)) if beside_kernels else Vision(weights)
-
-
-def _cached() -> list[str]:
-    """The published weights that the cache has."""
-    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
-
-    try:
-        folder = cache_folder()
-    except WeightsError:
-        return []
-    return [name for name, url in PUBLISHED.items() if (folder / url.rsplit("/", 1)[1]).is_file()]
+    vision = Vision(weights)
+    return Joined(Kernels(dimension=beside - vision.dimension), vision) if beside else vision

@@ -46,9 +46,9 @@ class _Block(nn.Module):
         shapes = [(inputs, planes, 3, stride), (planes, planes, 3, 1)]
         if bottleneck:
             shapes = [(inputs, planes, 1, 1), (planes, planes, 3, stride), (planes, outputs, 1, 1)]
-        for at, (into, out, kernel, step) in enumerate(shapes, start=1):
-            setattr(self, f"conv{at}", nn.Conv2d(into, out, kernel, step, kernel // 2, bias=False))
-            setattr(self, f"bn{at}", nn.BatchNorm2d(out))
+        for i, (into, out, kernel, step) in enumerate(shapes, start=1):
+            setattr(self, f"conv{i}", nn.Conv2d(into, out, kernel, step, kernel // 2, bias=False))
+            setattr(self, f"bn{i}", nn.BatchNorm2d(out))
         self.downsample: nn.Sequential | None = None
         if stride != 1 or inputs != outputs:
             shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
@@ -89,7 +89,7 @@ class ResNet(nn.Module):
             planes = FIRST * 2 ** (layer - 1)
             outputs = self.widths[layer]
             strides = [1 if layer == 1 else 2] + [1] * (blocks - 1)
-            made = [_Block(inputs if at == 0 else outputs, planes, s, bottleneck) for at, s in enumerate(strides)]
+            made = [_Block(outputs if i else inputs, planes, s, bottleneck) for i, s in enumerate(strides)]
             setattr(self, f"layer{layer}", nn.Sequential(*made))
             inputs = outputs
 
@@ -170,7 +170,7 @@ def _fold(conv: nn.Conv2d, norm: nn.BatchNorm2d) -> nn.Conv2d:
     # In double precision, so that folding rounds once.
     slope = norm.weight.double() / torch.sqrt(norm.running_var.double() + norm.eps)
     with torch.device("meta"):
-        one = nn.Conv2d(
+        both = nn.Conv2d(
             conv.in_channels,
             conv.out_channels,
             conv.kernel_size,  # type: ignore[arg-type]
@@ -179,6 +179,6 @@ def _fold(conv: nn.Conv2d, norm: nn.BatchNorm2d) -> nn.Conv2d:
         )
     weight = conv.weight.double() * slope[:, None, None, None]
     bias = norm.bias.double() - norm.running_mean.double() * slope
-    one.weight = nn.Parameter(weight.float().detach(), requires_grad=False)
-    one.bias = nn.Parameter(bias.float().detach(), requires_grad=False)
-    return one
+    both.weight = nn.Parameter(weight.float().detach(), requires_grad=False)
+    both.bias = nn.Parameter(bias.float().detach(), requires_grad=False)
+    return both

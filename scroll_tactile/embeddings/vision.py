@@ -29,7 +29,7 @@ FloatArray = npt.NDArray[np.float32]
 MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
 
-# Windows of TOGETHER columns or more share one pass over the whole image: RoboSkin is told apart 0.3 points better so
+# Windows of TOGETHER columns or more share one pass over the whole image: RoboSkin is classified 0.3 points better so
 # than in windows apart, and one pass is cheaper. Narrower ones are cut out first, for early decisions rest on them, and
 # these see only what was observed: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
 MOST_COLUMNS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory

@@ -25,12 +25,14 @@ __all__ = [
     "CACHE_VARIABLE",
     "PUBLISHED",
     "cache_folder",
+    "cached_weights",
     "digest_of",
     "hash_tensors",
     "load_network",
     "network_of",
     "read_tensors",
     "source_name",
+    "weights_file",
 ]
 
 Tensors = dict[str, torch.Tensor]
@@ -145,6 +147,22 @@ def cache_folder() -> Path:
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen).expanduser() / "weights"
     return Path(_pooch().os_cache("scroll-tactile")) / "weights"
+
+
+def cached_weights() -> list[str]:
+    """The published names whose files the cache has."""
+    return [name for name, url in PUBLISHED.items() if weights_file(url.rsplit("/", 1)[1])[1] is not None]
+
+
+def weights_file(name: str | None) -> tuple[Path | None, Path | None]:
+    """The folder that a file of weights is looked for in, and the file of that name, None where it has none."""
+    try:
+        folder = cache_folder()
+    except WeightsError:  # without pooch there is no such folder, unless the environment names it
+        return None, None
+    if name is None:
+        return None, None
+    return folder, folder / name if (folder / name).is_file() else None
 
 
 def _published(name: str) -> Path:

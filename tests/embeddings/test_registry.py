@@ -1,5 +1,6 @@
 """What an embedding was made with, as JSON, and the same embedding made of it again."""
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision, sensors
 from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration, guess
 from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import EmbeddingError, WeightsError
 
 PICTURE = np.random.default_rng(0).uniform(0, 255, (24, 32, 3)).astype(np.float32)
@@ -187,6 +189,16 @@ class TestWeights:
         torch.save(ResNet.random(4).state_dict(), cache / file.name)
         with pytest.raises(EmbeddingError, match="expected weights whose tensors have the SHA-256"):
             from_configuration(named)
+
+    def test_published_weights_are_named_and_memories_made_before_are_found(self, file, cache, monkeypatch):
+        name = f"resnet18-{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}.pth"
+        file.rename(cache / name)
+        monkeypatch.setitem(PUBLISHED, "resnet18", f"https://nowhere.invalid/{name}")
+        for embedding in (Vision(), Joined(Kernels(dimension=64), Vision())):
+            assert repr(from_configuration(configuration_of(embedding))) == repr(embedding)
+            found = guess(embedding.name, embedding.dimension, embedding.fingerprint, sensors.BIOTAC)
+            assert repr(found) == repr(embedding)
+        assert configuration_of(Vision())["weights"]["name"] == "resnet18"
 
     def test_damaged_published_weights_are_refused_and_nothing_is_fetched_for_a_guess(self, cache):
         (cache / "resnet18-f37072fd.pth").write_bytes(b"not weights")

@@ -21,8 +21,8 @@ from scipy.special import logsumexp
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.network import Lesson, TouchFeatures
-from scroll_tactile.finetune.training import Progress, Trained, Trainer, repeatable, start_of, told_of_memory
+from scroll_tactile.finetune.network import TouchFeatures, TrainingSample
+from scroll_tactile.finetune.training import Progress, Trained, Trainer, named_out_of_memory, repeatable, start_of
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.prediction.model import Model
@@ -73,25 +73,25 @@ def fine_tune(
     begun = time.perf_counter()
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars)
-    touches = TouchFeatures(embedding, model.plan)
-    lessons = list(_lessons(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
-    names = sorted({lesson.material for lesson in lessons})
+    touches = TouchFeatures(embedding, model.reading)
+    samples = list(_samples(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
+    names = sorted({sample.material for sample in samples})
     if len(names) < 2:
         raise InputError(
             f"expected exemplars of at least two materials of {model.plan.milestones()[-1]} columns or more; there "
             f"are some of {names}. Observe longer touches, or more materials"
         )
-    chosen = mode or _mode(touches, len(lessons))
-    with repeatable(device), told_of_memory(device):
-        spreads = touches.spreads(lessons)
+    chosen = mode or _mode(touches, len(samples))
+    with repeatable(device), named_out_of_memory(device):
+        spreads = touches.spreads(samples)
         trainer = Trainer(touches, spreads, most, seed, torch.device(device), chosen, progress)
-        best, temperature, scores = _best(*trainer.held_out(model, lessons), most)
+        best, temperature, scores = _best(*trainer.held_out(model, samples), most)
         progress("training", 0, best)
-        final = trainer.train(start_of(model, names), lessons, [], best, salt=FOLDS)
+        final = trainer.train(start_of(model, names), samples, [], best, salt=FOLDS)
     kept, reason = _verdict(scores)
     heads = {scale: head * temperature for scale, head in final.heads.items()}
     tuned = Tuned(names, heads, final.bias * temperature, final.network, chosen, kept)
-    report = TuneReport(kept, reason, chosen, len(lessons), best, scores, time.perf_counter() - begun, tuned.digest())
+    report = TuneReport(kept, reason, chosen, len(samples), best, scores, time.perf_counter() - begun, tuned.digest())
     return replace(tuned, report=Tuned.described(report)), report
 
 
@@ -112,9 +112,7 @@ def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[st
     if sum(map(len, exemplars.values())) == 0:
         raise InputError("expected exemplars to fine-tune on; the buffer is empty. Open a memory with exemplars > 0")
     if len(exemplars) < 2:
-        raise InputError(
-            f"expected at least two materials, to be told apart; the buffer has exemplars of {list(exemplars)} only"
-        )
+        raise InputError(f"expected at least two materials; the buffer has exemplars of {list(exemplars)} only")
     try:
         torch.zeros(1, dtype=torch.float64, device=torch.device(device)).item()
     except (RuntimeError, AssertionError, TypeError) as error:
@@ -129,24 +127,24 @@ def _mode(touches: TouchFeatures, count: int) -> TuneMode:
     return "adapters" if count < WHOLE_NETWORK_FROM else "network"
 
 
-def _lessons(
+def _samples(
     touches: TouchFeatures,
     model: Model,
     exemplars: Mapping[str, Sequence[Exemplar]],
     seen: tuple[Sensor, Rest],
     progress: Progress,
-) -> Iterator[Lesson]:
+) -> Iterator[TrainingSample]:
     """The exemplars that reach the last stage, by material and rank; seen: by which sensor, against what at rest."""
-    if len(model.calibrations) < len(model.stages):  # nothing was felt for long enough
+    if len(model.calibrations) < len(model.stages):  # nothing was observed for long enough
         return
-    felt = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
+    known = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
     total, done = sum(map(len, exemplars.values())), 0
-    for material, those in sorted(exemplars.items()):
-        for one in those:
-            image = image_of(validate(one.readings, seen[0]), seen[1])
+    for material, buffered in sorted(exemplars.items()):
+        for exemplar in buffered:
+            image = image_of(validate(exemplar.readings, seen[0]), seen[1])
             columns = image.shape[1]
-            if material in felt and model.is_last(columns) and touches.reads(columns):
-                yield Lesson(material, one.key, image, touches.frozen(image))
+            if material in known and model.is_last(columns) and touches.reads(columns):
+                yield TrainingSample(material, exemplar.key, image, touches.frozen(image))
             done += 1
             progress("reading exemplars", done, total)
 
@@ -181,11 +179,11 @@ def _best(trials: list[Trained], before: list[Trained], most: int) -> tuple[int,
         return most, 1.0, {}
     f = _Score.of([(trial.logits[0], trial.targets) for trial in before], TEMPERATURES)
     epochs = [
-        _Score.of([(trial.logits[at], trial.targets) for trial in trials], TEMPERATURES)
-        for at in range(len(trials[0].logits))
+        _Score.of([(trial.logits[i], trial.targets) for trial in trials], TEMPERATURES)
+        for i in range(len(trials[0].logits))
     ]
-    best = min(range(len(epochs)), key=lambda at: epochs[at].loss)
-    scores = {name: {"loss": one.loss, "wrong": one.wrong} for name, one in (("f", f), ("f*", epochs[best]))}
+    best = min(range(len(epochs)), key=lambda i: epochs[i].loss)
+    scores = {name: {"loss": score.loss, "wrong": score.wrong} for name, score in (("f", f), ("f*", epochs[best]))}
     gain = f.losses - epochs[best].losses
     scores["f*"]["margin"] = float(gain.std() / np.sqrt(len(gain)))
     return best + 1, epochs[best].temperature, scores
@@ -195,7 +193,9 @@ def _verdict(scores: Mapping[str, Mapping[str, float]]) -> tuple[bool, str]:
     if not scores:
         return False, "no exemplar could be held out to compare them: f answers"
     f, tuned = scores["f"], scores["f*"]
-    told = f"log loss {tuned['loss']:.4f} against {f['loss']:.4f}, wrong {tuned['wrong']:.2%} against {f['wrong']:.2%}"
+    figures = (
+        f"log loss {tuned['loss']:.4f} against {f['loss']:.4f}, wrong {tuned['wrong']:.2%} against {f['wrong']:.2%}"
+    )
     if tuned["wrong"] > f["wrong"] or tuned["loss"] + max(CLEARLY * tuned["margin"], LEAST_GAIN) >= f["loss"]:
-        return False, f"on exemplars held out f* is not better than f ({told}): f answers"
-    return True, f"on exemplars held out f* is better than f ({told})"
+        return False, f"on exemplars held out f* is not better than f ({figures}): f answers"
+    return True, f"on exemplars held out f* is better than f ({figures})"

@@ -20,7 +20,7 @@ from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
 
-__all__ = ["Backbone", "Lesson", "TouchFeatures", "TunedReader", "adapted"]
+__all__ = ["Backbone", "TouchFeatures", "TrainingSample", "TunedReader", "adapted"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ SPREAD_FLOOR = 0.05
 
 
 @dataclass(frozen=True)
-class Lesson:
+class TrainingSample:
     """An exemplar made ready: its tactile image, and of each judging scale the mean of its windows' frozen features.
 
     frozen: width → float64 (d,), zero where the features come from the network.
@@ -108,15 +108,17 @@ class TouchFeatures:
     def __init__(self, embedding: Embedding, reading: WindowPlan) -> None:
         self.parts = parts_of(embedding)
         self.reading = reading
-        self._at = next((i for i, part in enumerate(self.parts) if capabilities_of(part).tunable), None)
+        self._tuned = next((i for i, part in enumerate(self.parts) if capabilities_of(part).tunable), None)
         edges = np.cumsum([0, *(part.dimension for part in self.parts)])
         self.dimension = int(edges[-1])
-        self._place = slice(0, 0) if self._at is None else slice(int(edges[self._at]), int(edges[self._at + 1]))
+        self._place = (
+            slice(0, 0) if self._tuned is None else slice(int(edges[self._tuned]), int(edges[self._tuned + 1]))
+        )
 
     @property
     def tunable(self) -> bool:
         """Whether there is a network to be trained, and a scale that it reads."""
-        return self._at is not None and self.reading.widths[-1] >= TOGETHER
+        return self._tuned is not None and self.reading.widths[-1] >= TOGETHER
 
     def reads(self, columns: int) -> bool:
         """Whether a touch of so many columns is one pass of the network, or needs none."""
@@ -124,8 +126,8 @@ class TouchFeatures:
 
     def network(self) -> Backbone:
         """A new copy of the network, with the embedding's own weights."""
-        assert self._at is not None
-        return Backbone(cast(Vision, self.parts[self._at]).network())
+        assert self._tuned is not None
+        return Backbone(cast(Vision, self.parts[self._tuned]).network())
 
     def windows(self, columns: int) -> dict[int, list[int]]:
         """Width → first columns of the windows that judge a touch of so many columns."""
@@ -140,8 +142,8 @@ class TouchFeatures:
         windows = self.windows(image.shape[1])
         means = {width: np.zeros(self.dimension) for width in windows}
         first = 0
-        for at, part in enumerate(self.parts):
-            fixed = {width: starts for width, starts in windows.items() if at != self._at or width < TOGETHER}
+        for i, part in enumerate(self.parts):
+            fixed = {width: starts for width, starts in windows.items() if i != self._tuned or width < TOGETHER}
             if fixed:
                 for width, rows in embed_windows(part, image, fixed).items():
                     means[width][first : first + part.dimension] = rows.mean(axis=0, dtype=np.float64) / part.bound
@@ -149,22 +151,22 @@ class TouchFeatures:
         return means
 
     def means(
-        self, net: Backbone | None, lessons: Sequence[Lesson], device: torch.device | None = None
+        self, net: Backbone | None, samples: Sequence[TrainingSample], device: torch.device | None = None
     ) -> dict[int, torch.Tensor]:
-        """Width → mean features (B, d), float64, of lessons, those of the network from `net`.
+        """Width → mean features (B, d), float64, of samples, those of the network from `net`.
 
         Without one the network's are those of the embedding itself.
         """
-        scales = sorted(lessons[0].frozen)
-        means = {s: torch.from_numpy(np.stack([one.frozen[s] for one in lessons])).to(device) for s in scales}
-        passed = [] if self._at is None else [scale for scale in scales if scale >= TOGETHER]
+        scales = sorted(samples[0].frozen)
+        means = {s: torch.from_numpy(np.stack([sample.frozen[s] for sample in samples])).to(device) for s in scales}
+        passed = [] if self._tuned is None else [scale for scale in scales if scale >= TOGETHER]
         if not passed:
             return means
         sizes: dict[int, list[int]] = {}
-        for at, lesson in enumerate(lessons):
-            sizes.setdefault(lesson.image.shape[1], []).append(at)
+        for i, sample in enumerate(samples):
+            sizes.setdefault(sample.image.shape[1], []).append(i)
         for columns, members in sizes.items():
-            images = torch.from_numpy(np.stack([lessons[at].image for at in members]))
+            images = torch.from_numpy(np.stack([samples[i].image for i in members]))
             windows = self.windows(columns)
             spans = [(start, width) for width in passed for start in windows[width]]
             features = (self._own(images, spans).to(device) if net is None else net(images.to(device), spans)).double()
@@ -181,10 +183,10 @@ class TouchFeatures:
     def _own(self) -> Backbone:
         return self.network().requires_grad_(False)
 
-    def spreads(self, lessons: Sequence[Lesson]) -> dict[int, FloatArray]:
-        """Width → the standard deviation of each feature among lessons, (d,), no less than a twentieth."""
+    def spreads(self, samples: Sequence[TrainingSample]) -> dict[int, FloatArray]:
+        """Width → the standard deviation of each feature among samples, (d,), no less than a twentieth."""
         with torch.no_grad():
-            parts = [self.means(None, lessons[first : first + 32]) for first in range(0, len(lessons), 32)]
+            parts = [self.means(None, samples[first : first + 32]) for first in range(0, len(samples), 32)]
         return {
             width: np.maximum(np.concatenate([part[width].numpy() for part in parts]).std(axis=0), SPREAD_FLOOR)
             for width in parts[0]
@@ -217,7 +219,7 @@ class TunedReader:
     def logits(self, image: npt.NDArray[np.float32]) -> dict[str, float]:
         """Material → logit, for a touch that reaches the last stage; image: (C, T) in [-1, 1]."""
         with steady():
-            means = self._touches.means(self._net, [Lesson("", b"", image, self._touches.frozen(image))])
+            means = self._touches.means(self._net, [TrainingSample("", b"", image, self._touches.frozen(image))])
             logits = self.tuned.bias.copy()
             for scale, head in self.tuned.heads.items():
                 logits += means[scale][0].numpy() @ head

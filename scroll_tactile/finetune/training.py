@@ -1,4 +1,4 @@
-"""The training of a fine-tune: from f's readout, on lessons, with an exam that is held out."""
+"""The training of a fine-tune: from f's readout, on samples, tested on others that are held out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from scroll_tactile.embeddings.runtimes import full_float32, one_torch_thread
 from scroll_tactile.errors import FineTuneError
-from scroll_tactile.finetune.network import Backbone, Lesson, TouchFeatures, adapted
+from scroll_tactile.finetune.network import Backbone, TouchFeatures, TrainingSample, adapted
 from scroll_tactile.memory.tuned import TuneMode
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.readout import Readout
@@ -23,7 +23,7 @@ from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS, fold_of
 
-__all__ = ["Progress", "Start", "Trained", "Trainer", "repeatable", "start_of", "told_of_memory"]
+__all__ = ["Progress", "Start", "Trained", "Trainer", "named_out_of_memory", "repeatable", "start_of"]
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], object]
@@ -72,11 +72,11 @@ def start_of(model: Model, names: Sequence[str], fold: int | None = None) -> Sta
         readout: Readout = selection.readout
         if fold is not None:
             places, readout = selection.held_out[fold]
-            known = [selection.names[at] for at in places]
-        at = [known.index(name) for name in names]
+            known = [selection.names[place] for place in places]
+        columns = [known.index(name) for name in names]
         mixing = np.eye(len(known)) if model.kind == "lda" else readout.ridge
-        slopes = readout.weights @ mixing[:, at]
-        offset = readout.scores(np.zeros(len(known)), model.kind)[at]
+        slopes = readout.weights @ mixing[:, columns]
+        offset = readout.scores(np.zeros(len(known)), model.kind)[columns]
         heads[scale.width] = weight * slopes * 2.0**BITS
         bias += weight * (offset - readout.center @ slopes)
     return Start(list(names), heads, bias)
@@ -89,7 +89,7 @@ def held_names(model: Model, fold: int, names: Sequence[str]) -> list[str]:
         selection = model.selections[scale]
         if fold not in selection.held_out:
             return []
-        known &= {selection.names[at] for at in selection.held_out[fold][0]}
+        known &= {selection.names[place] for place in selection.held_out[fold][0]}
     return sorted(known)
 
 
@@ -105,8 +105,8 @@ def repeatable(device: str) -> Iterator[None]:
 
 
 @contextmanager
-def told_of_memory(device: str) -> Iterator[None]:
-    """Tell that a device has no memory left as the FineTuneError that it is."""
+def named_out_of_memory(device: str) -> Iterator[None]:
+    """Raise what a device without memory left raises as a FineTuneError."""
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
@@ -140,61 +140,62 @@ class Trainer:
         self.mode = mode
         self.progress = progress
 
-    def held_out(self, model: Model, lessons: list[Lesson]) -> tuple[list[Trained], list[Trained]]:
+    def held_out(self, model: Model, samples: list[TrainingSample]) -> tuple[list[Trained], list[Trained]]:
         """For each fold what training on the others gives for it, and what f gives."""
         trials, before = [], []
-        names = sorted({lesson.material for lesson in lessons})
+        names = sorted({sample.material for sample in samples})
         for fold in range(FOLDS):
             known = held_names(model, fold, names)
-            taught = [one for one in lessons if fold_of(one.key) != fold and one.material in known]
-            exam = [one for one in lessons if fold_of(one.key) == fold and one.material in known]
-            if len(known) < 2 or not taught or not exam:
+            usable = [sample for sample in samples if sample.material in known]
+            train = [sample for sample in usable if fold_of(sample.key) != fold]
+            test = [sample for sample in usable if fold_of(sample.key) == fold]
+            if len(known) < 2 or not train or not test:
                 continue
             start = start_of(model, known, fold)
-            head = Head(start, self.spreads).to(self.device)
-            before.append(Trained([self._judge(head, None, exam)], _targets(head, exam), {}, start.bias, {}))
+            head = LinearHead(start, self.spreads).to(self.device)
+            before.append(Trained([self._judge(head, None, test)], _targets(head, test), {}, start.bias, {}))
             what = f"held out {fold + 1}/{FOLDS}"
-            trials.append(self.train(start, taught, exam, self.epochs, salt=fold, what=what))
+            trials.append(self.train(start, train, test, self.epochs, salt=fold, what=what))
         return trials, before
 
     def train(
         self,
         start: Start,
-        taught: list[Lesson],
-        exam: list[Lesson],
+        train: list[TrainingSample],
+        test: list[TrainingSample],
         until: int,
         *,
         salt: int,
         what: str = "training",
     ) -> Trained:
-        """Train for `until` epochs of a schedule of `epochs`, and judge the exam after each."""
+        """Train for `until` epochs of a schedule of `epochs`, and test it after each."""
         random = np.random.default_rng([self.seed, salt])
-        head = Head(start, self.spreads).to(self.device)
+        head = LinearHead(start, self.spreads).to(self.device)
         net = None if self.mode == "head" else self._network()
-        optimiser, schedule = self._optimiser(head, net, -(-len(taught) // BATCH) * self.epochs)
+        optimiser, schedule = self._optimiser(head, net, -(-len(train) // BATCH) * self.epochs)
         logits = []
         for epoch in range(until):
-            order = random.permutation(len(taught))
+            order = random.permutation(len(train))
             for first in range(0, len(order), BATCH):
-                batch = [self._augmented(taught[at], random) for at in order[first : first + BATCH]]
+                batch = [self._augmented(train[i], random) for i in order[first : first + BATCH]]
                 self._step(head, net, batch, optimiser, f"{what}, epoch {epoch + 1}")
                 schedule.step()
-            if exam:
-                logits.append(self._judge(head, net, exam))
+            if test:
+                logits.append(self._judge(head, net, test))
             self.progress(what, epoch + 1, until)
         heads, bias = head.arrays()
         network = {} if net is None else net.tensors()
         arrays: list[npt.NDArray[Any]] = [bias, *heads.values(), *network.values()]
         if not all(np.isfinite(array).all() for array in arrays):
             raise FineTuneError(f"the weights are not finite after {what}: nothing was changed; take another seed")
-        return Trained(logits, _targets(head, exam), heads, bias, network)
+        return Trained(logits, _targets(head, test), heads, bias, network)
 
     def _network(self) -> Backbone:
         net = adapted(self.touches.network()) if self.mode == "adapters" else self.touches.network()
         return net.to(self.device)
 
     def _optimiser(
-        self, head: Head, net: Backbone | None, steps: int
+        self, head: LinearHead, net: Backbone | None, steps: int
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         groups: list[dict[str, Any]] = [
             {"params": [*head.changes.values()], "lr": HEAD_RATE},
@@ -205,14 +206,19 @@ class Trainer:
         optimiser = torch.optim.AdamW(groups, weight_decay=0.0)
         return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
 
-    def _augmented(self, lesson: Lesson, random: np.random.Generator) -> Lesson:
+    def _augmented(self, sample: TrainingSample, random: np.random.Generator) -> TrainingSample:
         if random.random() >= AUGMENTED:
-            return lesson
-        image = AUGMENTATION.augment(lesson.image, random, columns=lesson.image.shape[1])
-        return Lesson(lesson.material, lesson.key, image, self.touches.frozen(image))
+            return sample
+        image = AUGMENTATION.augment(sample.image, random, columns=sample.image.shape[1])
+        return TrainingSample(sample.material, sample.key, image, self.touches.frozen(image))
 
     def _step(
-        self, head: Head, net: Backbone | None, batch: list[Lesson], optimiser: torch.optim.Optimizer, where: str
+        self,
+        head: LinearHead,
+        net: Backbone | None,
+        batch: list[TrainingSample],
+        optimiser: torch.optim.Optimizer,
+        where: str,
     ) -> None:
         targets = torch.from_numpy(_targets(head, batch)).to(self.device)
         loss = functional.cross_entropy(head(self.touches.means(net, batch, self.device)), targets)
@@ -226,22 +232,22 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
 
-    def _judge(self, head: Head, net: Backbone | None, exam: list[Lesson]) -> FloatArray:
+    def _judge(self, head: LinearHead, net: Backbone | None, test: list[TrainingSample]) -> FloatArray:
         """Logits (touches, C)."""
         with torch.no_grad():
             parts = [
-                head(self.touches.means(net, exam[first : first + BATCH], self.device))
-                for first in range(0, len(exam), BATCH)
+                head(self.touches.means(net, test[first : first + BATCH], self.device))
+                for first in range(0, len(test), BATCH)
             ]
         logits: FloatArray = torch.cat(parts).cpu().numpy()
         return logits
 
 
-def _targets(head: Head, lessons: Sequence[Lesson]) -> npt.NDArray[np.intp]:
-    return np.array([head.names.index(one.material) for one in lessons], dtype=np.intp)
+def _targets(head: LinearHead, samples: Sequence[TrainingSample]) -> npt.NDArray[np.intp]:
+    return np.array([head.names.index(sample.material) for sample in samples], dtype=np.intp)
 
 
-class Head(nn.Module):
+class LinearHead(nn.Module):
     """f's readout, with changes to be learned in units of the features' spread."""
 
     def __init__(self, start: Start, spreads: Mapping[int, FloatArray]) -> None:

@@ -1,4 +1,4 @@
-"""What a memory says, as one ONNX file: from the tactile image to the materials' scores, without this library."""
+"""What a memory predicts, as an ONNX file: from the tactile image to the materials' scores, without this library."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ def export_onnx(learner: TactileLearner, path: str | os.PathLike[str]) -> None:
     the probabilities that `predict` gives them all. The model's metadata hold `materials`, the names in the order
     of the scores, as JSON, beside `sensor` and `fingerprint`. What is not in the file: novelty, and so "unknown".
 
-    It is what the memory says now; observe more, and export again. Two runtimes' float32 networks differ in the last
-    bits, which the readouts enlarge: in ONNX Runtime, of 400 real touches, the probabilities lay within 8e-6 of those
+    It is what the memory predicts now; observe more, and export again. Two runtimes' networks differ in the last bits,
+    which the readouts enlarge: in ONNX Runtime, of 400 real touches, the probabilities lay within 8e-6 of those
     of torch, the scores within 4e-4, and the best material was the same.
 
     Raises InputError for a memory of another embedding than Vision in float32, for one that holds nothing or a
-    material that was never felt for long enough, and where the package onnx is missing.
+    material that was never observed for long enough, and where the package onnx is missing.
     """
     embedding = learner.embedding
     if not isinstance(embedding, Vision) or embedding.precision != "float32":
         raise InputError(
-            f"only memories of a Vision embedding in float32 can be exported; this one's is {embedding!r}. Teach "
-            "TactileLearner(embedding=Vision(...)) the same touches"
+            f"only memories of a Vision embedding in float32 can be exported; this one's is {embedding!r}. Observe the "
+            "same touches with TactileLearner(embedding=Vision(...))"
         )
     if not learner.materials:
-        raise InputError("expected a memory that has felt something; this one is empty, and would have no scores")
-    model = learner.model()
+        raise InputError("expected a memory that has observed something; this one is empty, and would have no scores")
+    model, longest = learner.model(), learner._memory.statistics.longest
     channels, columns = _shape(learner.sensor)
     read = min(columns, model.longest) if not learner.sensor.camera else columns  # no further than was learned
     graph = Graph()
@@ -80,8 +80,8 @@ def _scales(model: Model, columns: int) -> tuple[int, list[Scale]]:
     for name in model.names:
         if any(name not in model.selections[scale].places for scale in scales):
             raise InputError(
-                f"expected every material to have been felt for the sensor's usual length; {name!r} was only felt "
-                "briefly, and would have no score. Observe a longer touch of it first"
+                f"expected every material to have been observed for the sensor's usual length; {name!r} was "
+                "only observed briefly, and would have no score. Observe a longer touch of it first"
             )
     return stage, scales
 
@@ -113,7 +113,7 @@ def _planes(graph: Graph, columns: int, read: int) -> str:
     """The image's first columns as scaled colour planes (1, 3, C, T)."""
     image = "image" if read == columns else _slice(graph, "image", 0, read, axis=1)
     half = graph.add("Mul", graph.add("Add", image, graph.constant(np.float32(1))), graph.constant(np.float32(0.5)))
-    mean, deviation = (np.array(one, np.float32).reshape(1, 3, 1, 1) for one in (MEAN, DEVIATION))
+    mean, deviation = (np.array(planes, np.float32).reshape(1, 3, 1, 1) for planes in (MEAN, DEVIATION))
     return graph.add("Div", graph.add("Sub", half, graph.constant(mean)), graph.constant(deviation))
 
 
@@ -127,7 +127,7 @@ def _pooled(
 ) -> str:
     """`pool_windows` of spans of an image of this shape, or of all of each image of a batch where there are none."""
     with torch.inference_mode():
-        widths = [one.shape[-1] for one in net(torch.zeros(1, 3, *shape), embedding.stages[-1])]
+        widths = [stage.shape[-1] for stage in net(torch.zeros(1, 3, *shape), embedding.stages[-1])]
     parts = []
     for stage in embedding.stages:
         if spans is None:
@@ -171,5 +171,5 @@ def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int
 
 
 def _slice(graph: Graph, what: str, first: int, after: int, *, axis: int) -> str:
-    bounds = [graph.constant(np.array([one])) for one in (first, after, axis)]
+    bounds = [graph.constant(np.array([bound])) for bound in (first, after, axis)]
     return graph.add("Slice", what, *bounds)

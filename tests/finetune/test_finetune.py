@@ -11,8 +11,7 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
-from scroll_tactile.finetune.network import Lesson, TouchFeatures, TunedReader, adapted
-from scroll_tactile.memory.identity import Identity
+from scroll_tactile.finetune.network import TouchFeatures, TrainingSample, TunedReader, adapted
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
@@ -242,14 +241,14 @@ def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
     reading = window_plan(PAD, embedding)
     features = TouchFeatures(embedding, reading)
     image = tactile_image(touches[0][1])
-    means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
+    means = features.means(None, [TrainingSample("", b"", image, features.frozen(image))])
     codes = embedding.embed_windows(image, reading.extent(image.shape[1]))
     for width, mean in means.items():
         expected = codes[width][reading.places(image.shape[1])[Scale("window", width)]].mean(axis=0)
         assert np.abs(mean[0].numpy() - expected).max() < 1e-5
     net = adapted(features.network())
     assert all("alpha" in name for name, p in net.named_parameters() if p.requires_grad)
-    near = features.means(net, [Lesson("", b"", image, features.frozen(image))])
+    near = features.means(net, [TrainingSample("", b"", image, features.frozen(image))])
     for width, mean in means.items():  # narrow windows stay as the embedding reads them
         change = float((near[width] - mean).abs().max().detach())
         assert 0 < change < 1e-2 if width >= TOGETHER else change == 0
@@ -344,7 +343,7 @@ def test_the_judged_windows_are_read_as_the_embedding_reads_them_whatever_their_
     features = TouchFeatures(embedding, reading)
     image = tactile_image(Scene(sensor=sensor).touch(NAMES[0], 1))
     columns = image.shape[1]
-    means = features.means(None, [Lesson("", b"", image, features.frozen(image))])
+    means = features.means(None, [TrainingSample("", b"", image, features.frozen(image))])
     rows = embedding.embed_windows(image, reading.extent(columns))
     for width, mean in means.items():
         expected = rows[width][reading.places(columns)[Scale("window", width)]].mean(axis=0)

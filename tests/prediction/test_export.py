@@ -89,8 +89,8 @@ def test_an_empty_memory_is_refused(tmp_path):
     assert not (tmp_path / "memory.onnx").exists()
 
 
-def test_a_material_felt_only_briefly_is_named(tmp_path):
+def test_a_material_observed_only_briefly_is_named(tmp_path):
     learner, scene = taught(sensors.ROBOSKIN)
     learner.observe("brief", scene.touch(scene.materials[0], 5).first(0.4))
-    with pytest.raises(InputError, match="'brief' was only felt briefly"):
+    with pytest.raises(InputError, match="'brief' was only observed briefly"):
         export_onnx(learner, tmp_path / "memory.onnx")

@@ -154,14 +154,14 @@ def _stream(readings: npt.NDArray[Any], sensor: Sensor, path: Path) -> Stream:
 
 def _count_before(labels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """For each label, how many equal ones come before it."""
-    return np.array([np.count_nonzero(labels[:at] == label) for at, label in enumerate(labels)])
+    return np.array([np.count_nonzero(labels[:i] == label) for i, label in enumerate(labels)])
 
 
 def _read_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[Any]:
     wanted = f"an array of shape {shape}"
     array = _read(path, lambda file: np.load(file, allow_pickle=False), wanted)
     if not isinstance(array, np.ndarray) or array.shape != shape:
-        came = getattr(array, "shape", type(array).__name__)
+        came = array.shape if isinstance(array, np.ndarray) else type(array).__name__
         raise DatasetError(f"expected {path} to hold {wanted}; it holds {came}")
     return array
 

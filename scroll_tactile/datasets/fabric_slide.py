@@ -91,8 +91,8 @@ def load(root: str | Path, fabrics: Collection[str] = BALANCED, seed: int = 0) -
     if strange or not fabrics:
         raise InputError(f"expected fabrics out of {list(FABRICS)}; came {strange or 'none'}")
     folder = _find(Path(root).expanduser())
-    told = sorted((protocol_of(path), path) for path in folder.glob("*.csv"))
-    chosen = [one for one in told if one[0][0] in fabrics]
+    found = sorted((protocol_of(path), path) for path in folder.glob("*.csv"))
+    chosen = [(protocol, path) for protocol, path in found if protocol[0] in fabrics]
     missing = sorted(set(fabrics) - {protocol[0] for protocol, _ in chosen})
     if missing:
         raise DatasetError(f"expected slides over {missing} in {folder}; there are none. Get them from {SOURCE}")
@@ -106,7 +106,7 @@ def load(root: str | Path, fabrics: Collection[str] = BALANCED, seed: int = 0) -
     )
     streams = [_read(path) for _, path in chosen]
     recordings = Recordings("FabricSlide", CPM_FINGER, streams, names, within, fold, ordered=False)
-    force, speed = (np.array([protocol[at] for protocol, _ in chosen], dtype=np.int64) for at in (1, 2))
+    force, speed = (np.array([protocol[i] for protocol, _ in chosen], dtype=np.int64) for i in (1, 2))
     return Slides(recordings, force, speed)
 
 
@@ -124,8 +124,8 @@ def ratios(slide: Stream) -> Stream:
     # The integral of the readings, taken between the places' edges: exact for slow slides and for fast ones.
     total = np.concatenate([np.zeros((1, logs.shape[1])), np.cumsum(logs, axis=0)])
     edges = np.linspace(0, len(logs), _PLACES + 1)
-    at = np.stack([np.interp(edges, np.arange(len(total)), column) for column in total.T], axis=1)
-    return validate(np.diff(at, axis=0) * (_PLACES / len(logs)), CPM_RATIOS)
+    totals = np.stack([np.interp(edges, np.arange(len(total)), column) for column in total.T], axis=1)
+    return validate(np.diff(totals, axis=0) * (_PLACES / len(logs)), CPM_RATIOS)
 
 
 def _read(path: Path) -> Stream:

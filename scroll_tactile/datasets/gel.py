@@ -83,7 +83,7 @@ class Gel:
         usual = math.exp(random.normal(0, 0.15))
         pressure = np.arange(count) / max(1, count - 1) * (usual if force is None else force)
         slopes = _pressed(self.seed, index, _grid(self.sensor.shape), random)
-        shares = np.stack([_lit(slopes, float(one)) for one in pressure])
+        shares = np.stack([_lit(slopes, float(force)) for force in pressure])
         shares += _NOISE * random.standard_normal(shares.shape)
         low, high = np.asarray(self.sensor.low), np.asarray(self.sensor.high)
         return validate(low + np.round(np.clip(shares, 0, 1) * (high - low)), self.sensor)

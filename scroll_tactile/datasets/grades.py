@@ -1,6 +1,6 @@
 """A table of materials' attributes in grades, from a .csv file: a line for each material, a column for each attribute.
 
-Such as a publisher's list of what was touched, told in whole numbers from 0: soft 0, firm 1, stiff 2; where it says
+Such as a publisher's list of what was touched, graded in whole numbers from 0: soft 0, firm 1, stiff 2; where it says
 what a material is (foam, wood, plant fibre), a column of 0 and 1 for each. Lists are not ours to hand on, so the file
 is the reader's own::
 
@@ -17,7 +17,7 @@ from scroll_tactile.errors import DatasetError
 
 __all__ = ["read_grades"]
 
-MOST = 20  # grades are told step by step, each by a head of its own: they are no measures
+MOST = 20  # grades are predicted step by step, each by a head of its own: they are no measures
 
 
 def read_grades(path: Path) -> dict[str, dict[str, int]]:

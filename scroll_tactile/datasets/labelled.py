@@ -51,7 +51,7 @@ class Recordings:
     def blocked(self) -> npt.NDArray[np.int64]:
         """Folds of ten successive repetitions, int of shape (N,); the last, 4 of 50, is the usual test block.
 
-        A material recorded in one sitting drifts as it goes: neighbours in time in training and test make a
+        A material recorded in one session drifts as it goes: neighbours in time in training and test make a
         random split look better than tomorrow will be.
 
         Raises DatasetError if the order of recording is not known.

@@ -6,7 +6,7 @@ Published as github.com/tasbolat1/letter-spike (Telluride 2021, NUSkin on a robo
 
 A taxel sends its value when it changes, and a harder press is a smaller value. So between two events of a taxel its
 value stays what it was: binned, a press is a stream of pressures, 1023 − adc. Each letter is six dots, and each dot a
-constituent that is there or not, so letters stand in for fabrics: those never pressed are told by dots that were.
+constituent that is there or not, so letters stand in for fabrics: new letters are known by dots that were pressed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def dots_of(letter: str) -> dict[str, bool]:
 
 
 def letter_folds(folds: int, seed: int = 0) -> list[list[str]]:
-    """The letters dealt into so many groups: those of one are never touched before they are asked about.
+    """The letters dealt into so many groups: the letters of a group are evaluated without being observed.
 
     Raises InputError for fewer than 2 groups, more than there are letters, or a negative seed.
     """
@@ -81,7 +81,7 @@ def letter_folds(folds: int, seed: int = 0) -> list[list[str]]:
             f"expected 2 to {len(LETTERS)} groups of letters and a seed of 0 or more; came {folds}, {seed}"
         )
     order = np.random.default_rng([seed, folds]).permutation(len(LETTERS))
-    return [sorted(LETTERS[at] for at in order[first::folds]) for first in range(folds)]
+    return [sorted(LETTERS[i] for i in order[first::folds]) for first in range(folds)]
 
 
 def load(root: str | Path, seed: int = 0, *, seconds: float = 3.0) -> Recordings:
@@ -111,8 +111,8 @@ def load(root: str | Path, seed: int = 0, *, seconds: float = 3.0) -> Recordings
             repetitions.append(press)
     numbers = np.array(repetitions, dtype=np.int64)
     dealt = {
-        letter: np.random.default_rng([seed, at]).permutation(np.arange(_PRESSES) % _FOLDS)
-        for at, letter in enumerate(LETTERS)
+        letter: np.random.default_rng([seed, i]).permutation(np.arange(_PRESSES) % _FOLDS)
+        for i, letter in enumerate(LETTERS)
     }
     fold = np.array([dealt[letter][press] for letter, press in zip(materials, repetitions, strict=True)], np.int64)
     return Recordings("letter-spike", NUSKIN, streams, materials, numbers, fold, ordered=True)

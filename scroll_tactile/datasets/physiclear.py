@@ -88,17 +88,17 @@ def videos(recordings: Recordings) -> Recordings:
     """
     marks = list(zip(recordings.materials, recordings.repetition.tolist(), strict=True))
     places: dict[tuple[str, int], list[int]] = {}
-    for at, mark in enumerate(marks):
-        places.setdefault(mark, []).append(at)
-    if any(len(set(recordings.fold[those].tolist())) > 1 for those in places.values()):
+    for i, mark in enumerate(marks):
+        places.setdefault(mark, []).append(i)
+    if any(len(set(recordings.fold[frames].tolist())) > 1 for frames in places.values()):
         raise InputError(f"expected the frames of each video of {recordings.name} in one fold; some are in several")
-    first = [those[0] for those in places.values()]
-    joined = [np.concatenate([recordings.streams[at].readings for at in those]) for those in places.values()]
+    first = [frames[0] for frames in places.values()]
+    joined = [np.concatenate([recordings.streams[i].readings for i in frames]) for frames in places.values()]
     return replace(
         recordings,
         name="GelSight videos",
         streams=[validate(readings, recordings.sensor) for readings in joined],
-        materials=[recordings.materials[at] for at in first],
+        materials=[recordings.materials[i] for i in first],
         repetition=recordings.repetition[first],
         fold=recordings.fold[first],
     )
@@ -111,8 +111,8 @@ def read_attributes(root: str | Path) -> dict[str, dict[str, int]]:
     """
     path = _find(Path(root).expanduser()) / "attributes.json"
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        of_each = {name: {key: told[name][key] for key in told[name]} for name in ATTRIBUTES}
+        grades = json.loads(path.read_text(encoding="utf-8"))
+        of_each = {name: {key: grades[name][key] for key in grades[name]} for name in ATTRIBUTES}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"expected {', '.join(ATTRIBUTES)} of the objects in {path}; they cannot be read: {error!r}. It is part of "

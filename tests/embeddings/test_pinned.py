@@ -1,0 +1,69 @@
+"""What no change may move: a memory is refused to an embedding whose features or fingerprint changed by a bit.
+
+These are literals of the first version, so that without any data, too, a change of the default embedding is noticed.
+"""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Frames, Joined, Kernels, Maps, Robust, TactileLearner, sensors
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import embed_windows
+from scroll_tactile.embeddings.banks import bank
+from scroll_tactile.embeddings.protocol import window_plan
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.statistics.grid import to_codes
+
+SCENE = Scene(sensor=sensors.BIOTAC)
+
+FINGERPRINTS = [
+    (Kernels(), "7ca64c644374904e4e1687d99224aeb4f1debc8085be2283f3aa8983defe0d3c"),
+    (Kernels(dimension=64), "57f08f53388ea400c235b2c91e24d47edb76fc83175b793c42183337022f65d3"),
+    (Frames(), "4acbe6a3662862972b53271ce2e817fb6ca8eb8ea17ccd9fc51bdcef2be7de8f"),
+    (Frames(rest=None), "c0681443478dd89f9aadb7c5fdb199e1138ca2339eecb2ec232290fc04e0b952"),
+    (Robust(), "8a11586640b932752ea1323ac0a5090213659bf1812ed76d04189f2d6b0fbc23"),
+    (
+        Joined(Kernels(dimension=64), Kernels(seed=2, dimension=128)),
+        "03526032c69ee247a5292ba2e52ddd94aa3c4f6c1f49c863f302e80ed51f2215",
+    ),
+    (Maps(layout=(19,), parts=3), "7370942d5c2d7ff09600c15f971087e8312dd2d02976fa12df2f3171e987ede6"),
+]
+CODES = "888cebaadb4cfb976bf95cf4dedfd4f4ae15a78a0161860a85e2c6e936ba80d6"
+# Of the first kernel of the shortest dilation, for three channels.
+THRESHOLDS = [
+    *(363.5, 420.5, -63.5, 843.5, -46.5, -726.5, 1458.5, -1574.5, 1133.5, 1.5, -6267.5, 129.5),
+    *(-171.5, 3948.5, 115.5, -99.5, 194.5, -575.5, -2343.5, 1655.5, -77.5, 736.5, 340.5, -112.5),
+]
+
+
+@pytest.mark.parametrize(("embedding", "fingerprint"), FINGERPRINTS, ids=lambda given: repr(given)[:40])
+def test_the_fingerprints_of_memories_that_exist(embedding, fingerprint):
+    assert embedding.fingerprint == fingerprint
+
+
+def test_the_default_kernels_thresholds():
+    thresholds = bank(1, 3, 1).thresholds.numpy()
+    assert thresholds[:, 0].tolist() == THRESHOLDS
+    assert thresholds.shape == (24, 378)
+
+
+def test_the_default_features_of_a_simulated_touch():
+    image = tactile_image(SCENE.touch("denim", 0))
+    assert image.shape == (19, 400)
+    embedding, digest = Kernels(), hashlib.sha256()
+    windows = window_plan(sensors.BIOTAC, embedding).extent(image.shape[1])
+    assert {width: len(starts) for width, starts in windows.items()} == {30: 19, 300: 3}
+    for _, rows in sorted(embed_windows(embedding, image, windows).items()):
+        digest.update(to_codes(rows, embedding.bound).astype("<i8").tobytes())
+    assert digest.hexdigest() == CODES
+
+
+def test_the_default_accuracy_on_simulated_touches():
+    learner = TactileLearner(sensor=sensors.BIOTAC, exemplars=0)
+    for material in SCENE.materials:
+        learner.observe(material, SCENE.touch(material, 0))
+    short = [(material, SCENE.touch(material, i, seconds=0.3)) for i in (10, 11) for material in SCENE.materials]
+    right = np.count_nonzero([learner.predict(touch).material == material for material, touch in short])
+    assert 31 <= right <= 33  # of 40 touches of 0.3 s, after one touch of each material; another BLAS may move one

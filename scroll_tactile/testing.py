@@ -1,4 +1,4 @@
-"""Whether an embedding keeps the promises that exactness rests on; for the tests of those who write one."""
+"""Checks for the tests of those who write their own part: whether it keeps the promises that exactness rests on."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows
+from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, is_embedding
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = ["check_embedding"]
 
 Image = npt.NDArray[np.float32]
-HASHED = 16  # hex digits: fewer than 64 bits would meet by chance
+HASHED = 16  # hex digits: of fewer than 64 bits two would be equal by chance
+DECLARED = {  # by which capability
+    "embed_windows": "embeds_windows",
+    "is_noisy": "embeds_noise",
+    "embed_noisy": "embeds_noise",
+    "parts": "composite",
+    "network": "tunable",
+}
 
 
 def check_embedding(
@@ -33,6 +40,7 @@ def check_embedding(
     images += [np.full_like(images[-1], value) for value in (0.0, 1.0, -1.0, 0.3)]
     promises = [
         _describes_itself,
+        _declares_what_it_has,
         _features_are_sound,
         _image_is_left_alone,
         _repeats_itself,
@@ -52,7 +60,7 @@ def check_embedding(
 
 def _describes_itself(embedding: Embedding, images: list[Image]) -> None:
     """it says what it is: name, dimension, bound, fingerprint."""
-    if not isinstance(embedding, Embedding):
+    if not is_embedding(embedding):
         raise EmbeddingError(
             f"expected name, dimension, bound, fingerprint and embed(image); {type(embedding).__name__} lacks some"
         )
@@ -65,6 +73,17 @@ def _describes_itself(embedding: Embedding, images: list[Image]) -> None:
     digits = embedding.fingerprint
     if not isinstance(digits, str) or len(digits) < HASHED or set(digits) - set("0123456789abcdef"):
         raise _broken(embedding, f"its fingerprint must be {HASHED} or more lower-case hex digits; it is {digits!r}")
+
+
+def _declares_what_it_has(embedding: Embedding, images: list[Image]) -> None:
+    """its capabilities are those that it has."""
+    declared = capabilities_of(embedding)
+    for member, capability in DECLARED.items():
+        has, says = hasattr(embedding, member), bool(vars(declared)[capability])
+        if says and not has:
+            raise _broken(embedding, f"its capabilities say {capability}, and it has no {member}")
+        if has and not says and member.startswith("embed_"):  # another's `parts` may be anything
+            raise _broken(embedding, f"it has {member}, which nothing calls: declare Capabilities({capability}=True)")
 
 
 def _features_are_sound(embedding: Embedding, images: list[Image]) -> None:
@@ -89,32 +108,32 @@ def _image_is_left_alone(embedding: Embedding, images: list[Image]) -> None:
 
 
 def _repeats_itself(embedding: Embedding, images: list[Image]) -> None:
-    """one image gives the same bytes again."""
+    """an image gives the same bytes again."""
     for image in images:
         _require_same(embedding, embedding.embed(image.copy()), embedding.embed(image.copy()), "again", image)
 
 
 def _forgets_what_came_between(embedding: Embedding, images: list[Image]) -> None:
-    """one image gives the same bytes whatever was embedded in between."""
+    """an image gives the same bytes whatever was embedded in between."""
     first = [embedding.embed(image.copy()).copy() for image in images]
     for image, before in zip(images[::-1], first[::-1], strict=True):
         _require_same(embedding, before, embedding.embed(image.copy()), "after other images", image)
 
 
 def _windows_are_sound(embedding: Embedding, images: list[Image]) -> None:
-    """windows are read: as many rows as were asked for, sound ones."""
+    """windows are read: a sound row for each."""
     for image in images:
         windows = _windows(image, images)
         embedded = embed_windows(embedding, image.copy(), windows)
         if set(embedded) != set(windows):
-            raise _broken(embedding, f"asked for windows of widths {sorted(windows)}, it gave {sorted(embedded)}")
+            raise _broken(embedding, f"given windows of widths {sorted(windows)}, it read {sorted(embedded)}")
         for width, starts in windows.items():
             what = f"windows of {width} columns of {_described(image)}"
             _require_sound(embedding, embedded[width], (len(starts), embedding.dimension), what)
 
 
 def _windows_repeat(embedding: Embedding, images: list[Image]) -> None:
-    """windows give the same bytes again, whichever others are asked for."""
+    """windows give the same bytes again, whichever others are read with them."""
     for image in images:
         together = embed_windows(embedding, image.copy(), _windows(image, images))
         for width, starts in _windows(image, images).items():
@@ -154,7 +173,7 @@ def _image(channels: int, columns: int) -> Image:
 
 def _windows(image: Image, images: list[Image]) -> dict[int, list[int]]:
     """Windows of a third, of two thirds, and of all of the image; none narrower than the narrowest of all images."""
-    columns, least = image.shape[1], min(one.shape[1] for one in images)
+    columns, least = image.shape[1], min(other.shape[1] for other in images)
     widths = sorted({max(least, columns // 3), max(least, 2 * columns // 3), columns})
     return {width: sorted({0, (columns - width) // 2, columns - width}) for width in widths}
 
@@ -172,16 +191,16 @@ def _require_sound(embedding: Embedding, features: npt.NDArray[np.floating], sha
 
 def _require_same(
     embedding: Embedding,
-    one: npt.NDArray[np.floating],
-    other: npt.NDArray[np.floating],
+    first: npt.NDArray[np.floating],
+    second: npt.NDArray[np.floating],
     when: str,
     image: Image,
 ) -> None:
-    if one.dtype != other.dtype or one.tobytes() != other.tobytes():
-        differing = np.count_nonzero(one != other)
+    if first.dtype != second.dtype or first.tobytes() != second.tobytes():
+        differing = np.count_nonzero(first != second)
         raise _broken(
             embedding,
-            f"{when}, {_described(image)} gave other bytes ({differing} of {one.size} features differ). Threads, "
+            f"{when}, {_described(image)} gave other bytes ({differing} of {first.size} features differ). Threads, "
             "batches, dropout and state that is kept between calls are the usual reasons",
         )
 

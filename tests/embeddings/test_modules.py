@@ -40,7 +40,7 @@ def test_a_module_becomes_an_embedding_in_one_line():
     embedding = ModuleEmbedding(POOL, name="pool", dimension=32)
     assert isinstance(embedding, Embedding)
     assert (embedding.capabilities, embedding.bound) == (Capabilities(partial_windows=False), 1.0)
-    assert len(check_embedding(embedding, columns=(9, 60))) == 9
+    assert len(check_embedding(embedding, columns=(9, 60))) == 10
     image = np.linspace(-1, 1, 19 * 40, dtype=np.float32).reshape(19, 40)
     assert np.array_equal(embedding.embed(image), POOL(torch.from_numpy(image)[None])[0].numpy())
 
@@ -174,6 +174,9 @@ CASES = {
     "depends on the past": (broken(embed=remembers), "other"),
     "writes into its input": (broken(embed=writes), "wrote into the image"),
     "refuses read-only": (broken(embed=only_writable), "read-only"),
+    "windows undeclared": (broken(embed_windows=lies), "declare Capabilities(embeds_windows=True)"),
+    "noise undone": (broken(capabilities=Capabilities(embeds_noise=True)), "it has no is_noisy"),
+    "capabilities of another type": (broken(capabilities={}), "expected the capabilities of Mine"),
     "windows differ from cuts": (broken(embed_windows=lies, capabilities=OWN), "cut out"),
     "windows missing": (broken(embed_windows=forgets_rows, capabilities=OWN), "expected features of shape (3, 2)"),
     "windows by company": (broken(embed_windows=by_company, capabilities=OWN), "with other windows and alone"),
@@ -189,5 +192,5 @@ def test_a_broken_promise_is_named(case):
 
 
 def test_what_holds_is_listed():
-    assert len(check_embedding(Broken())) == 9
+    assert len(check_embedding(Broken())) == 10
     assert check_embedding(Kernels(dimension=64), channels=(1, 19), columns=(9, 30)) == check_embedding(Broken())

@@ -38,7 +38,7 @@ def image(channels, columns, seed=0):
 @pytest.mark.parametrize("vision", [RANDOM, Vision(None, seed=1, stages=(0, 4), precision="bfloat16")], ids=repr)
 def test_it_keeps_the_promises_of_an_embedding(vision):
     assert isinstance(vision, Embedding)
-    assert "one image gives the same bytes again" in check_embedding(vision, channels=(1, 19), columns=(1, 30, 100))
+    assert "an image gives the same bytes again" in check_embedding(vision, channels=(1, 19), columns=(1, 30, 100))
 
 
 def test_real_weights_keep_them_too(real_weights):

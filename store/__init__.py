@@ -1,18 +1,17 @@
 """Arrays and records that survive a power cut.
 
 A `Store` is a folder with a journal, whose rows are durable when `append` returns, and with
-generations: snapshots of arrays that are replaced as a whole. It knows nothing of what the arrays
-mean. FORMAT.md beside this file describes every byte of it.
+generations: snapshots of arrays, each replaced as a whole. It knows nothing of what the arrays mean.
+FORMAT.md beside this file describes every byte of it.
 
     with Store.open(path, identity={"made for": "this"}) as store:
         head = store.append("add", "a label", key, arrays={"codes": codes})
         store.commit({"sums": sums}, upto=head.sequence)
 
-`check_store` verifies all of one, and `repair_store` keeps of a damaged one what verifies.
+`check_store` verifies a whole store; `repair_store` keeps what verifies of a damaged one.
 """
 
-from store.check import Problem, check_store
-from store.errors import (
+from store.exceptions import (
     CompactedError,
     DamageError,
     LockedError,
@@ -27,6 +26,7 @@ from store.errors import (
 from store.records import JSON, Generation, Head, Record
 from store.repair import Repair, repair_store
 from store.store import Store
+from store.survey import Problem, check_store
 
 __all__ = [
     "JSON",

@@ -33,12 +33,10 @@ def _sync(path: Path, flags: int) -> None:
     try:
         # On a Mac fsync stops at the drive's cache; some file systems there refuse the stronger call.
         if FULL_SYNC is not None:
-            try:
+            with suppress(OSError):
                 fcntl.fcntl(descriptor, FULL_SYNC)
-            except OSError:
-                os.fsync(descriptor)
-        else:
-            os.fsync(descriptor)
+                return
+        os.fsync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -1,149 +1,187 @@
-"""Generations: zarr groups that are written whole and made durable before they count."""
+"""The generations of an open store: which one is current, which others stay, and how a new one is committed."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
-from collections.abc import Collection, Mapping
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
-from store.arrays import array_digest, chunk_digest, flat_bytes
-from store.files import remove_tree, sync_folder, sync_tree
-from store.records import JSON
-from store.reporting import reported
+from store.exceptions import DamageError, StoreError, reported
+from store.files import remove_tree
+from store.groups import PARTIAL, GroupReader, folder_name, write_group
+from store.journal import Journal
+from store.records import Generation, GenerationRow, from_json
 
-__all__ = [
-    "GROUP_VERSION",
-    "PARTIAL",
-    "folder_name",
-    "highest_number",
-    "numbers",
-    "own_digest",
-    "remove_others",
-    "write_generation",
-]
+__all__ = ["Generations", "highest_number", "numbers", "remove_others"]
 
 logger = logging.getLogger(__name__)
 
-GROUP_VERSION = 1
-PARTIAL = ".partial"
+# The current one, and the one before it in case a disk error spoils the current: then recovery
+# replays only the journal's rows since then. More would only cost space. A base stays beside them,
+# for the rows that it stands for have no arrays of their own any more.
+KEPT_GENERATIONS = 2
 
-# Pieces of a large array: small enough to be compressed in cache-sized steps and on several
-# threads, large enough that a hundred megabytes are some tens of files to make durable.
-CHUNK_BYTES = 4 * 2**20
-
-
-def folder_name(number: int) -> str:
-    """Return the name of a generation's folder: its number in eight digits, or more when it needs them."""
-    return f"{number:08d}"
+Answer = TypeVar("Answer")
+Commit = tuple[Mapping[str, np.ndarray], int, str, Mapping[str, int]]
 
 
-def write_generation(
-    parent: Path,
-    number: int,
-    upto: int,
-    arrays: Mapping[str, np.ndarray],
-    attributes: Mapping[str, JSON],
-    chunks: Mapping[str, int],
-    identity: Mapping[str, JSON],
-) -> dict[str, Any]:
-    """Write checked arrays as a durable zarr group in `parent` and return what must be read back.
+class Generations:
+    """The generations in folder `parent` that the journal names. The methods are `Store`'s of the same names."""
 
-    That is the group's format and, for each array, its dtype, shape and sha256, and for one that is in
-    `chunks` (name → rows) a digest of each chunk, as JSON. The group says the same of itself, and what
-    store it is of, so that it can be verified without the journal. On any error nothing is left behind.
-    Raises StoreFullError, ReadOnlyError or StoreError.
-    """
-    described = {name: _describe(array, chunks.get(name)) for name, array in arrays.items()}
-    content = {"format": GROUP_VERSION, "arrays": described}
-    final = parent / folder_name(number)
-    draft = parent / (folder_name(number) + PARTIAL)
-    try:
-        with reported(draft, f"writing generation {number}"):
-            parent.mkdir(exist_ok=True)
-            remove_tree(draft)
-            known = {"number": number, "upto": upto, "attributes": attributes, "identity": identity, **content}
-            _write_group(draft, known | {"sha256": own_digest(known)}, arrays, chunks)
-            sync_tree(draft)
-            draft.rename(final)
-            sync_folder(parent)
-    except BaseException:
-        remove_tree(draft)
-        remove_tree(final)
-        raise
-    return content
+    def __init__(self, parent: Path, journal: Journal) -> None:
+        self._parent = parent
+        self._journal = journal
+        self._committing = threading.Lock()
+        # Numbers of generations that failed to verify: they do not count as a fallback.
+        self._spoilt: set[int] = set()
+        self._worker = ThreadPoolExecutor(1, f"store commit {parent.parent.name}")
+        self._queue = threading.Lock()
+        self._waiting: Commit | None = None
+        self._submitted: Future[None] | None = None
+        self._failure: Exception | None = None
 
+    def latest(self) -> Generation | None:
+        """Return the newest generation that verifies, None when there is none."""
+        passed: set[int] = set()
+        while True:
+            row = self._find(lambda row: row.number not in passed)
+            if row is None:
+                return None
+            passed.add(row.number)
+            try:
+                return self._load(row)
+            except DamageError as damage:
+                if self._is_named(row):
+                    self._spoilt.add(row.number)
+                    logger.warning("%s; falling back to an older generation", damage)
 
-def own_digest(known: Mapping[str, Any]) -> str:
-    """Return the sha256, in hexadecimal, over a group's other attributes, as compact JSON with sorted keys."""
-    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
+    def base(self) -> Generation | None:
+        """Return the generation that stands for the compacted rows, None when there is none."""
+        return self._read(lambda row: bool(row.base), self._load)
 
-
-def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
-    described = {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
-    if rows is None:
-        return described
-    pieces = [chunk_digest(array[first : first + rows]) for first in range(0, len(array), rows)]
-    return described | {"rows": rows, "chunks": pieces}
-
-
-def _write_group(
-    path: Path, attributes: dict[str, Any], arrays: Mapping[str, np.ndarray], chunks: Mapping[str, int]
-) -> None:
-    # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
-    import zarr
-    from zarr.codecs import BloscCodec
-    from zarr.storage import LocalStore
-
-    group = zarr.create_group(store=LocalStore(path), zarr_format=3, attributes=attributes)
-    for name, array in arrays.items():
-        plain = _without_text(array)
-        target = group.create_array(
-            name,
-            shape=plain.shape,
-            dtype=plain.dtype,
-            **_layout(plain, chunks.get(name)),
-            compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
-            fill_value=0,
-            attributes={"dtype": array.dtype.str},
-            # A chunk that equals the fill value would have no file, nor would a lost one.
-            config={"write_empty_chunks": True},
+    def read_rows(self, name: str, first: int, last: int, number: int | None) -> np.ndarray:
+        """Return some rows of an array that is kept in chunks."""
+        rows = self._read(
+            lambda row: number in (None, row.number), lambda row: self._reader(row).rows(name, first, last)
         )
-        target[...] = plain
+        if rows is None:
+            wanted = "no generation" if number is None else f"generation {number} no longer"
+            raise StoreError(f"{self._parent.parent} has {wanted}: look at the newest again, with latest()")
+        return rows
 
+    def _find(self, wanted: Callable[[GenerationRow], bool]) -> GenerationRow | None:
+        return next((row for row in self._journal.generations() if wanted(row)), None)
 
-def _without_text(array: np.ndarray) -> np.ndarray:
-    # zarr v3 has no settled type for fixed-width text and warns of it: code points have one.
-    if array.dtype.kind != "U":
-        return array
-    shape = (*array.shape, array.dtype.itemsize // 4)
-    return flat_bytes(array).view("<u4").reshape(shape)
+    def _is_named(self, row: GenerationRow) -> bool:
+        # A writer may have replaced and removed it while it was read: that is no damage.
+        return self._find(lambda named: named.number == row.number) is not None
 
+    def _read(self, wanted: Callable[[GenerationRow], bool], read: Callable[[GenerationRow], Answer]) -> Answer | None:
+        while (row := self._find(wanted)) is not None:
+            try:
+                return read(row)
+            except DamageError:
+                if self._is_named(row):
+                    raise
+        return None
 
-def _layout(array: np.ndarray, rows: int | None) -> dict[str, Any]:
-    if rows is None:
-        return {"chunks": _chunks(array)}
-    # One file for all the chunks: hundreds of small ones would each have to be made durable.
-    rest = tuple(max(1, length) for length in array.shape[1:])
-    return {"chunks": (rows, *rest), "shards": (rows * max(1, -(-len(array) // rows)), *rest)}
+    def _reader(self, row: GenerationRow) -> GroupReader:
+        _, content = row.verified(self._journal.path)
+        return GroupReader(self._parent / folder_name(row.number), row.number, content)
 
+    def _load(self, row: GenerationRow) -> Generation:
+        attributes, _ = row.verified(self._journal.path)
+        return Generation(row.number, row.upto, attributes, self._reader(row).arrays())
 
-def _chunks(array: np.ndarray) -> tuple[int, ...]:
-    chunks, piece = [], array.nbytes
-    for length in array.shape:
-        slab = piece // max(length, 1)
-        chunks.append(max(1, length if piece <= CHUNK_BYTES else CHUNK_BYTES // max(slab, 1)))
-        piece = slab * chunks[-1]
-    return tuple(chunks)
+    def commit(
+        self,
+        arrays: Mapping[str, np.ndarray],
+        upto: int,
+        attributes: str,
+        chunks: Mapping[str, int],
+        *,
+        base: bool = False,
+    ) -> int:
+        """Write checked arrays as a generation, make the journal name it, and return its number."""
+        with self._committing:
+            earlier = self._journal.generations()
+            number = 1 + max([highest_number(self._parent), *(row.number for row in earlier)])
+            identity = self._journal.identity
+            content = write_group(self._parent, number, upto, arrays, from_json(attributes), chunks, identity)
+            row = GenerationRow.of(number, upto, int(base), time.time(), attributes, content)
+            kept = {row.number for row in self._kept(earlier, base=base)}
+            # When this fails the folder stays, for the next commit or open to remove: what could not be
+            # synced may be on the disk all the same, and name it after a crash.
+            self._journal.make_current(row, forget={row.number for row in earlier} - kept)
+            self._remove_unnamed()
+            return number
 
+    def _kept(self, earlier: list[GenerationRow], *, base: bool) -> list[GenerationRow]:
+        """Return which of the earlier generations, the newest first, stay beside a new one."""
+        sound = [row for row in earlier if row.sound and row.number not in self._spoilt]
+        if base:
+            # Only the newest: recovery from an older one may need arrays that go with this commit.
+            return sound[:1]
+        # Nobody knows whether a row that fails its checksum is that of the base.
+        bases = [row for row in earlier if row.sound and row.base]
+        return sound[: KEPT_GENERATIONS - 1] + bases[:1] + [row for row in earlier if not row.sound]
 
-def highest_number(parent: Path) -> int:
-    """Return the highest number of a generation's folder in `parent`, finished or not; 0 for none."""
-    return max(numbers(parent, unfinished=True), default=0)
+    def commit_later(self, commit: Commit) -> None:
+        """Do `commit` in a background thread; a newer one takes the place of one that still waits.
+
+        Logs a failure and keeps it until `raise_failure`.
+        """
+        with self._queue:
+            self._waiting = commit
+            self._submitted = self._worker.submit(self._commit_newest)
+
+    def _commit_newest(self) -> None:
+        with self._queue:
+            commit, self._waiting = self._waiting, None
+        if commit is None:
+            return
+        try:
+            self.commit(*commit)
+        except Exception as error:
+            logger.exception("%s: a background commit failed; the journal still holds its rows", self._parent.parent)
+            self._failure = error
+
+    def wait(self) -> None:
+        """Return when no background commit runs or waits."""
+        if self._submitted is not None:
+            wait_for([self._submitted])
+
+    def raise_failure(self) -> None:
+        """Raise the failure of an earlier background commit, once, as a StoreError."""
+        with self._queue:
+            failure, self._failure = self._failure, None
+        if isinstance(failure, StoreError):
+            raise failure
+        if failure is not None:
+            raise StoreError(f"a background commit failed: {failure!r}") from failure
+
+    def close(self) -> None:
+        """Wait for the background commit and end its thread."""
+        self._worker.shutdown()
+
+    def remove_unfinished(self) -> None:
+        """Remove the folders that the journal does not name: a writer that died left them behind."""
+        with reported(self._parent, "removing unfinished generations"):
+            remove_others(self._parent, [row.number for row in self._journal.generations()])
+
+    def _remove_unnamed(self) -> None:
+        try:
+            self.remove_unfinished()
+        except StoreError as error:
+            # The commit itself stands; the next one, or the next open, removes what is left.
+            logger.warning("%s: old generations could not be removed: %s", self._parent, error)
 
 
 def numbers(parent: Path, *, unfinished: bool = False) -> list[int]:
@@ -153,6 +191,11 @@ def numbers(parent: Path, *, unfinished: bool = False) -> list[int]:
     names = (entry.name for entry in parent.iterdir())
     stems = {name.removesuffix(PARTIAL) if unfinished else name for name in names}
     return sorted(int(stem) for stem in stems if stem.isascii() and stem.isdigit())
+
+
+def highest_number(parent: Path) -> int:
+    """Return the highest number of a generation's folder in `parent`, finished or not; 0 for none."""
+    return max(numbers(parent, unfinished=True), default=0)
 
 
 def remove_others(parent: Path, kept: Collection[int]) -> None:

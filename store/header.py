@@ -1,14 +1,13 @@
-"""Whether a folder holds a store: what the first bytes of its journal say, before SQLite sees them."""
+"""What a folder and the first bytes of its journal say, before SQLite sees them."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
 
-from store.errors import DamageError, NotAStoreError, VersionError
-from store.files import file_size
-from store.lock import HOLDER_FILE, LOCK_FILE
-from store.reporting import reported
+from store.exceptions import DamageError, NotAStoreError, VersionError, reported
+from store.files import file_size, sync_folder
+from store.lock import HOLDER_FILE, LOCK_FILE, WriterLock
 from store.schema import (
     APPLICATION_ID,
     DAMAGED_FILE,
@@ -20,11 +19,13 @@ from store.schema import (
     PAGE_BYTES,
     REPAIRED_FILE,
     SIDES,
+    create_journal,
+    remove_drafts,
 )
 
-__all__ = ["header_fault", "holds_store", "with_new_header"]
+__all__ = ["header_fault", "holds_store", "lock_to_write", "new_first_page"]
 
-# What may be in a folder in which a store was not made yet; and of these one is there where a journal was.
+# What a folder may hold in which no store was made yet, and what betrays that one was.
 OURS = frozenset(
     {LOCK_FILE, HOLDER_FILE, HOLDER_FILE + ".new", GENERATIONS}
     | {DRAFT_FILE + suffix for suffix in ("", "-journal", *SIDES)}
@@ -33,8 +34,8 @@ TRACES = (JOURNAL_FILE + LOG, REPAIRED_FILE, DAMAGED_FILE)
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 HEADER_LENGTH = 100
-# Where the header says what: the file's change, its pages, its free pages, user_version, application_id,
-# and the change for which the count of pages was made.
+# Offsets in the header: the file's change, its pages, its free pages, user_version, application_id, and
+# the change for which the count of pages was made.
 CHANGE_AT, PAGES_AT, FREE_AT, VERSION_AT, APPLICATION_AT, COUNTED_AT = 24, 28, 32, 60, 68, 92
 
 # What every journal's header says, and where; between these, and behind, are counts that change. `log` is 2
@@ -94,7 +95,7 @@ def _refuse_foreign(folder: Path) -> None:
     if traces:
         raise DamageError(
             f"{folder} has {' and '.join(traces)} but no {JOURNAL_FILE}: put the journal back from a copy, or "
-            "repair the store (repair_store), which goes on from what verifies",
+            "repair the store (repair_store), which resumes from what verifies",
             path=folder / JOURNAL_FILE,
         )
     if foreign := sorted(entry.name for entry in folder.iterdir() if entry.name not in OURS):
@@ -140,11 +141,37 @@ def header_fault(journal: Path) -> str | None:
     return f"{journal} has {size} bytes, and says that it has {pages} pages of {PAGE_BYTES}"
 
 
-def with_new_header(page: bytes) -> bytes:
-    """Return the first page of a new journal, so that SQLite takes it for that of one of any size."""
+def new_first_page(page: bytes) -> bytes:
+    """Return the first page of a new journal, changed so that SQLite takes it for that of one of any size."""
     fresh = bytearray(page)
     struct.pack_into(">II", fresh, FREE_AT, 0, 0)
-    # A count of pages that was made for another change is not believed: it goes by the size of the file.
+    # SQLite does not believe a count of pages made for another change: it goes by the size of the file.
     struct.pack_into(">I", fresh, CHANGE_AT, 1)
     struct.pack_into(">I", fresh, COUNTED_AT, 0)
     return bytes(fresh)
+
+
+def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
+    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
+
+    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
+    """
+    with reported(folder, "making the folder"):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(folder.parent)
+    lock = WriterLock(folder)
+    try:
+        # Asked again, under the lock: another writer may have made the store, and left, since.
+        if not holds_store(folder):
+            if identity is None:
+                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
+            with reported(folder, "making the store"):
+                create_journal(folder, identity)
+        with reported(folder, "removing what an interrupted repair left"):
+            # Or, were the journal lost later, the rows appended from now on would be lost with it.
+            remove_drafts(folder)
+    except BaseException:
+        lock.release()
+        raise
+    return lock

@@ -10,13 +10,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from store.arrays import decode_payload
-from store.connection import connect, roll_back
-from store.errors import CompactedError, DamageError, StoreClosedError, StoreError
-from store.records import JSON, Head, Record, from_json
-from store.reporting import reported
-from store.rows import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, lost_heads, read_head, read_meta, uncovered
-from store.schema import checksum, has_our_schema, payload_digest
+from store.encoding import decode_payload
+from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
+from store.records import (
+    GENERATION_COLUMNS,
+    HEAD_COLUMNS,
+    JSON,
+    GenerationRow,
+    Head,
+    Record,
+    checksum,
+    from_json,
+    lost_heads,
+    payload_digest,
+    read_head,
+    read_meta,
+    uncovered,
+)
+from store.schema import connect, has_our_schema
 
 __all__ = ["Journal"]
 
@@ -73,7 +84,7 @@ class Journal:
     def last(self) -> int:
         """Return the sequence of the last row, or the last that a generation contains, if later; or 0."""
         # Payloads and generations count only when rows were lost: then their numbers must not be given out
-        # again, and who reads on to the last must meet the gap.
+        # again, and whoever reads on to the last must meet the gap.
         query = (
             "SELECT max(coalesce((SELECT max(sequence) FROM record), 0),"
             " coalesce((SELECT max(sequence) FROM payload), 0)), (SELECT max(upto) FROM generation)"
@@ -95,7 +106,7 @@ class Journal:
             with self._using("beginning a batch") as connection:
                 connection.execute("BEGIN IMMEDIATE")
             self._batch = True
-            # Not inside `_using`: what the block itself raises is not the store's to tell.
+            # Not inside `_using`: what the block itself raises is not the store's error.
             try:
                 yield
                 with self._using("making a batch durable"):
@@ -103,19 +114,19 @@ class Journal:
                         raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
                     connection.execute("COMMIT")
             except BaseException:
-                self._take_back(connection)
+                self._undo_batch(connection)
                 raise
             finally:
                 self._batch = False
 
-    def _take_back(self, connection: sqlite3.Connection) -> None:
+    def _undo_batch(self, connection: sqlite3.Connection) -> None:
         try:
-            with self._using("taking a batch back"):
-                roll_back(connection)
+            with self._using("rolling a batch back"):
+                connection.rollback()
                 self._last = self.last()
         except StoreError as error:
-            # What ended the batch is what the caller has to hear of; the next insert tries this again.
-            logger.warning("%s: a batch could not be taken back yet: %s", self.path, error)
+            # The caller has to learn what ended the batch; the next insert rolls back again.
+            logger.warning("%s: a batch could not be rolled back yet: %s", self.path, error)
 
     def refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -143,7 +154,7 @@ class Journal:
                 if not self._batch:
                     connection.execute("COMMIT")
             except BaseException:
-                roll_back(connection)
+                connection.rollback()
                 # A failed sync may have left the row in place: then its number is taken.
                 self._last = self.last()
                 raise
@@ -243,7 +254,7 @@ class Journal:
         except StoreError:
             still = "the table of generations cannot be read either"
         return DamageError(
-            f"{what} {self.path}; {still}; records(after={sequence}) goes on behind it",
+            f"{what} {self.path}; {still}; records(after={sequence}) continues behind it",
             path=self.path,
             sequence=sequence,
         )
@@ -278,7 +289,7 @@ class Journal:
                     connection.execute("DELETE FROM payload WHERE sequence <= ?", (row.upto,))
                 connection.execute("COMMIT")
             except BaseException:
-                roll_back(connection)
+                connection.rollback()
                 raise
 
     def shrink(self) -> None:

@@ -10,8 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from store.errors import LockedError, StoreError
-from store.reporting import reported
+from store.exceptions import LockedError, StoreError, reported
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -62,7 +61,7 @@ class WriterLock:
             holder = json.loads((self._folder / HOLDER_FILE).read_text(encoding="utf-8"))
             who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
         except (OSError, ValueError, TypeError, KeyError):
-            # The holder writes the note just after it takes the lock and removes it just before it lets go.
+            # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"
         return (
             f"{self._folder} is being written by {who}: close the store there (the lock frees itself when "

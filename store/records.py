@@ -1,27 +1,60 @@
-"""What the store hands out: a row of the journal, and a snapshot of arrays."""
+"""What the store keeps: records, heads and generations, and the checksummed rows that hold them in the journal.
+
+SQLite gives the text of a row as bytes: damaged text need not be UTF-8, and the checksums are over bytes.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from pathlib import Path
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from store.errors import RecordError
+from store.exceptions import DamageError, RecordError
 
-__all__ = ["JSON", "Generation", "Head", "Record", "check_key", "check_text", "check_time", "from_json", "to_json"]
+__all__ = [
+    "GENERATION_COLUMNS",
+    "HEAD_COLUMNS",
+    "JSON",
+    "Generation",
+    "GenerationRow",
+    "Head",
+    "Record",
+    "Spans",
+    "check_key",
+    "check_text",
+    "check_time",
+    "checksum",
+    "from_json",
+    "lost_heads",
+    "payload_digest",
+    "read_head",
+    "read_meta",
+    "to_json",
+    "uncovered",
+    "united",
+]
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 
 LONGEST_KEY = 64  # bytes: the longest digest in common use (sha512, blake2b)
 
+HEAD_COLUMNS = "sequence, kind, label, key, time, attributes, size, digest, checksum"
+GENERATION_COLUMNS = "number, upto, base, time, attributes, content, checksum"
+
+# Ranges of sequences, first and last included, ascending and apart.
+Spans = list[tuple[int, int]]
+
 
 @dataclass(frozen=True)
 class Head:
-    """One durable row of the journal without its arrays, which may have been compacted away.
+    """One durable row of the journal without its arrays, which compaction may have given up.
 
     `sequence` counts 1, 2, 3 … without gaps. `key` is a content hash of at most 64 bytes and `time`
     is in Unix seconds. `size` is that of the payload in bytes.
@@ -142,3 +175,121 @@ def _paired(where: str, text: str) -> str:
     except UnicodeEncodeError as error:
         raise RecordError(f"{where} holds half of a surrogate pair: {text!r}") from error
     return str(text)
+
+
+def checksum(table: str, *fields: int | float | bytes) -> bytes:
+    """Return the 16-byte BLAKE2b over a row's fields, each with its length before it.
+
+    An int counts as 8 bytes little-endian and a float as its IEEE 754 double, little-endian; the name
+    of the table goes first, so that no row passes for one of another table.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for field in (table.encode("ascii"), *fields):
+        if isinstance(field, int):
+            part = struct.pack("<q", field)
+        elif isinstance(field, float):
+            part = struct.pack("<d", field)
+        else:
+            part = field
+        digest.update(struct.pack("<Q", len(part)))
+        digest.update(part)
+    return digest.digest()
+
+
+def payload_digest(payload: bytes) -> bytes:
+    """Return the 16-byte BLAKE2b over the bytes of a payload."""
+    return hashlib.blake2b(payload, digest_size=16).digest()
+
+
+def _verifies(table: str, fields: Sequence[Any], stored: object) -> bool:
+    try:
+        return checksum(table, *fields) == stored
+    except (TypeError, ValueError, AttributeError):
+        return False  # a flipped bit can also change a value's type
+
+
+def read_head(row: tuple[Any, ...]) -> tuple[Head, bytes] | None:
+    """Return what a row of table record holds, and the digest of its payload; None where its checksum fails."""
+    *fields, stored = row
+    if not _verifies("record", fields, stored):
+        return None
+    sequence, kind, label, key, time, attributes, size, digest = fields
+    head = Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
+    return head, digest
+
+
+def read_meta(rows: Iterable[tuple[Any, ...]]) -> dict[str, str]:
+    """Return what table meta holds, by key, without the rows that fail their checksums."""
+    return {key.decode(): value.decode() for key, value, stored in rows if _verifies("meta", (key, value), stored)}
+
+
+def lost_heads(meta: dict[str, str]) -> Spans:
+    """Return the rows up to the base that an earlier repair had to leave out."""
+    try:
+        return [(int(first), int(last)) for first, last in json.loads(meta["repaired"])["heads"]]
+    except (KeyError, TypeError, ValueError):
+        return []
+
+
+def uncovered(first: int, last: int, spans: Spans) -> Iterator[tuple[int, int]]:
+    """Yield the parts of `first` to `last` that are in none of the spans."""
+    for begin, end in spans:
+        if begin > last:
+            break
+        if first < begin:
+            yield first, begin - 1
+        first = max(first, end + 1)
+    if first <= last:
+        yield first, last
+
+
+def united(spans: Iterable[tuple[int, int]]) -> Spans:
+    """Return the sequences of all the spans as spans that are ascending and apart."""
+    joined: Spans = []
+    for first, last in sorted(spans):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return joined
+
+
+@dataclass(frozen=True)
+class GenerationRow:
+    """What the journal knows of a generation; `content` is what `write_generation` returned, as JSON.
+
+    `base` is 1 where the rows up to `upto` have given up their arrays for it, else 0.
+    """
+
+    number: int
+    upto: int
+    base: int
+    time: float
+    attributes: bytes
+    content: bytes
+    checksum: bytes
+
+    @classmethod
+    def of(
+        cls, number: int, upto: int, base: int, time: float, attributes: str, content: dict[str, Any]
+    ) -> GenerationRow:
+        """Return the row with its checksum."""
+        texts = attributes.encode(), json.dumps(content, separators=(",", ":")).encode()
+        return cls(number, upto, base, time, *texts, checksum("generation", number, upto, base, time, *texts))
+
+    @property
+    def sound(self) -> bool:
+        """Whether it is as it was written."""
+        fields = (self.number, self.upto, self.base, self.time, self.attributes, self.content)
+        return _verifies("generation", fields, self.checksum)
+
+    def verified(self, journal: Path) -> tuple[dict[str, JSON], dict[str, Any]]:
+        """Return the attributes and the content; raise DamageError if they are not as written."""
+        if not self.sound:
+            raise DamageError(f"the row of generation {self.number} in {journal} fails its checksum", path=journal)
+        return from_json(self.attributes.decode()), dict(from_json(self.content.decode()))
+
+    def values(self) -> tuple[int, int, int, float, str, str, bytes]:
+        """Return the values of GENERATION_COLUMNS, to be written."""
+        texts = self.attributes.decode(), self.content.decode()
+        return self.number, self.upto, self.base, self.time, *texts, self.checksum

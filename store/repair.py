@@ -1,30 +1,103 @@
-"""Making a damaged store whole again, at the price of what is lost."""
+"""Making a damaged store whole again, at the price of what is lost: the one entry to salvage and repair."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-from store.check import problems
-from store.errors import DamageError
-from store.faults import Progress, rows_text
+from store.exceptions import DamageError, reported
 from store.files import sync_folder
-from store.generations import folder_name, highest_number, remove_others, write_generation
+from store.generations import highest_number, remove_others
+from store.groups import GroupReader, folder_name, write_group
 from store.lock import WriterLock
-from store.reading import read_generation
-from store.rebuild import Contents, finish_repair, free_name, put_in_place, write_repaired
-from store.records import JSON, to_json
-from store.remains import Remains, require_remains
-from store.reporting import reported
-from store.rows import GenerationRow, Spans, lost_heads
-from store.schema import DAMAGED_FILE, GENERATIONS, JOURNAL_FILE, SIDES, new_meta
-from store.survey import Found, Survey, survey
+from store.records import (
+    GENERATION_COLUMNS,
+    HEAD_COLUMNS,
+    JSON,
+    GenerationRow,
+    Spans,
+    from_json,
+    lost_heads,
+    payload_digest,
+    read_head,
+    to_json,
+    united,
+)
+from store.salvage import Fault, Progress, Salvage, require_salvageable, survey_rows
+from store.schema import (
+    DAMAGED_FILE,
+    DRAFT_FILE,
+    GENERATIONS,
+    JOURNAL_FILE,
+    REPAIRED_FILE,
+    SIDES,
+    build_journal,
+    new_meta,
+    remove_drafts,
+)
+from store.survey import FoundGeneration, Survey
 
 __all__ = ["Repair", "repair_store"]
+
+DISTRUST = "its disk cannot be trusted; copy the folder to another one and repair it there"
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What a repair did.
+
+    `kept` is the last sequence that is kept. `lost` are sentences that name what is lost or can no longer be
+    retracted. `aside` is the damaged journal, None where nothing was damaged or there was none.
+    """
+
+    kept: int
+    lost: list[str]
+    aside: Path | None
+
+
+def repair_store(path: str | PathLike[str], *, progress: Progress | None = None) -> Repair:
+    """Keep of a damaged store the longest part from its beginning that verifies, and name what is lost.
+
+    Recovery resumes from the newest generation whose checksums verify, whatever is wrong with the rows that it
+    contains. Behind it rows are kept up to the first that is damaged or missing. Those behind that one are
+    dropped even where they verify: nobody knows what it did; it may have retracted one of them, or they one
+    that is gone. If rows that the generation contains are damaged, it becomes the base: all of them give up
+    their arrays, so none can be retracted any more, and rows that cannot be read are left out.
+
+    Where nothing is damaged nothing is written. Otherwise the damaged journal and damaged generations stay
+    beside the new ones, under names with "damaged" in them. Killed at any instant it can be started again.
+    Readers that have the store open continue with the damaged one until they open it anew.
+    `progress` is called with what is being done, how many of it are done, and how many there will be.
+
+    Raises NotAStoreError, LockedError while a writer has it, VersionError for a newer format, DamageError
+    where not even its identity is left, StoreFullError, ReadOnlyError and other StoreErrors.
+    """
+    folder = Path(path).absolute()
+    require_salvageable(folder)
+    lock = WriterLock(folder)
+    try:
+        with reported(folder, "repairing the store"):
+            noted = _finish_interrupted(folder)
+            if noted is None:
+                with closing(Salvage(folder / JOURNAL_FILE)) as salvage:
+                    survey = Survey(folder, salvage, progress or (lambda *_: None))
+                    if not survey.problems():
+                        return Repair(survey.rows.last, [], None)
+                    noted = _write_repaired(survey)
+                _put_generations_aside(survey)
+                _put_in_place(folder, str(noted["aside"]))
+            with closing(Salvage(folder / JOURNAL_FILE)) as salvage:
+                remove_others(folder / GENERATIONS, [row.number for row in salvage.generations()[0]])
+            aside = folder / str(noted["aside"])
+            lost = cast("list[str]", noted["lost"])
+            return Repair(cast(int, noted["kept"]), list(lost), aside if aside.exists() else None)
+    finally:
+        lock.release()
 
 
 @dataclass(frozen=True)
@@ -38,173 +111,206 @@ class _Plan:
     base: int
     fresh: bool
     heads: Spans
-    generations: list[Found]
+    generations: list[FoundGeneration]
+
+    @classmethod
+    def of(cls, survey: Survey) -> _Plan:
+        sound, rows = survey.sound, survey.rows
+        newest = sound[0].upto if sound else 0
+        standing = survey.compacted if survey.has_base else 0
+        # Up to `compacted` no row has arrays; without the base that stood for them they are as good as damaged.
+        fresh = bool(rows.faulty(standing + 1, newest)) or (standing < survey.compacted and newest > 0)
+        base = newest if fresh else standing
+        behind = rows.faulty(newest + 1, rows.last)
+        kept = behind[0][0] - 1 if behind else rows.last
+        if survey.compacted > newest:
+            kept = newest
+        lost = [(first, last) for first, last, fault in rows.faulty(1, base) if fault.takes_head]
+        heads = united([*lost, *((first, last) for first, last in lost_heads(survey.meta) if last <= base)])
+        bases = [found for found in sound if found.is_base and found.upto == base]
+        # A generation that does not describe itself has to be written again: only where it is needed.
+        needed = [
+            found
+            for found in sound
+            if found is sound[0] or found in bases[:1] or (found.upto >= base and found.own is None)
+        ]
+        return cls(kept, base, fresh, heads, needed)
 
 
-@dataclass(frozen=True)
-class Repair:
-    """What a repair did.
-
-    `kept` is the last sequence that is kept. `lost` are sentences that name what is lost or can no longer be
-    taken back. `aside` is the damaged journal, None where nothing was damaged or there was none.
-    """
-
-    kept: int
-    lost: list[str]
-    aside: Path | None
-
-
-def repair_store(path: str | PathLike[str], *, progress: Progress | None = None) -> Repair:
-    """Keep of a damaged store the longest part from its beginning that verifies, and name what is lost.
-
-    The newest generation that verifies is gone on from, whatever is wrong with the rows that it contains.
-    Behind it rows are kept up to the first that is damaged or missing. Those behind that one are dropped even
-    where they verify: what it did cannot be known, and it may have taken one of them back, or they one that
-    is not there. If rows that the generation contains are damaged, it becomes the base: the arrays of all of
-    them are given up, so none can be taken back any more, and rows that cannot be read are left out.
-
-    Where nothing is damaged nothing is written. Otherwise the damaged journal and damaged generations are
-    kept beside the new ones, under names with "damaged" in them. Killed at any instant it can be begun again.
-    Who has the store open to read goes on with the damaged one until it is opened anew.
-    `progress` is told what is being done, how many of it are, and how many there will be.
-
-    Raises NotAStoreError, LockedError while a writer has it, VersionError for a newer format, DamageError
-    where not even its identity is left, StoreFullError, ReadOnlyError and other StoreErrors.
-    """
-    folder = Path(path).absolute()
-    require_remains(folder)
-    lock = WriterLock(folder)
-    try:
-        with reported(folder, "repairing the store"):
-            if (noted := finish_repair(folder)) is not None:
-                _remove_dropped(folder)
-                return _done(folder, noted)
-            return _repair(folder, progress or (lambda *_: None))
-    finally:
-        lock.release()
-
-
-def _done(folder: Path, noted: Mapping[str, Any]) -> Repair:
-    aside = folder / noted["aside"]
-    return Repair(noted["kept"], list(noted["lost"]), aside if aside.exists() else None)
-
-
-def _repair(folder: Path, told: Progress) -> Repair:
-    with closing(Remains(folder / JOURNAL_FILE)) as remains:
-        found = survey(folder, remains, told)
-        if not problems(remains, found):
-            return Repair(found.rows.last, [], None)
-        if found.identity is None:
-            raise DamageError(
-                f"neither {found.journal} nor a generation beside it tells what the store in {folder} is for: put the "
-                "folder back from a copy",
-                path=found.journal,
-            )
-        plan = _plan(found)
-        noted: dict[str, JSON] = {
-            "aside": free_name(folder, DAMAGED_FILE, ("", *SIDES)),
-            "heads": [list(span) for span in plan.heads],
-            "kept": plan.kept,
-            "lost": [*_lost_rows(remains, found, plan), *_lost_generations(found)],
-        }
-        meta = new_meta(to_json("identity", found.identity)) | {
-            key: found.meta[key] for key in ("created", "identity") if key in found.meta
-        }
-        meta["repaired"] = to_json("what was repaired", noted)
-        rows = [_row_of(folder, found, plan, one) for one in plan.generations]
-        write_repaired(folder, remains, Contents(plan.kept, plan.base, plan.heads, rows, meta), told)
-    _put_generations_aside(found)
-    put_in_place(folder, cast(str, noted["aside"]))
-    _remove_dropped(folder)
-    return _done(folder, noted)
-
-
-def _plan(found: Survey) -> _Plan:
-    sound, rows = found.sound, found.rows
-    newest = sound[0].upto if sound else 0
-    standing = found.compacted if found.has_base else 0
-    # Up to `compacted` no row has arrays, and without the base that stood for them they are as good as damaged.
-    fresh = bool(rows.faulty(standing + 1, newest)) or (standing < found.compacted and newest > 0)
-    base = newest if fresh else standing
-    behind = rows.faulty(newest + 1, rows.last)
-    kept = behind[0][0] - 1 if behind else rows.last
-    if found.compacted > newest:
-        kept = newest
-    lost = [(first, last) for first, last, fault in rows.faulty(1, base) if fault.takes_head]
-    heads = _united([*lost, *((first, last) for first, last in lost_heads(found.meta) if last <= base)])
-    bases = [one for one in sound if one.is_base and one.upto == base]
-    # One that must be written again, because it does not tell what it is, is worth it only where it is needed.
-    needed = [one for one in sound if one is sound[0] or one in bases[:1] or (one.upto >= base and one.own is None)]
-    return _Plan(kept, base, fresh, heads, needed)
-
-
-def _united(spans: Spans) -> Spans:
-    united: Spans = []
-    for first, last in sorted(spans):
-        if united and first <= united[-1][1] + 1:
-            united[-1] = (united[-1][0], max(last, united[-1][1]))
-        else:
-            united.append((first, last))
-    return united
-
-
-def _lost_rows(remains: Remains, found: Survey, plan: _Plan) -> list[str]:
-    rows, newest = found.rows, found.sound[0].upto if found.sound else 0
-    which = f"generation {found.sound[0].number}" if found.sound else ""
+def _lost_rows(survey: Survey, plan: _Plan) -> list[str]:
+    rows, newest = survey.rows, survey.sound[0].upto if survey.sound else 0
+    which = f"generation {survey.sound[0].number}" if survey.sound else ""
     lost = [
-        f"{rows_text(first, last, fault)}; what they did is in {which}, but can no longer be taken back"
+        f"{fault.describe(first, last)}; what they did is in {which}, but can no longer be retracted"
         for first, last, fault in rows.faulty(1, newest)
     ]
     if plan.fresh:
         lost.append(
-            f"the arrays of rows 1 to {plan.base} are given up, {which} stands for them: none of them can be taken "
-            "back any more"
+            f"rows 1 to {plan.base} give up their arrays, {which} stands for them: none of them can be retracted any "
+            "more"
         )
     if plan.kept < rows.last:
         behind = rows.faulty(newest + 1, rows.last)
-        why = rows_text(*behind[0]) if behind else "the base that they go on from is lost"
+        first, last, fault = behind[0] if behind else (0, 0, None)
+        why = fault.describe(first, last) if fault else "the base that they continue is lost"
         lost.append(
-            f"rows {plan.kept + 1} to {rows.last} are dropped, also those that verify: {why}, and what that did to the "
-            "others cannot be known"
+            f"rows {plan.kept + 1} to {rows.last} are dropped, also those that verify: {why}, and nobody knows what "
+            "that did to the others"
         )
-    if remains.is_gone:
-        lost.append(f"{'; '.join(remains.damage)}: the rows behind {newest}, if there were any, are lost")
+    if survey.salvage.is_gone:
+        lost.append(f"{'; '.join(survey.salvage.damage)}: the rows behind {newest}, if there were any, are lost")
     return lost
 
 
-def _lost_generations(found: Survey) -> list[str]:
+def _lost_generations(survey: Survey) -> list[str]:
     lost = []
-    for one in found.generations:
-        if not one.sound:
-            why = one.damage or ([one.own] if one.own is not None else [])
-            lost.append(f"generation {one.number}: {'; '.join(map(str, why))}")
+    for found in survey.generations:
+        if not found.sound:
+            why = found.damage or ([found.own] if found.own is not None else [])
+            lost.append(f"generation {found.number}: {'; '.join(map(str, why))}")
     return lost
 
 
-def _row_of(folder: Path, found: Survey, plan: _Plan, one: Found) -> GenerationRow:
-    """The row of a generation that stays; one that does not tell what it is is written again."""
-    assert one.row is not None
-    attributes, content = one.row.verified(found.journal)
-    number = one.number
-    if one.own is not None:
-        parent = folder / GENERATIONS
-        arrays = read_generation(one.folder, number, content)
+def _row_to_keep(survey: Survey, plan: _Plan, found: FoundGeneration) -> GenerationRow:
+    """Return the row of a generation that stays; write one again that does not describe itself."""
+    assert found.row is not None
+    attributes, content = found.row.verified(survey.journal)
+    number = found.number
+    if found.own is not None:
+        parent = found.folder.parent
+        arrays = GroupReader(found.folder, number, content).arrays()
         chunks = {name: described["rows"] for name, described in content["arrays"].items() if "rows" in described}
         number = 1 + highest_number(parent)
-        content = write_generation(parent, number, one.upto, arrays, attributes, chunks, found.identity or {})
-    base = one.upto == plan.base and (one.is_base or (plan.fresh and one is plan.generations[0]))
-    return GenerationRow.of(number, one.upto, int(base), one.row.time, one.row.attributes.decode(), content)
+        content = write_group(parent, number, found.upto, arrays, attributes, chunks, survey.identity or {})
+    base = found.upto == plan.base and (found.is_base or (plan.fresh and found is plan.generations[0]))
+    return GenerationRow.of(number, found.upto, int(base), found.row.time, found.row.attributes.decode(), content)
 
 
-def _put_generations_aside(found: Survey) -> None:
-    for one in found.generations:
-        if not one.sound and one.folder.exists():
-            parent = one.folder.parent
-            one.folder.rename(parent / free_name(parent, f"{folder_name(one.number)}.damaged"))
+def _write_repaired(survey: Survey) -> dict[str, JSON]:
+    """Write the repaired journal, verify it, and return what it notes of this repair.
+
+    It is then complete and durable under a name of its own. Raises DamageError where it does not read back
+    as it was written.
+    """
+    if survey.identity is None:
+        raise DamageError(
+            f"neither {survey.journal} nor a generation beside it tells what the store in {survey.folder} is for: put "
+            "the folder back from a copy",
+            path=survey.journal,
+        )
+    folder, plan = survey.folder, _Plan.of(survey)
+    noted: dict[str, JSON] = {
+        "aside": _free_name(folder, DAMAGED_FILE, ("", *SIDES)),
+        "heads": [list(span) for span in plan.heads],
+        "kept": plan.kept,
+        "lost": [*_lost_rows(survey, plan), *_lost_generations(survey)],
+    }
+    known = {key: survey.meta[key] for key in ("created", "identity") if key in survey.meta}
+    meta = new_meta(to_json("identity", survey.identity)) | known
+    meta["repaired"] = to_json("what was repaired", noted)
+    rows = [_row_to_keep(survey, plan, found) for found in plan.generations]
+
+    def fill(connection: sqlite3.Connection) -> None:
+        _copy_rows(survey, plan, connection)
+        values = [row.values() for row in rows]
+        connection.executemany(f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?,?)", values)
+
+    draft = folder / DRAFT_FILE
+    try:
+        build_journal(draft, meta, fill)
+        _verify(draft, plan, rows, survey.progress)
+        draft.rename(folder / REPAIRED_FILE)
+        sync_folder(folder)
+    except BaseException:
+        # The disk may be full, and a half of it is worth nothing.
+        remove_drafts(folder)
+        raise
+    return noted
+
+
+def _copy_rows(survey: Survey, plan: _Plan, connection: sqlite3.Connection) -> None:
+    marks = ",".join("?" * len(HEAD_COLUMNS.split(",")))
+    for sequence, _, row in survey.salvage.rows(plan.kept, lost_heads(survey.meta), whole=True):
+        if sequence > plan.kept:
+            break
+        head = None if isinstance(row, Fault) else read_head(row)
+        if head is None or isinstance(row, Fault):
+            continue
+        survey.progress("rows written", sequence, plan.kept)
+        values = [value.decode() if i in (1, 2, 5) else value for i, value in enumerate(row)]
+        connection.execute(f"INSERT INTO record ({HEAD_COLUMNS}) VALUES ({marks})", values)
+        if sequence > plan.base:
+            payload, _ = survey.salvage.payload(sequence)
+            if payload is None or payload_digest(payload) != head[1]:
+                raise DamageError(
+                    f"row {sequence} of {survey.journal} verified, and a moment later did not: {DISTRUST}",
+                    path=survey.journal,
+                    sequence=sequence,
+                )
+            connection.execute("INSERT INTO payload (sequence, bytes) VALUES (?, ?)", (sequence, payload))
+
+
+def _verify(draft: Path, plan: _Plan, generations: Sequence[GenerationRow], progress: Progress) -> None:
+    with closing(Salvage(draft)) as written:
+        upto = max((row.upto for row in generations), default=0)
+        rows = survey_rows(written, plan.base, upto, plan.heads, progress)
+        found, whole = written.generations()
+        same = sorted(found, key=lambda row: row.number) == sorted(generations, key=lambda row: row.number)
+        if written.damage or rows.faults or rows.strays or rows.last != plan.kept or not whole or not same:
+            raise DamageError(f"{draft} does not read back as it was just written: {DISTRUST}", path=draft)
+
+
+def _free_name(folder: Path, wanted: str, suffixes: Sequence[str] = ("",)) -> str:
+    """Return `wanted`, or the first of wanted-2, wanted-3 … of which nothing is there yet, with any of the suffixes."""
+    name, count = wanted, 1
+    while any((folder / (name + suffix)).exists() for suffix in suffixes):
+        count += 1
+        name = f"{wanted}-{count}"
+    return name
+
+
+def _put_generations_aside(survey: Survey) -> None:
+    for found in survey.generations:
+        if not found.sound and found.folder.exists():
+            parent = found.folder.parent
+            found.folder.rename(parent / _free_name(parent, f"{folder_name(found.number)}.damaged"))
             sync_folder(parent)
 
 
-def _remove_dropped(folder: Path) -> None:
-    with closing(Remains(folder / JOURNAL_FILE)) as remains:
-        kept = [row.number for row in remains.generations()[0]]
-    remove_others(folder / GENERATIONS, kept)
+def _put_in_place(folder: Path, aside: str) -> None:
+    """Rename the damaged journal, with all that SQLite has beside it, to `aside`, and the repaired one to its name.
+
+    A call that was cut short can be repeated: between any two steps there is either the damaged journal as it
+    was, or none and the repaired one complete.
+    """
+    # The journal first: without its log it could be opened, and rows would be missing; the log without it
+    # cannot. And each move is durable before the next, or the repaired one could meet a log that is not its own.
+    for suffix in ("", *SIDES):
+        old = folder / (JOURNAL_FILE + suffix)
+        if old.exists():
+            old.rename(folder / (aside + suffix))
+            sync_folder(folder)
+    (folder / REPAIRED_FILE).rename(folder / JOURNAL_FILE)
+    sync_folder(folder)
+
+
+def _finish_interrupted(folder: Path) -> dict[str, JSON] | None:
+    """Finish a repair that was killed after it had moved the damaged journal away; return what it noted of itself.
+
+    None where there is no such repair. Raises DamageError where what it had made is damaged itself.
+    """
+    repaired = folder / REPAIRED_FILE
+    if (folder / JOURNAL_FILE).exists() or not repaired.exists():
+        return None
+    with closing(Salvage(repaired)) as salvage:
+        meta, damaged = salvage.meta()
+        if salvage.damage or damaged or "repaired" not in meta:
+            raise DamageError(
+                f"{repaired}, left by a repair that did not end, is damaged: remove it, give {DAMAGED_FILE} (the one "
+                f"with the highest number) the name {JOURNAL_FILE} again, and what is beside it likewise, and repair "
+                "the store once more",
+                path=repaired,
+            )
+    noted = from_json(meta["repaired"])
+    _put_in_place(folder, str(noted["aside"]))
+    return noted

@@ -1,16 +1,17 @@
-"""The journal file: its name, its tables and their checksums, and how a new one is made."""
+"""The journal file: its names, its tables, and how one is made and opened."""
 
 from __future__ import annotations
 
-import hashlib
+import os
 import sqlite3
-import struct
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
+from store.exceptions import StoreError
 from store.files import remove_tree, sync_file, sync_folder
+from store.records import checksum
 
 __all__ = [
     "APPLICATION_ID",
@@ -24,11 +25,10 @@ __all__ = [
     "REPAIRED_FILE",
     "SIDES",
     "build_journal",
-    "checksum",
+    "connect",
     "create_journal",
     "has_our_schema",
     "new_meta",
-    "payload_digest",
     "remove_drafts",
 ]
 
@@ -47,6 +47,12 @@ DAMAGED_FILE = JOURNAL_FILE + ".damaged"
 LOG = "-wal"
 SIDES = (LOG, "-shm")
 
+
+# Seconds for another program, such as a backup, to leave a transaction before it is reported.
+PATIENCE = 5.0
+
+# Bytes to which SQLite cuts an emptied log: a large batch would leave one as large as itself.
+LARGEST_IDLE_LOG = 16 * 2**20
 
 # Part of the format, so that a damaged first page can be made anew: with TABLES it is always the same.
 PAGE_BYTES = 4096
@@ -85,8 +91,8 @@ TABLES = (
 )""",
 )
 
-# In the order of TABLES each gets the next page of a new file, and again when SQLite writes it anew. A
-# number that changed would make one table pass for another, or for a shorter one.
+# In the order of TABLES each gets the next page of a new file, and again after a VACUUM. A number that
+# changed would make one table pass for another, or for a shorter one.
 ROOTS = (
     (b"table", b"meta", 2),
     (b"index", b"sqlite_autoindex_meta_1", 3),
@@ -96,28 +102,44 @@ ROOTS = (
 )
 
 
-def checksum(table: str, *fields: int | float | bytes) -> bytes:
-    """Return the 16-byte BLAKE2b over a row's fields, each with its length before it.
+def connect(path: Path, *, write: bool) -> sqlite3.Connection:
+    """Return a connection that begins no transaction by itself, gives text as bytes and serves any thread."""
+    options = "mode=rw" if write else "mode=ro"
+    if not write and _is_still(path):
+        options = "immutable=1"
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?{options}",
+        uri=True,
+        timeout=PATIENCE,
+        isolation_level=None,
+        check_same_thread=False,
+    )
+    try:
+        # Bytes, because damaged text need not be UTF-8, and the checksum is over the bytes.
+        connection.text_factory = bytes
+        if write:
+            connection.execute("PRAGMA synchronous = FULL")
+            # On a Mac a plain fsync stops at the drive's cache.
+            connection.execute("PRAGMA fullfsync = 1")
+            connection.execute("PRAGMA checkpoint_fullfsync = 1")
+            connection.execute(f"PRAGMA journal_size_limit = {LARGEST_IDLE_LOG}")
+            (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
+            if mode != b"wal":
+                raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")
+            # Where opening to write fails, SQLite opens to read and says nothing until something is written.
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute("DELETE FROM meta WHERE 0")
+            connection.execute("ROLLBACK")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
-    An int counts as 8 bytes little-endian and a float as its IEEE 754 double, little-endian; the name
-    of the table goes first, so that no row passes for one of another table.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    for field in (table.encode("ascii"), *fields):
-        if isinstance(field, int):
-            part = struct.pack("<q", field)
-        elif isinstance(field, float):
-            part = struct.pack("<d", field)
-        else:
-            part = field
-        digest.update(struct.pack("<Q", len(part)))
-        digest.update(part)
-    return digest.digest()
 
-
-def payload_digest(payload: bytes) -> bytes:
-    """Return the 16-byte BLAKE2b over the bytes of a payload."""
-    return hashlib.blake2b(payload, digest_size=16).digest()
+def _is_still(path: Path) -> bool:
+    # Without a log, in a folder where SQLite could not make one, it refuses to read unless told
+    # that nothing changes: an archive on a read-only disk.
+    return not os.access(path.parent, os.W_OK) and not path.with_name(path.name + LOG).exists()
 
 
 def create_journal(folder: Path, identity: str) -> None:

@@ -14,9 +14,8 @@ from typing import Literal, Self
 
 import numpy as np
 
-from store.arrays import check_arrays, check_chunks, encode_payload
-from store.background import Background
-from store.errors import (
+from store.encoding import check_arrays, check_chunks, encode_payload
+from store.exceptions import (
     CompactedError,
     DamageError,
     NotAStoreError,
@@ -24,17 +23,17 @@ from store.errors import (
     RecordError,
     StoreClosedError,
     StoreError,
+    reported,
 )
 from store.files import file_size, tree_size
-from store.generations import folder_name
-from store.header import holds_store
+from store.generations import Generations
+from store.groups import folder_name
+from store.header import holds_store, lock_to_write
 from store.journal import Journal
 from store.lock import WriterLock
-from store.opening import lock_to_write, require_whole_log
 from store.records import JSON, Generation, Head, Record, check_key, check_text, check_time, from_json, to_json
-from store.reporting import reported
 from store.schema import GENERATIONS, JOURNAL_FILE
-from store.snapshots import Snapshots
+from store.writeahead import require_whole_log
 
 __all__ = ["Store"]
 
@@ -62,9 +61,9 @@ class Store:
     ) -> Store:
         """Open the store in folder `path`.
 
-        To write, the folder and its parents are made where there is nothing, and `identity` is kept in
-        it for good; in an existing store the one it was made with stays, and comparing is the caller's
-        part. To read, nothing is made and no lock is taken, and each call sees what is committed then.
+        To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it
+        for good; an existing store keeps its own, and the caller compares. To read, it makes nothing and
+        takes no lock, and each call sees what is committed at that moment.
 
         Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a
         file, a folder of other things), LockedError for a second writer, VersionError for a newer
@@ -86,7 +85,6 @@ class Store:
         self._closing = threading.Lock()
         self._closed = False
         self._lock: WriterLock | None = None
-        self._background = Background(f"store commit {folder.name}")
         with ExitStack() as undo:
             if mode == "write":
                 self._lock = lock_to_write(folder, identity)
@@ -95,9 +93,9 @@ class Store:
             self._journal = self._opened(folder / JOURNAL_FILE)
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
-            self._snapshots = Snapshots(folder / GENERATIONS, self._journal)
+            self._generations = Generations(folder / GENERATIONS, self._journal)
             if mode == "write":
-                self._snapshots.remove_unfinished()
+                self._generations.remove_unfinished()
             self._warn_of_damaged_generations()
             undo.pop_all()
 
@@ -111,7 +109,7 @@ class Store:
             return Journal(journal, write=False)
 
     def _warn_of_damaged_generations(self) -> None:
-        # It may be the base's: nothing else would tell of that until a generation behind it is damaged, too.
+        # It may be the base's: nothing else would show that until a generation behind it is damaged, too.
         for row in self._journal.generations():
             if not row.sound:
                 logger.warning(
@@ -153,7 +151,7 @@ class Store:
         """Add a record and return its head once it is durable; in a batch, once it is written.
 
         `time` is in Unix seconds, now when not given. Raises RecordError for what cannot be kept,
-        StoreFullError, ReadOnlyError or another StoreError; after any of them the store goes on.
+        StoreFullError, ReadOnlyError or another StoreError; after any of them the store can be used on.
         """
         self._check_open(write=True)
         check_text("the kind", kind)
@@ -169,27 +167,26 @@ class Store:
     def batch(self) -> Iterator[None]:
         """Make the records appended in the block durable together, when it ends, or none of them.
 
-        That is one wait for the disk in place of one for each. After an exception in the block, or an
-        append that failed on the disk, none is kept; one that was refused with RecordError was never part of
-        it. Other threads that append or read wait meanwhile. In the block nothing can be committed, flushed
-        or closed, nor another batch begun: StoreError. Raises StoreFullError, ReadOnlyError or another StoreError.
+        They wait for the disk once, not once each. After an exception in the block, or an append that
+        failed on the disk, none is kept; a record refused with RecordError was never part of it. Other
+        threads that append or read wait meanwhile. In the block, committing, flushing, closing and beginning
+        another batch raise StoreError. Raises StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open(write=True)
         self._journal.refuse_in_batch("beginning a batch")
-        self._background.wait()
+        self._generations.wait()
         with self._journal.batch():
             yield
 
     def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
         """Yield the records behind sequence `after` without their arrays, up to the last at the start.
 
-        `kind`, `label`: those of one only. They are there for compacted records, too, but for those that a
-        repair named as lost. Raises DamageError at the first that is damaged or, where all are asked for,
-        missing; where they are chosen, one whose kind or label is damaged is passed over.
+        `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those
+        that a repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and
+        `label`, missing; with them, a record whose kind or label is damaged is passed over.
         """
         self._check_open()
-        if after < 0:
-            raise ValueError(f"after must not be negative, not {after}")
+        _check_after(after)
         for what, text in (("the kind", kind), ("the label", label)):
             if text is not None:
                 check_text(what, text)
@@ -198,7 +195,7 @@ class Store:
     def record(self, sequence: int) -> Record:
         """Return the record of this sequence.
 
-        Raises RecordError where there is none, CompactedError where its arrays were given up, DamageError.
+        Raises RecordError where there is none, CompactedError where compaction gave up its arrays, DamageError.
         """
         self._check_open()
         last = self._journal.last()
@@ -212,16 +209,15 @@ class Store:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
 
         One is in memory at a time. Raises DamageError at the first that is damaged or missing; its
-        `sequence` is the `after` with which to go on behind it. Raises CompactedError where the first
-        are compacted: `base` has their place, and its `upto` is the `after` to go on with.
+        `sequence` is the `after` with which to continue behind it. Raises CompactedError where the first
+        are compacted: `base` has their place, and its `upto` is the `after` to continue with.
         """
         self._check_open()
-        if after < 0:
-            raise ValueError(f"after must not be negative, not {after}")
-        if after < self._journal.compacted():
+        _check_after(after)
+        if after < (compacted := self._journal.compacted()):
             raise CompactedError(
-                f"the arrays of records 1 to {self._journal.compacted()} of {self.path} were given up when it was "
-                "compacted: begin with base(), and go on behind its upto"
+                f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
+                "base(), and continue behind its upto"
             )
         return self._walk(after, self._journal.last())
 
@@ -239,11 +235,11 @@ class Store:
     def latest(self) -> Generation | None:
         """Return the newest generation that verifies, None when there is none.
 
-        One that does not is passed over with a logged warning that names the file and the array.
+        A logged warning names the file and the array of each one that it passes over.
         Raises VersionError for a generation of a newer format.
         """
         self._check_open()
-        return self._snapshots.latest()
+        return self._generations.latest()
 
     @property
     def newest(self) -> int | None:
@@ -263,20 +259,20 @@ class Store:
         Raises DamageError where it does not verify, and VersionError for a newer format.
         """
         self._check_open()
-        return self._snapshots.base()
+        return self._generations.base()
 
     def read_rows(self, name: str, first: int, last: int, *, generation: int | None = None) -> np.ndarray:
         """Return rows `first` to before `last` of an array that was committed with `chunks`, and read no others.
 
         They are of the newest generation, or of the one with the number `generation`, which need not be
-        the newest any more but must still be there. Only what is read is verified: damage elsewhere in
+        the newest any more but must still be there. It verifies only what it reads: damage elsewhere in
         the array does not matter here.
 
         Raises RecordError for an array that is not kept in chunks or has no such rows, DamageError that
         names file, array and chunk, VersionError, and StoreError where the generation is not there.
         """
         self._check_open()
-        return self._snapshots.read_rows(name, first, last, generation)
+        return self._generations.read_rows(name, first, last, generation)
 
     def commit(
         self,
@@ -289,14 +285,14 @@ class Store:
         """Write a generation that contains the records up to `upto`, make it current, return its number.
 
         chunks: name → rows of a chunk, for arrays of which `read_rows` is to read a part. Each is one file.
-        The one with the highest `upto` is current, and of several with the same the last committed.
-        A background commit is waited for first, and its failure is raised here in place of committing.
+        The generation with the highest `upto` is current, and of several with the same the last committed.
+        It waits for a background commit first, and raises its failure here in place of committing.
         Raises RecordError for arrays, attributes, chunks or an `upto` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the generation before then stays current.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._idle()
-        return self._snapshots.commit(checked, upto, text, pieces)
+        return self._generations.commit(checked, upto, text, pieces)
 
     def compact(
         self,
@@ -306,17 +302,17 @@ class Store:
         attributes: Mapping[str, JSON] | None = None,
         chunks: Mapping[str, int] | None = None,
     ) -> None:
-        """Let a base stand for the records up to `upto`: their arrays are given up, their heads stay.
+        """Let a base stand for the records up to `upto`: they give up their arrays and keep their heads.
 
-        The base is a generation like others, but kept until the next one; whoever goes through the
-        records begins with it. It takes effect whole or not at all. A generation with all records has to
-        be committed before, so that one damaged file cannot take everything: RecordError otherwise, DamageError
-        where that one cannot be read back, and as `commit`. The space is given back to the disk where there is
-        room to do so; a warning is logged where there is not.
+        The base is a generation like others, but kept until the next base; a replay of the records begins
+        with it. It takes effect whole or not at all. A generation with all records has to be committed
+        before, so that one damaged file cannot take everything: RecordError otherwise, DamageError where
+        that generation cannot be read back, and as `commit`. It gives the space back to the disk where there
+        is room to do so, and logs a warning where there is not.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._idle()
-        newest, named = self._snapshots.latest(), self._journal.newest()
+        newest, named = self._generations.latest(), self._journal.newest()
         if named is not None and (newest is None or newest.number != named):
             raise DamageError(
                 f"{self.path} cannot be compacted: generation {named}, which has to be whole beside the base, could "
@@ -329,7 +325,7 @@ class Store:
                 f"{self.path} can be compacted only beside a generation with all {self._journal.last()} records; "
                 f"{there}: commit one first"
             )
-        self._snapshots.commit(checked, upto, text, pieces, base=True)
+        self._generations.commit(checked, upto, text, pieces, base=True)
         try:
             self._journal.shrink()
         except StoreError as error:
@@ -345,13 +341,13 @@ class Store:
     ) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
-        While one is being written the newest given waits for it, in place of any that waited before. A
-        failure is logged and raised, once, by the next `commit`, `commit_later` (which then queues
-        nothing), `flush` or `close`. What cannot be kept is refused at once, with RecordError.
+        While one is being written, only the newest of those handed over waits. A failure is logged and
+        raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
+        What cannot be kept is refused at once, with RecordError.
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
-        self._background.check()
-        self._background.submit(lambda: self._snapshots.commit(checked, upto, text, pieces))
+        self._generations.raise_failure()
+        self._generations.commit_later((checked, upto, text, pieces))
 
     def _check_commit(
         self,
@@ -361,11 +357,11 @@ class Store:
         chunks: Mapping[str, int] | None,
     ) -> tuple[dict[str, np.ndarray], str, dict[str, int]]:
         self._check_open(write=True)
-        # The rows of a batch may yet be taken back.
+        # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a generation")
         first, last = self._journal.compacted(), self._journal.last()
         if isinstance(upto, bool) or not isinstance(upto, int) or not first <= upto <= last:
-            # One before the base could not be gone on from: the arrays of the rows behind it were given up.
+            # Recovery could not resume before the base: the rows behind it have given up their arrays.
             raise RecordError(
                 f"upto must be a sequence from {first}, the last that was compacted, to {last}, the last that there "
                 f"is, not {upto!r}"
@@ -380,9 +376,8 @@ class Store:
         self._idle()
 
     def _idle(self) -> None:
-        """Wait for the background commit and raise its failure."""
-        self._background.wait()
-        self._background.check()
+        self._generations.wait()
+        self._generations.raise_failure()
 
     def size(self) -> dict[str, int]:
         """Return the bytes on the disk: {"journal": …, "generations": …}."""
@@ -392,9 +387,9 @@ class Store:
             return {"journal": journal, "generations": tree_size(self.path / GENERATIONS)}
 
     def close(self) -> None:
-        """Wait for the background commit, let go of the files and the lock; a second call does nothing.
+        """Wait for the background commit, release the files and the lock; a second call does nothing.
 
-        Raises the failure of a background commit, after everything was let go, and StoreError in a batch.
+        Raises the failure of a background commit, after everything is released, and StoreError in a batch.
         """
         # What a fork inherited belongs to the parent: closing SQLite there can undo its locks.
         if os.getpid() != self._process:
@@ -403,14 +398,14 @@ class Store:
         with self._closing:
             if self._closed:
                 return
-            self._background.wait()
+            self._generations.close()
             self._closed = True
             try:
                 self._journal.close()
             finally:
                 if self._lock is not None:
                     self._lock.release()
-        self._background.check()
+        self._generations.raise_failure()
 
     def __enter__(self) -> Self:
         self._check_open()
@@ -422,6 +417,11 @@ class Store:
         try:
             self.close()
         except StoreError:
-            # Logged already, and less telling than what went wrong inside.
+            # Logged already, and it says less than what went wrong inside.
             if error is None:
                 raise
+
+
+def _check_after(after: int) -> None:
+    if after < 0:
+        raise ValueError(f"after must not be negative, not {after}")

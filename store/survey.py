@@ -1,28 +1,60 @@
-"""What of a store verifies and what does not: found by reading all of it, for `check_store` and `repair_store`."""
+"""A whole store read and verified without changing it: what `check_store` reports, and `repair_store` starts from."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from store.errors import DamageError
-from store.faults import Progress, Rows, survey_rows
-from store.generations import folder_name, numbers
-from store.reading import generation_damage, read_known
-from store.records import JSON, from_json, to_json
-from store.remains import Remains
-from store.rows import GenerationRow, lost_heads
-from store.schema import GENERATIONS
+from store.exceptions import DamageError, reported
+from store.generations import numbers
+from store.groups import PARTIAL, GroupReader, folder_name, read_own_description
+from store.records import JSON, GenerationRow, from_json, lost_heads, to_json
+from store.salvage import Progress, RowSurvey, Salvage, require_salvageable, survey_rows
+from store.schema import DAMAGED_FILE, DRAFT_FILE, GENERATIONS, JOURNAL_FILE, REPAIRED_FILE
 
-__all__ = ["Found", "Survey", "survey"]
+__all__ = ["FoundGeneration", "Problem", "Survey", "check_store"]
 
 
 @dataclass(frozen=True)
-class Found:
+class Problem:
+    """Something that is not as it was written. `path` is the file, or the array's folder; `what` says it in words.
+
+    `kind`: "lost" where nothing else in the store holds what was there; "spare" where something does, or
+    where no content is concerned; "leftover" for files too many: no damage, and only space.
+    """
+
+    path: Path
+    what: str
+    kind: Literal["lost", "spare", "leftover"]
+
+
+def check_store(path: str | PathLike[str], *, progress: Progress | None = None) -> list[Problem]:
+    """Return all that is wrong with the store in folder `path`, the journal first; nothing for a sound one.
+
+    It verifies every checksum: SQLite's structure of the journal, each row and its arrays, each array and
+    chunk of each generation, and what these say of themselves. It writes nothing and takes no lock, and a
+    writer may be at work (SQLite may make its two files beside the journal, as for any reader).
+    `progress` is called with what is being verified, how many of it are done, and how many there are.
+
+    Raises NotAStoreError where there is no store, VersionError for a newer format, and another StoreError
+    where a file cannot be read for a reason that says nothing against it.
+    """
+    folder = Path(path).absolute()
+    require_salvageable(folder)
+    with reported(folder, "checking the store"), closing(Salvage(folder / JOURNAL_FILE)) as salvage:
+        survey = Survey(folder, salvage, progress or (lambda *_: None))
+        return survey.problems() + list(survey.leftovers())
+
+
+@dataclass(frozen=True)
+class FoundGeneration:
     """A generation as it was found.
 
-    `row` is the journal's, or, where that is gone, made of what the group says of itself; None where neither
+    `row` is the journal's, or, where that is gone, made from what the group says of itself; None where neither
     verifies. `damage` is what keeps it from being used; `own`, what is wrong with what the group says of itself.
     """
 
@@ -34,7 +66,7 @@ class Found:
 
     @property
     def sound(self) -> bool:
-        """Whether it can be gone on from."""
+        """Whether recovery can resume from it."""
         return self.row is not None and not self.damage
 
     @property
@@ -50,122 +82,177 @@ class Found:
 
 @dataclass
 class Survey:
-    """All that was found. `trusted`: the journal can be believed about which generations there are.
+    """All that is found of the store in `folder`, whose journal is `salvage`, and whether it verifies.
 
     `identity` is None where it is lost, `compacted` the last row whose arrays a base stands for, whether that
     base is sound or not, and `unnamed` are the folders of generations that the journal does not know.
+    A writer may be at work meanwhile. Raises VersionError for a newer format, and StoreError for a file that
+    cannot be read for a reason that says nothing against it.
     """
 
-    journal: Path
-    meta: dict[str, str]
-    damaged_meta: int
-    damaged_generation_rows: list[int]
-    trusted: bool
+    folder: Path
+    salvage: Salvage
+    progress: Progress
     identity: dict[str, JSON] | None = None
-    generations: list[Found] = field(default_factory=list)
-    unnamed: list[Path] = field(default_factory=list)
-    compacted: int = 0
-    rows: Rows = field(default_factory=Rows)
+    generations: list[FoundGeneration] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        # The folders before the rows: a generation that is committed in between is then known, not a leftover.
+        parent = self.folder / GENERATIONS
+        there = numbers(parent)
+        self.journal = self.salvage.path
+        self.meta, self.damaged_meta = self.salvage.meta()
+        rows, whole = self.salvage.generations()
+        self.damaged_generation_rows = [row.number for row in rows if not row.sound]
+        trusted = whole and not self.damaged_generation_rows and not self.salvage.damage
+        named = {row.number: row for row in rows if row.sound}
+        self.identity = _identity(parent, self.meta, there)
+        chosen = [*named, *(number for number in there if number not in named and not trusted)]
+        for done, number in enumerate(chosen):
+            self.progress("generations", done, len(chosen))
+            found = self._examine(parent / folder_name(number), number, named.get(number))
+            # A writer may have replaced it while it was read: that is no damage.
+            still_named = number in {row.number for row in self.salvage.generations()[0]}
+            if found.sound or number not in named or still_named:
+                self.generations.append(found)
+        self.unnamed = [parent / folder_name(number) for number in there if number not in chosen]
+        self.compacted = max((found.upto for found in self.generations if found.is_base), default=0)
+        upto = max((found.upto for found in self.generations), default=0)
+        self.rows: RowSurvey = survey_rows(
+            self.salvage, self.compacted, max(upto, 0), lost_heads(self.meta), self.progress
+        )
 
     @property
-    def sound(self) -> list[Found]:
-        """The generations that can be gone on from, the newest first."""
-        found = [one for one in self.generations if one.sound]
-        return sorted(found, key=lambda one: (one.upto, one.number), reverse=True)
+    def sound(self) -> list[FoundGeneration]:
+        """The generations that recovery can resume from, the newest first."""
+        found = [found for found in self.generations if found.sound]
+        return sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
 
     @property
     def has_base(self) -> bool:
         """Whether a sound generation stands for the compacted rows, or none were compacted."""
-        return not self.compacted or any(one.upto == self.compacted and one.is_base for one in self.sound)
+        return not self.compacted or any(found.upto == self.compacted and found.is_base for found in self.sound)
+
+    def _examine(self, folder: Path, number: int, row: GenerationRow | None) -> FoundGeneration:
+        known, own = None, None
+        try:
+            known = read_own_description(folder)
+            own = self._disagreement(folder / "zarr.json", known, number, row)
+        except DamageError as wrong:
+            own = wrong
+        if row is None and known is not None and own is None:
+            row = self._row_of(folder, known)
+        if row is None:
+            return FoundGeneration(number, folder, None, [], own)
+        try:
+            damage = list(GroupReader(folder, number, row.verified(self.journal)[1]).damage())
+        except DamageError as wrong:
+            damage = [wrong]
+        if own is not None and known is not None:
+            # It verifies, and says that it is another: then it is.
+            damage.append(own)
+        return FoundGeneration(number, folder, row, damage, own)
+
+    def _disagreement(
+        self, header: Path, known: dict[str, Any], number: int, row: GenerationRow | None
+    ) -> DamageError | None:
+        expected: dict[str, Any] = {"number": number}
+        if self.identity is not None:
+            expected["identity"] = self.identity
+        if row is not None:
+            attributes, content = row.verified(self.journal)
+            expected |= {"upto": row.upto, "attributes": attributes, **content}
+        for name, value in expected.items():
+            if known.get(name) != value:
+                detail = "" if name in ("arrays", "attributes") else f": {known.get(name)!r}, not {value!r}"
+                return DamageError(
+                    f"{header} is of another generation, or of another store, than expected: it says another "
+                    f"{name}{detail}",
+                    path=header,
+                )
+        return None
+
+    def _row_of(self, folder: Path, known: dict[str, Any]) -> GenerationRow:
+        """Return the journal's row as it must have been; a base is one where no row up to it has its arrays."""
+        base = known["upto"] > 0 and not self.salvage.may_have_payloads(known["upto"])
+        content = {"format": known["format"], "arrays": known["arrays"]}
+        attributes = to_json("attributes", known["attributes"])
+        time = (folder / "zarr.json").stat().st_mtime
+        return GenerationRow.of(known["number"], known["upto"], int(base), time, attributes, content)
+
+    def problems(self) -> list[Problem]:
+        """Return what is damaged."""
+        return [*self._in_journal(), *self._in_rows(), *self._in_generations()]
+
+    def _in_journal(self) -> Iterator[Problem]:
+        for what in self.salvage.damage:
+            yield Problem(self.journal, what, "lost" if self.salvage.is_gone else "spare")
+        missing = sorted({"format", "created", "identity"} - set(self.meta))
+        if self.damaged_meta or missing:
+            what = f"{self.damaged_meta} rows of table meta in {self.journal} fail their checksums"
+            what += f"; without a row that verifies: {', '.join(missing)}" if missing else ""
+            yield Problem(self.journal, what, "spare" if self.identity is not None else "lost")
+
+    def _in_rows(self) -> Iterator[Problem]:
+        for first, last, fault in self.rows.faults:
+            yield Problem(self.journal, f"{fault.describe(first, last)} in {self.journal}", "lost")
+        for first, last in self.rows.strays:
+            rows = f"row {first}" if first == last else f"rows {first} to {last}"
+            what = f"{self.journal} holds arrays of {rows} that no row has, or a base stands for"
+            yield Problem(self.journal, what, "spare")
+
+    def _in_generations(self) -> Iterator[Problem]:
+        known = {found.number: found for found in self.generations}
+        for number in self.damaged_generation_rows:
+            generation = known.get(number)
+            spare = (generation is not None and generation.sound) or self._is_spare(generation)
+            what = f"the row of generation {number} in {self.journal} fails its checksum"
+            yield Problem(self.journal, what, "spare" if spare else "lost")
+        for found in self.generations:
+            kind: Literal["lost", "spare"] = "spare" if self._is_spare(found) else "lost"
+            for damage in found.damage:
+                yield Problem(damage.path, str(damage), kind)
+            if found.own is not None and found.own not in found.damage:
+                # A generation that the journal knows need not describe itself.
+                yield Problem(found.own.path, str(found.own), "spare" if found.sound else kind)
+
+    def _is_spare(self, generation: FoundGeneration | None) -> bool:
+        """Return whether the state that a generation holds can be had without it."""
+        upto = self.rows.last if generation is None or generation.row is None else generation.upto
+        uptos = [other.upto for other in self.sound if other is not generation]
+        if generation is not None and generation.is_base and upto == self.compacted:
+            return upto in uptos
+        starts = [start for start in [*uptos, *([0] if not self.compacted else [])] if start >= self.compacted]
+        return any(start >= upto or not self.rows.faulty(start + 1, upto) for start in starts)
+
+    def leftovers(self) -> Iterator[Problem]:
+        """Yield the files that are there too many, and who removes them."""
+        aside = "was put aside by a repair: remove it when you need it no more"
+        for path in self.unnamed:
+            yield Problem(path, f"{path} is of no generation that counts: the next writer removes it", "leftover")
+        parent = self.folder / GENERATIONS
+        for path in sorted(parent.iterdir()) if parent.is_dir() else ():
+            if path.name.endswith(PARTIAL):
+                yield Problem(path, f"{path} was, or is being, written: the next writer removes it", "leftover")
+            elif ".damaged" in path.name:
+                yield Problem(path, f"{path} {aside}", "leftover")
+        for path in sorted(self.folder.iterdir()):
+            if path.name.startswith(DAMAGED_FILE):
+                yield Problem(path, f"{path} {aside}", "leftover")
+            elif path.name.startswith((DRAFT_FILE, REPAIRED_FILE)):
+                what = f"{path} is of a repair that did not end: the next writer removes it"
+                yield Problem(path, what, "leftover")
 
 
-def survey(folder: Path, remains: Remains, told: Progress) -> Survey:
-    """Read all that there is of the store in `folder`, whose journal is `remains`, and verify it.
-
-    A writer may be at work meanwhile. Raises VersionError for a newer format, and StoreError for a file that
-    cannot be read for a reason that says nothing against it.
-    """
-    # The folders before the rows: one that is committed between is then known, not a leftover.
-    there = numbers(folder / GENERATIONS)
-    meta, damaged_meta = remains.meta()
-    rows, whole = remains.generations()
-    damaged_rows = [row.number for row in rows if not row.sound]
-    trusted = whole and not damaged_rows and not remains.damage
-    found = Survey(remains.path, meta, damaged_meta, damaged_rows, trusted)
-    named = {row.number: row for row in rows if row.sound}
-    found.identity = _identity(folder, meta, there)
-    chosen = [*named, *(number for number in there if number not in named and not trusted)]
-    for done, number in enumerate(chosen):
-        told("generations", done, len(chosen))
-        one = _examined(folder / GENERATIONS / folder_name(number), number, named.get(number), found.identity, remains)
-        # A writer may have replaced it while it was read: no damage.
-        if one.sound or number not in named or number in {row.number for row in remains.generations()[0]}:
-            found.generations.append(one)
-    found.unnamed = [folder / GENERATIONS / folder_name(number) for number in there if number not in chosen]
-    found.compacted = max((one.upto for one in found.generations if one.is_base), default=0)
-    upto = max((one.upto for one in found.generations), default=0)
-    found.rows = survey_rows(remains, found.compacted, max(upto, 0), lost_heads(meta), told)
-    return found
-
-
-def _identity(folder: Path, meta: dict[str, str], there: list[int]) -> dict[str, JSON] | None:
-    """The journal's, or that of the newest generation that says what it is."""
+def _identity(parent: Path, meta: dict[str, str], there: list[int]) -> dict[str, JSON] | None:
+    """Return the journal's identity, or that of the newest generation that describes itself."""
     try:
         return from_json(meta["identity"])
     except (KeyError, ValueError):
         pass
     for number in reversed(there):
         try:
-            return dict(read_known(folder / GENERATIONS / folder_name(number))["identity"])
+            return dict(read_own_description(parent / folder_name(number))["identity"])
         except DamageError:
             continue
     return None
-
-
-def _examined(
-    folder: Path, number: int, row: GenerationRow | None, identity: dict[str, JSON] | None, remains: Remains
-) -> Found:
-    known, own = None, None
-    try:
-        known = read_known(folder)
-        own = _disagreement(folder, known, number, row, identity)
-    except DamageError as wrong:
-        own = wrong
-    if row is None and known is not None and own is None:
-        row = _row_of(folder, known, remains)
-    if row is None:
-        return Found(number, folder, None, [], own)
-    damage = list(generation_damage(folder, number, row.verified(remains.path)[1]))
-    if own is not None and known is not None:
-        # It verifies, and says that it is another: then it is.
-        damage.append(own)
-    return Found(number, folder, row, damage, own)
-
-
-def _disagreement(
-    folder: Path, known: dict[str, Any], number: int, row: GenerationRow | None, identity: dict[str, JSON] | None
-) -> DamageError | None:
-    expected: dict[str, Any] = {"number": number}
-    if identity is not None:
-        expected["identity"] = identity
-    if row is not None:
-        attributes, content = from_json(row.attributes.decode()), from_json(row.content.decode())
-        expected |= {"upto": row.upto, "attributes": attributes, **content}
-    for name, value in expected.items():
-        if known.get(name) != value:
-            told = "" if name in ("arrays", "attributes") else f": {known.get(name)!r}, not {value!r}"
-            return DamageError(
-                f"{folder / 'zarr.json'} is of another generation, or of another store, than expected: it says "
-                f"another {name}{told}",
-                path=folder / "zarr.json",
-            )
-    return None
-
-
-def _row_of(folder: Path, known: dict[str, Any], remains: Remains) -> GenerationRow:
-    """The journal's row as it must have been; a base is one where no row up to it has its arrays."""
-    base = known["upto"] > 0 and not remains.has_payloads(known["upto"])
-    content = {"format": known["format"], "arrays": known["arrays"]}
-    attributes = to_json("attributes", known["attributes"])
-    time = (folder / "zarr.json").stat().st_mtime
-    return GenerationRow.of(known["number"], known["upto"], int(base), time, attributes, content)

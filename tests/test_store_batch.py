@@ -142,7 +142,7 @@ def test_a_batch_that_cannot_be_taken_back_at_once_hides_no_error_and_blocks_not
     stuck = []
 
     def using(doing):
-        if doing == "taking a batch back" and not stuck:
+        if doing == "rolling a batch back" and not stuck:
             stuck.append(doing)
             raise StoreError("the disk says no")
         return real(doing)
@@ -151,7 +151,7 @@ def test_a_batch_that_cannot_be_taken_back_at_once_hides_no_error_and_blocks_not
     with pytest.raises(KeyError), opened.batch():
         add(opened, "one")
         raise KeyError
-    assert "could not be taken back yet" in caplog.text
+    assert "could not be rolled back yet" in caplog.text
     with pytest.raises(StoreError):
         add(opened, "meanwhile")
     assert labels(opened) == ["before"]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import store.generations
-import store.reading
-import store.snapshots
+import store.groups
+import store.generations
 from store import DamageError, Store, StoreError
 
 ONE = {"x": np.arange(10)}
@@ -31,8 +31,8 @@ class Gate:
 
     def __init__(self, monkeypatch):
         self.open, self.reached, self.uptos = threading.Event(), threading.Event(), []
-        self.write = store.snapshots.write_generation
-        monkeypatch.setattr(store.snapshots, "write_generation", self)
+        self.write = store.generations.write_group
+        monkeypatch.setattr(store.generations, "write_group", self)
 
     def __call__(self, parent, number, upto, *rest):
         self.uptos.append(upto)
@@ -65,7 +65,7 @@ def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
         opened.commit_later(ONE, upto=upto)
     assert opened.last == 4
     assert opened.latest() is None
-    assert [thread.name for thread in threading.enumerate()].count("store commit s") == 1
+    assert [thread.name for thread in threading.enumerate()].count("store commit s_0") == 1
     gate.open.set()
     opened.flush()
     assert gate.uptos == [0, 3]
@@ -104,9 +104,9 @@ def fail(*_):
 )
 def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
     with monkeypatch.context() as broken:
-        broken.setattr(store.generations, "sync_tree", fail)
+        broken.setattr(store.groups, "sync_tree", fail)
         opened.commit_later(ONE, upto=0)
-        opened._background.wait()
+        opened._generations.wait()
     with pytest.raises(StoreError, match="the disk says no"):
         surface(opened)
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
@@ -117,7 +117,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr(store.snapshots, "write_generation", fail)
+    monkeypatch.setattr(store.generations, "write_group", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, upto=0)
         raise KeyError
@@ -126,7 +126,7 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
 def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
     opened = Store.open(tmp_path, identity={})
     with monkeypatch.context() as broken:
-        broken.setattr(store.snapshots, "write_generation", fail)
+        broken.setattr(store.generations, "write_group", fail)
         opened.commit_later(ONE, upto=0)
         with pytest.raises(StoreError, match="background commit failed"):
             opened.close()
@@ -135,9 +135,9 @@ def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
 
 def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
     opened.commit(ONE, upto=0)
-    for name in ("sync_tree", "_write_group", "sync_folder"):
+    for name in ("sync_tree", "_write_zarr", "sync_folder"):
         with monkeypatch.context() as broken:
-            broken.setattr(store.generations, name, fail)
+            broken.setattr(store.groups, name, fail)
             with pytest.raises(StoreError, match="the disk says no"):
                 opened.commit({"x": np.arange(3)}, upto=0)
         assert folders(opened) == ["00000001"]
@@ -192,7 +192,7 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
     def starve(*_):
         raise MemoryError
 
-    monkeypatch.setattr(store.reading, "_read_array", starve)
+    monkeypatch.setattr(store.groups, "_read_array", starve)
     with pytest.raises(StoreError) as caught:
         opened.latest()
     assert not isinstance(caught.value, DamageError)

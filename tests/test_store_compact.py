@@ -9,7 +9,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-import store.snapshots
+import store.generations
 from store import CompactedError, DamageError, RecordError, Store, StoreError
 
 LAST = 12
@@ -239,9 +239,9 @@ def crash(*_, **__):
 
 
 STEPS = {
-    "before the folder is written": (store.snapshots, "write_generation"),
+    "before the folder is written": (store.generations, "write_group"),
     "before the journal knows it": ("journal", "make_current"),
-    "before what is dropped is removed": (store.snapshots, "remove_others"),
+    "before what is dropped is removed": (store.generations, "remove_others"),
     "before the space is given back": ("journal", "shrink"),
 }
 

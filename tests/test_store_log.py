@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from store import DamageError, Store, check_store, repair_store
-from store.log import FRAME_BYTES, HEADER_BYTES, damaged_frame, mend_log
+from store.writeahead import FRAME_BYTES, HEADER_BYTES, damaged_frame, mend_log
 
 ROWS = 40
 
@@ -85,7 +85,7 @@ def test_a_flipped_bit_is_found_before_sqlite_drops_the_rows_behind_it(crashed, 
         assert [one for one in check_store(copy) if one.kind != "leftover"] == []
         # All, but where the newest version of a row behind the generation was hit; of one before it, its arrays.
         assert right(copy) == done.kept >= 20
-        assert (done.kept == ROWS) == all("taken back" in lost for lost in done.lost)
+        assert (done.kept == ROWS) == all("retracted" in lost for lost in done.lost)
 
 
 def test_the_last_commit_may_be_cut_anywhere_in_any_order(crashed, tmp_path):

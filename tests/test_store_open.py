@@ -375,7 +375,7 @@ def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_p
 
     with monkeypatch.context() as broken:
         broken.setattr(Path, "unlink", read_only)
-        broken.setattr("store.generations._write_group", lambda *_: read_only(tmp_path))
+        broken.setattr("store.groups._write_zarr", lambda *_: read_only(tmp_path))
         with pytest.raises(StoreError):
             opened.commit({}, upto=1)
         opened.close()

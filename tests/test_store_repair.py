@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import store.files
-import store.rebuild
+import store.repair
 import store.repair
 import store.schema
 import store.store
@@ -179,8 +179,8 @@ def test_a_generation_that_contains_lost_rows_becomes_the_base(made, tmp_path, w
     done = repair_store(path)
     assert done.kept == LAST
     assert f"row{'s' if len(gone) > 1 else ''} 8" in done.lost[0]
-    assert "is in generation 2, but can no longer be taken back" in done.lost[0]
-    assert "the arrays of rows 1 to 15 are given up, generation 2 stands for them" in done.lost[-1]
+    assert "is in generation 2, but can no longer be retracted" in done.lost[0]
+    assert "rows 1 to 15 give up their arrays, generation 2 stands for them" in done.lost[-1]
     assert agrees(path, kept=LAST, base=15, latest=15, lost=gone)
     assert goes_on(path)
 
@@ -237,7 +237,7 @@ def test_a_damaged_base_is_replaced_by_the_newest_generation(compacted):
     spoil(compacted, 3)
     done = repair_store(compacted)
     assert done.lost[0] == (
-        "the arrays of rows 1 to 15 are given up, generation 2 stands for them: none of them can be taken back any more"
+        "rows 1 to 15 give up their arrays, generation 2 stands for them: none of them can be retracted any more"
     )
     assert agrees(compacted, kept=LAST, base=15, latest=15)
     assert goes_on(compacted)
@@ -541,8 +541,8 @@ def steps_of(monkeypatch, at):
     killing(os, "rename")
     killing(os, "fsync")
     killing(shutil, "rmtree")
-    killing(store.rebuild, "build_journal")
-    killing(store.rebuild, "_verify")
+    killing(store.repair, "build_journal")
+    killing(store.repair, "_verify")
     return count
 
 
@@ -602,7 +602,7 @@ def test_killed_before_any_step_it_can_be_begun_again(made, tmp_path, monkeypatc
 def test_what_an_interrupted_repair_made_is_not_believed_after_the_store_went_on(path, monkeypatch):
     change(path, "DELETE FROM payload WHERE sequence = 18")
     with monkeypatch.context() as broken, pytest.raises(KilledError):
-        broken.setattr(store.repair, "put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
+        broken.setattr(store.repair, "_put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
         repair_store(path)
     assert (path / "journal.sqlite.repaired").exists()
     with Store.open(path) as opened:
@@ -615,7 +615,7 @@ def test_what_an_interrupted_repair_made_is_not_believed_after_the_store_went_on
 def test_a_damaged_result_of_an_interrupted_repair_is_named(path, monkeypatch):
     change(path, "DELETE FROM payload WHERE sequence = 18")
     with monkeypatch.context() as broken, pytest.raises(KilledError):
-        broken.setattr(store.repair, "put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
+        broken.setattr(store.repair, "_put_in_place", lambda *_: (_ for _ in ()).throw(KilledError))
         repair_store(path)
     (path / "journal.sqlite").rename(path / "journal.sqlite.damaged")
     (path / "journal.sqlite.repaired").write_bytes(b"no longer what it was" * 900)
@@ -626,7 +626,7 @@ def test_a_damaged_result_of_an_interrupted_repair_is_named(path, monkeypatch):
 
 def test_a_disk_that_does_not_keep_what_is_written_is_told_of(path, monkeypatch):
     change(path, "DELETE FROM payload WHERE sequence = 18")
-    real = store.rebuild.build_journal
+    real = store.repair.build_journal
 
     def forgetful(draft, meta, fill=None):
         real(draft, meta, fill)
@@ -634,7 +634,7 @@ def test_a_disk_that_does_not_keep_what_is_written_is_told_of(path, monkeypatch)
             connection.execute("UPDATE record SET time = 0 WHERE sequence = 3")
 
     with monkeypatch.context() as broken, pytest.raises(DamageError, match="does not read back as it was just written"):
-        broken.setattr(store.rebuild, "build_journal", forgetful)
+        broken.setattr(store.repair, "build_journal", forgetful)
         repair_store(path)
     assert not (path / "journal.sqlite.repaired").exists()
     assert repair_store(path).kept == 17

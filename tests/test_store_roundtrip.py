@@ -187,9 +187,9 @@ def test_the_public_names_are_sorted_and_none_leaks():
 
 
 def test_the_exception_tree_is_the_one_in_the_docstring():
-    lines = store.errors.__doc__.splitlines()
+    lines = store.exceptions.__doc__.splitlines()
     drawn = {line.split("── ")[1].split()[0] for line in lines if "── " in line}
-    assert drawn == set(store.errors.__all__)
+    assert drawn == {name for name in store.exceptions.__all__ if name.endswith("Error")}
     for name in drawn - {"StoreError"}:
         bases = getattr(store, name).__bases__
         assert bases == ((store.StoreError, ValueError) if name == "RecordError" else (store.StoreError,))

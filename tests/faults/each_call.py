@@ -160,7 +160,7 @@ class Attempt:
             if self.step.operation[0] == "close":
                 return self.learner.close()
             result = perform(self.learner, self.step.operation, self.home)
-            self.learner._ledger.store._background.wait()
+            self.learner._ledger.store._generations.wait()
             return result
         finally:
             scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
@@ -255,7 +255,7 @@ class Trial:
         self._require(f"{where}: after one more", seen(learner), [state])
         # Closing the store alone writes no generation: what was told is in the journal.
         if not thorough:
-            learner._ledger.store._background.check = lambda: None
+            learner._ledger.store._generations.raise_failure = lambda: None
         outcome = self._outcome(learner.close if thorough else learner._ledger.store.close)
         if outcome != "success":
             step.outcomes[f"closing told of the failure before it: {outcome}"] += 1

@@ -1,7 +1,4 @@
-"""Which arrays the store keeps, their digest, and the bytes of a journal row's payload.
-
-FORMAT.md describes the bytes for another implementation.
-"""
+"""Which arrays the store keeps, their digests, and the bytes of a record's payload (FORMAT.md describes them)."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from store.errors import RecordError, VersionError
+from store.exceptions import RecordError, VersionError
 
 __all__ = [
     "array_digest",
@@ -30,7 +27,7 @@ HEADER = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
 RAW, BLOSC = 0, 1
 
-# Whoever appends waits for it: on a touch of BioTac (60 KB) zstd saves a fifth of the bytes that LZ4 leaves, and takes
+# Every append waits for it: on a touch of BioTac (60 KB) zstd saves a fifth of the bytes that LZ4 leaves, and takes
 # 0.27 ms in place of 0.07, where the disk itself takes 0.2 to 0.3.
 COMPRESSOR, LEVEL = b"lz4", 1
 SMALL = 128  # bytes, of which compressing saves next to nothing

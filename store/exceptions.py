@@ -1,0 +1,157 @@
+"""What the store raises, grouped by what the caller does next, and how failures of the system become these errors.
+
+Exception
+└── StoreError             anything that the store reports
+    ├── LockedError        another writer holds the store: close that one, or open with mode="read"
+    ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
+    ├── VersionError       a newer release wrote it: upgrade; nothing was touched
+    ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
+    ├── CompactedError     compaction gave up this row's arrays: resume from the base
+    ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
+    ├── ReadOnlyError      the store, or its folder, may not be written from here
+    ├── StoreClosedError   the store was closed, or belongs to the process that forked this one
+    └── RecordError        this cannot be stored as it is (also a ValueError)
+"""
+
+from __future__ import annotations
+
+import errno
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = [
+    "SQLITE_ERRORS",
+    "CompactedError",
+    "DamageError",
+    "LockedError",
+    "NotAStoreError",
+    "ReadOnlyError",
+    "RecordError",
+    "StoreClosedError",
+    "StoreError",
+    "StoreFullError",
+    "VersionError",
+    "from_sqlite",
+    "is_damage",
+    "reported",
+]
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+
+# SQLite says IOERR, not FULL, when it cannot grow the shared memory beside the journal.
+IOERR_SHMSIZE = 10 | (19 << 8)
+IOERR_SHORT_READ = 10 | (2 << 8)
+
+# The second where a message quotes damaged text that Python cannot decode.
+SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+
+
+class StoreError(Exception):
+    """Anything that the store reports."""
+
+
+class LockedError(StoreError):
+    """Another writer holds the store; its process id, host and since when are in the message."""
+
+
+class NotAStoreError(StoreError):
+    """The path holds no store, or holds something else, which is left as it is."""
+
+
+class VersionError(StoreError):
+    """The store was written in a format newer than this release reads; nothing was touched."""
+
+
+class DamageError(StoreError):
+    """Bytes on the disk are not those that were written.
+
+    `path` is the damaged file or array folder. `sequence` is the damaged row of the journal, if it is one:
+    `records(after=sequence)` continues behind it. `check_store` names all that is damaged, and
+    `repair_store` keeps what verifies.
+    """
+
+    def __init__(self, message: str, *, path: Path, sequence: int | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+        self.sequence = sequence
+
+
+class CompactedError(StoreError):
+    """Compaction gave up the arrays of this row, on purpose; its head is still there."""
+
+
+class StoreFullError(StoreError):
+    """The disk, or a quota on it, is full. The call had no effect and may be repeated."""
+
+
+class ReadOnlyError(StoreError):
+    """The store was opened for reading, or its folder may not be written."""
+
+
+class StoreClosedError(StoreError):
+    """The store was closed, or was opened in the process that forked this one."""
+
+
+class RecordError(StoreError, ValueError):
+    """A label, key, time, attribute or array that the store cannot keep as it is."""
+
+
+@contextmanager
+def reported(path: Path, doing: str) -> Iterator[None]:
+    """Run the block; raise an OSError or an error of SQLite in it as the StoreError that it amounts to.
+
+    `path` is the file or folder concerned and `doing` completes "while …" in the message.
+    """
+    try:
+        yield
+    except SQLITE_ERRORS as error:
+        raise from_sqlite(error, path, doing) from error
+    except OSError as error:
+        raise _from_system(error, path, doing) from error
+
+
+def _from_system(error: OSError, path: Path, doing: str) -> StoreError:
+    """Return the StoreError for a failed system call."""
+    where = Path(error.filename) if isinstance(error.filename, str) else path
+    if error.errno in FULL:
+        return StoreFullError(f"no space left for {where} while {doing}: free some space and call again")
+    if error.errno in FORBIDDEN:
+        return ReadOnlyError(f"{where} is not open to this user while {doing} ({error.strerror})")
+    return StoreError(f"{where}: {error.strerror or error} while {doing}")
+
+
+def is_damage(error: sqlite3.Error | UnicodeDecodeError) -> bool:
+    """Return whether the error says that the file is not as SQLite, or the store, wrote it."""
+    if isinstance(error, UnicodeDecodeError):
+        return True
+    extended: int = getattr(error, "sqlite_errorcode", -1)
+    code = extended & 0xFF
+    if code == sqlite3.SQLITE_ERROR:
+        # Our statements are right: so tables or columns are missing, or their description is unreadable.
+        return str(error).startswith(("no such", "malformed", "unsupported file format"))
+    return code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or extended == IOERR_SHORT_READ
+
+
+def from_sqlite(error: sqlite3.Error | UnicodeDecodeError, path: Path, doing: str) -> StoreError:
+    """Return the StoreError for a failed call of SQLite, by its result code."""
+    # Errors that Python itself raises, such as text that is not UTF-8, carry no code.
+    extended: int = getattr(error, "sqlite_errorcode", -1)
+    code = extended & 0xFF
+    if code == sqlite3.SQLITE_FULL or extended == IOERR_SHMSIZE:
+        return StoreFullError(f"no space left for {path} while {doing}: free some space and call again")
+    if is_damage(error):
+        return DamageError(
+            f"{path} is damaged ({error}) while {doing}: copy the folder before anything else, then repair the "
+            "store (repair_store)",
+            path=path,
+        )
+    if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):
+        return ReadOnlyError(f"{path} may not be written while {doing} ({error})")
+    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        return LockedError(f"another program is inside {path} while {doing} ({error}): close it there")
+    if code == sqlite3.SQLITE_TOOBIG:
+        return RecordError(f"the record is larger than SQLite takes while {doing}: keep it in a generation")
+    return StoreError(f"{path}: {error} while {doing}")

@@ -1,0 +1,272 @@
+"""One generation on disk: a zarr group, written whole and durable, read back whole or in part, and verified."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from store.encoding import array_digest, chunk_digest, flat_bytes
+from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
+from store.files import remove_tree, sync_folder, sync_tree
+from store.records import JSON
+
+if TYPE_CHECKING:
+    import zarr
+
+__all__ = ["PARTIAL", "GroupReader", "folder_name", "read_own_description", "write_group"]
+
+GROUP_VERSION = 1
+PARTIAL = ".partial"
+
+# Pieces of a large array: small enough to be compressed in cache-sized steps and on several
+# threads, large enough that a hundred megabytes are some tens of files to make durable.
+CHUNK_BYTES = 4 * 2**20
+
+# What a reader meets where a file is missing or is not a file; other failures of the system
+# (no permission, too many open files) say nothing against the generation.
+GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
+
+
+def folder_name(number: int) -> str:
+    """Return the name of a generation's folder: its number in eight digits, or more when it needs them."""
+    return f"{number:08d}"
+
+
+def write_group(
+    parent: Path,
+    number: int,
+    upto: int,
+    arrays: Mapping[str, np.ndarray],
+    attributes: Mapping[str, JSON],
+    chunks: Mapping[str, int],
+    identity: Mapping[str, JSON],
+) -> dict[str, Any]:
+    """Write checked arrays as a durable zarr group in `parent`; return what a reader verifies them against.
+
+    That is the group's format and, for each array, its dtype, shape and sha256, and for an array in
+    `chunks` (name → rows) a digest of each chunk, as JSON. The group also describes itself so, and names
+    its store, so that it verifies without the journal. On any error nothing is left behind.
+    Raises StoreFullError, ReadOnlyError or StoreError.
+    """
+    described = {name: _describe(array, chunks.get(name)) for name, array in arrays.items()}
+    content = {"format": GROUP_VERSION, "arrays": described}
+    final = parent / folder_name(number)
+    draft = parent / (folder_name(number) + PARTIAL)
+    try:
+        with reported(draft, f"writing generation {number}"):
+            parent.mkdir(exist_ok=True)
+            remove_tree(draft)
+            known = {"number": number, "upto": upto, "attributes": attributes, "identity": identity, **content}
+            _write_zarr(draft, known | {"sha256": _own_digest(known)}, arrays, chunks)
+            sync_tree(draft)
+            draft.rename(final)
+            sync_folder(parent)
+    except BaseException:
+        remove_tree(draft)
+        remove_tree(final)
+        raise
+    return content
+
+
+def _own_digest(known: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
+
+
+def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
+    described = {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
+    if rows is None:
+        return described
+    pieces = [chunk_digest(array[first : first + rows]) for first in range(0, len(array), rows)]
+    return described | {"rows": rows, "chunks": pieces}
+
+
+def _write_zarr(
+    path: Path, attributes: dict[str, Any], arrays: Mapping[str, np.ndarray], chunks: Mapping[str, int]
+) -> None:
+    # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
+    import zarr
+    from zarr.codecs import BloscCodec
+    from zarr.storage import LocalStore
+
+    group = zarr.create_group(store=LocalStore(path), zarr_format=3, attributes=attributes)
+    for name, array in arrays.items():
+        plain = array
+        if array.dtype.kind == "U":
+            # zarr v3 has no settled type for fixed-width text and warns of it: code points have one.
+            plain = flat_bytes(array).view("<u4").reshape(*array.shape, array.dtype.itemsize // 4)
+        target = group.create_array(
+            name,
+            shape=plain.shape,
+            dtype=plain.dtype,
+            **_layout(plain, chunks.get(name)),
+            compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
+            fill_value=0,
+            attributes={"dtype": array.dtype.str},
+            # A chunk that equals the fill value would have no file, nor would a lost one.
+            config={"write_empty_chunks": True},
+        )
+        target[...] = plain
+
+
+def _layout(array: np.ndarray, rows: int | None) -> dict[str, Any]:
+    if rows is not None:
+        # One file for all the chunks: hundreds of small ones would each have to be made durable.
+        rest = tuple(max(1, length) for length in array.shape[1:])
+        return {"chunks": (rows, *rest), "shards": (rows * max(1, -(-len(array) // rows)), *rest)}
+    lengths, piece = [], array.nbytes
+    for length in array.shape:
+        slab = piece // max(length, 1)
+        lengths.append(max(1, length if piece <= CHUNK_BYTES else CHUNK_BYTES // max(slab, 1)))
+        piece = slab * lengths[-1]
+    return {"chunks": tuple(lengths)}
+
+
+class GroupReader:
+    """The generation in folder `path`, verified against `content`, which `write_group` returned.
+
+    Every method raises DamageError that names the file or folder, the array and the generation, VersionError
+    for a newer format, and StoreError for a file that cannot be read for a reason that says nothing against it.
+    """
+
+    def __init__(self, path: Path, number: int, content: Mapping[str, Any]) -> None:
+        _require_known(path, content["format"])
+        import zarr
+        from zarr.storage import LocalStore
+
+        self._path, self._number, self._described = path, number, content["arrays"]
+        header = path / "zarr.json"
+        try:
+            self._group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r", zarr_format=3)
+            found = self._group.attrs.get("format")
+        except Exception as error:
+            raise _unreadable(error, f"generation {number} in {header}", header) from error
+        if found != content["format"]:
+            raise DamageError(
+                f"generation {number} in {header} claims format {found!r}, not {content['format']}", path=header
+            )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all the arrays, verified, writable and the caller's own."""
+        return {name: self._array(name) for name in self._described}
+
+    def rows(self, name: str, first: int, last: int) -> np.ndarray:
+        """Return rows `first` to before `last` of an array that is kept in chunks, and verify only those chunks.
+
+        Raises RecordError for an array that is not there or not in chunks, and for rows that it does not have.
+        """
+        described = self._described.get(name)
+        if described is None or "rows" not in described:
+            kept = sorted(name for name, described in self._described.items() if "rows" in described)
+            raise RecordError(
+                f"generation {self._number} in {self._path} keeps {kept} in chunks, not {name!r}: read it as a whole"
+            )
+        length, step = described["shape"][0], described["rows"]
+        if not 0 <= first <= last <= length:
+            raise RecordError(
+                f"array {name!r} of generation {self._number} has rows 0 to {length}, not {first} to {last}"
+            )
+        pieces = [np.empty((0, *described["shape"][1:]), described["dtype"])]
+        for chunk in range(first // step, -(-last // step) if last > first else 0):
+            begin = chunk * step
+            pieces.append(self._chunk(name, chunk)[max(first - begin, 0) : last - begin])
+        return np.concatenate(pieces)
+
+    def damage(self) -> Iterator[DamageError]:
+        """Yield what is wrong with the arrays, array by array and chunk by chunk; nothing where all verifies."""
+        for name, described in self._described.items():
+            sound = True
+            for chunk in range(len(described.get("chunks", ()))):
+                try:
+                    self._chunk(name, chunk)
+                except DamageError as damage:
+                    sound = False
+                    yield damage
+            try:
+                self._array(name)
+            except DamageError as damage:
+                if sound:
+                    yield damage
+
+    def _array(self, name: str) -> np.ndarray:
+        folder = self._path / name
+        what = f"array {name!r} of generation {self._number} in {folder}"
+        array = self._read(name, what, folder, slice(None))
+        if array is None or array_digest(array) != self._described[name]["sha256"]:
+            raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
+        return array
+
+    def _chunk(self, name: str, chunk: int) -> np.ndarray:
+        described = self._described[name]
+        file = self._path / name / "c" / "/".join("0" * (len(described["shape"]) + (described["dtype"][1] == "U")))
+        begin, end = chunk * described["rows"], min(described["shape"][0], (chunk + 1) * described["rows"])
+        what = f"chunk {chunk} (rows {begin} to {end}) of array {name!r} of generation {self._number} in {file}"
+        piece = self._read(name, what, file, slice(begin, end))
+        if piece is None or chunk_digest(piece) != described["chunks"][chunk]:
+            raise DamageError(f"{what} is not what was written: its digest differs", path=file)
+        return piece
+
+    def _read(self, name: str, what: str, path: Path, rows: slice) -> np.ndarray | None:
+        import zarr
+
+        try:
+            node = self._group[name]
+            return _read_array(node, self._described[name], rows) if isinstance(node, zarr.Array) else None
+        except Exception as error:
+            raise _unreadable(error, what, path) from error
+
+
+def _read_array(node: zarr.Array[Any], described: Mapping[str, Any], rows: slice) -> np.ndarray | None:
+    shape, dtype = tuple(described["shape"]), np.dtype(described["dtype"])
+    text = dtype.kind == "U"
+    stored = ((*shape, dtype.itemsize // 4), np.dtype("<u4")) if text else (shape, dtype)
+    # Before it is read: a flipped bit in a shape could ask for more memory than there is.
+    if (node.shape, node.dtype) != stored:
+        return None
+    # zarr gives a scalar for a 0-d array, which has no rows to choose from.
+    plain = np.asarray(node[rows] if shape else node[...])
+    if not text:
+        return np.require(plain, requirements=["C", "W"])
+    array = np.empty(plain.shape[:-1], dtype)
+    flat_bytes(array)[:] = flat_bytes(np.asarray(plain, order="C"))
+    return array
+
+
+def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
+    other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
+    if other or isinstance(error, MemoryError):
+        return StoreError(f"{what} could not be read: {error}")
+    return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
+
+
+def read_own_description(path: Path) -> dict[str, Any]:
+    """Return what the group in folder `path` says of itself: number, upto, attributes, identity, format, arrays.
+
+    Raises DamageError where it is not as it was written, and VersionError for a newer format.
+    """
+    header = path / "zarr.json"
+    try:
+        known = json.loads(header.read_text(encoding="utf-8"))["attributes"]
+        stored = known.pop("sha256", None)
+    except Exception as error:
+        raise _unreadable(error, f"a generation in {header}", header) from error
+    # Before the version, which a flipped bit can make a newer one.
+    if _own_digest(known) != stored:
+        raise DamageError(
+            f"what {header} says of its generation is not what was written: its sha256 differs", path=header
+        )
+    _require_known(path, known["format"])
+    return dict(known)
+
+
+def _require_known(path: Path, version: int) -> None:
+    if version > GROUP_VERSION:
+        raise VersionError(
+            f"{path} is written in format {version}; this release reads generations up to format "
+            f"{GROUP_VERSION}: upgrade it; nothing was changed"
+        )

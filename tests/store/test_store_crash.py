@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from store_builds import as_after_a_crash
 
 import store
 from store import Store
@@ -81,7 +82,7 @@ def test_a_log_cut_at_any_byte_keeps_what_was_acknowledged_before_it(tmp_path, t
             sizes.append(log.stat().st_size)
             if number == 15:
                 opened.commit({"total": np.array(120), "bulk": np.full(3000, 15)}, upto=15)
-        shutil.copytree(path, tmp_path / "copy", ignore=shutil.ignore_patterns("*-shm", "lock", "holder.json"))
+        as_after_a_crash(opened, tmp_path / "copy")
     rng = random.Random(1)
     copy = tmp_path / "copy"
     data = (copy / "journal.sqlite-wal").read_bytes()

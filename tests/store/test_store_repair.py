@@ -8,76 +8,42 @@ import subprocess
 import threading
 from contextlib import closing
 
-import numpy as np
 import pytest
+from store_builds import (
+    IDENTITY,
+    LAST,
+    add,
+    as_after_a_crash,
+    change,
+    commit,
+    contents,
+    damage,
+    folders,
+    query,
+    same_arrays,
+    state,
+    values,
+)
 
-import store.files
 import store.repair
-import store.repair
-import store.schema
 import store.store
 from store import (
     CompactedError,
     DamageError,
     LockedError,
-    NotAStoreError,
     ReadOnlyError,
     Repair,
     Store,
-    VersionError,
+    StoreFullError,
     check_store,
     repair_store,
 )
 from store.journal import Journal
 
-LAST = 20
-IDENTITY = {"for": ["repairs", 1]}
-
-
-def values(number):
-    return np.random.default_rng(number).integers(0, 2**40, 200)
-
-
-def state(upto):
-    return {"sum": np.array(upto), "rows": np.arange(400.0).reshape(100, 4) + upto}
-
-
-def build(path, *, compacted):
-    """Twenty rows, generations up to rows 10 and 15, and, where compacted, a base up to row 6 in place of the first."""
-    with Store.open(path, identity=IDENTITY) as opened:
-        for number in range(1, LAST + 1):
-            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
-            if number in (10, 15):
-                opened.commit(state(number), upto=number, attributes={"n": number}, chunks={"rows": 25})
-            if number == 15 and compacted:
-                opened.compact(state(6), upto=6, attributes={"n": 6}, chunks={"rows": 25})
-    return path
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    home = tmp_path_factory.mktemp("made")
-    return {compacted: build(home / str(compacted), compacted=compacted) for compacted in (False, True)}
-
 
 @pytest.fixture
-def path(made, tmp_path):
-    return shutil.copytree(made[False], tmp_path / "s")
-
-
-@pytest.fixture
-def compacted(made, tmp_path):
-    return shutil.copytree(made[True], tmp_path / "s")
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def change(path, *statements):
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
-        for statement in statements:
-            connection.execute(statement)
+def path(plain):
+    return plain
 
 
 def spoil(path, number, name="rows/c/0/0"):
@@ -85,10 +51,6 @@ def spoil(path, number, name="rows/c/0/0"):
     data = bytearray(file.read_bytes())
     data[len(data) // 3] ^= 16
     file.write_bytes(data)
-
-
-def damage(path):
-    return [one for one in check_store(path) if one.kind != "leftover"]
 
 
 def agrees(path, *, kept, base=0, latest=None, lost=()):
@@ -109,9 +71,7 @@ def agrees(path, *, kept, base=0, latest=None, lost=()):
                 assert (found and found.upto) == upto
                 if found:
                     assert found.attributes == {"n": upto}
-                    assert {name: array.tobytes() for name, array in found.arrays.items()} == {
-                        name: array.tobytes() for name, array in state(upto).items()
-                    }
+                    assert same_arrays(found.arrays, state(upto))
     return True
 
 
@@ -119,17 +79,16 @@ def goes_on(path):
     """New rows are numbered behind those that were kept, and generations can be made."""
     with Store.open(path) as opened:
         number = opened.last + 1
-        assert opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}).sequence == number
-        opened.commit(state(number), upto=number, attributes={"n": number})
-        opened.compact(state(number), upto=number, attributes={"n": number})
+        assert add(opened, number).sequence == number
+        commit(opened.commit, number)
+        commit(opened.compact, number)
         assert opened.base().upto == number
     assert damage(path) == []
     return True
 
 
-@pytest.mark.parametrize("which", [False, True])
-def test_a_sound_store_is_left_as_it_is(made, tmp_path, which):
-    path = shutil.copytree(made[which], tmp_path / "s")
+def test_a_sound_store_is_left_as_it_is(either):
+    path = either
     shutil.copytree(path / "generations" / "00000002", path / "generations" / "00000009")
     before = contents(path)
     assert repair_store(path) == Repair(LAST, [], None)
@@ -147,9 +106,8 @@ BEHIND = {
 
 
 @pytest.mark.parametrize("statement", BEHIND.values(), ids=BEHIND)
-@pytest.mark.parametrize("which", [False, True])
-def test_behind_the_newest_generation_rows_are_kept_up_to_the_first_that_is_lost(made, tmp_path, which, statement):
-    path = shutil.copytree(made[which], tmp_path / "s")
+def test_behind_the_newest_generation_rows_are_kept_up_to_the_first_that_is_lost(either, which, statement):
+    path = either
     change(path, statement)
     done = repair_store(path)
     assert done.kept == 17
@@ -172,9 +130,8 @@ WITHIN = {
 
 
 @pytest.mark.parametrize(("statement", "gone"), WITHIN.values(), ids=WITHIN)
-@pytest.mark.parametrize("which", [False, True])
-def test_a_generation_that_contains_lost_rows_becomes_the_base(made, tmp_path, which, statement, gone):
-    path = shutil.copytree(made[which], tmp_path / "s")
+def test_a_generation_that_contains_lost_rows_becomes_the_base(either, which, statement, gone):
+    path = either
     change(path, statement)
     done = repair_store(path)
     assert done.kept == LAST
@@ -212,7 +169,7 @@ def test_a_damaged_generation_is_put_aside_and_the_one_before_it_gone_on_from(pa
     assert lost.startswith("generation 2: chunk 1 (rows 25 to 50) of array 'rows'")
     assert agrees(path, kept=LAST, latest=10)
     assert contents(path / "generations" / "00000002.damaged") == before
-    assert sorted(entry.name for entry in (path / "generations").iterdir()) == ["00000001", "00000002.damaged"]
+    assert folders(path) == ["00000001", "00000002.damaged"]
     assert goes_on(path)
 
 
@@ -346,9 +303,8 @@ def test_a_journal_that_was_cut_off_gives_what_it_still_has(path, pages):
 
 
 @pytest.mark.parametrize("how", ["deleted", "empty", "stub", "text"])
-@pytest.mark.parametrize("which", [False, True])
-def test_without_a_journal_the_newest_generation_is_gone_on_from(made, tmp_path, which, how):
-    path = shutil.copytree(made[which], tmp_path / "s")
+def test_without_a_journal_the_newest_generation_is_gone_on_from(either, which, how):
+    path = either
     file = path / "journal.sqlite"
     if how == "deleted":
         file.unlink()
@@ -366,13 +322,12 @@ def test_without_a_journal_the_newest_generation_is_gone_on_from(made, tmp_path,
     assert goes_on(path)
 
 
-def test_a_log_without_its_journal_never_meets_the_new_one(path):
+def test_a_log_without_its_journal_never_meets_the_new_one(path, tmp_path):
     """Its frames would be taken for changes to the repaired file."""
     with Store.open(path) as opened:
         for number in range(21, 40):
-            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)})
-        shutil.copytree(path, path.parent / "copy", ignore=shutil.ignore_patterns("*-shm", "holder.json"))
-    copy = path.parent / "copy"
+            add(opened, number)
+        copy = as_after_a_crash(opened, tmp_path / "copy")
     log = (copy / "journal.sqlite-wal").read_bytes()
     assert len(log) > 10 * 4096
     (copy / "journal.sqlite").unlink()
@@ -382,12 +337,11 @@ def test_a_log_without_its_journal_never_meets_the_new_one(path):
     assert agrees(copy, kept=15, base=15, latest=15, lost=range(1, 16))
 
 
-def test_what_the_log_holds_is_kept_with_the_damaged_journal(path):
+def test_what_the_log_holds_is_kept_with_the_damaged_journal(path, tmp_path):
     with Store.open(path) as opened:
         for number in range(21, 25):
-            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
-        shutil.copytree(path, path.parent / "copy", ignore=shutil.ignore_patterns("*-shm", "holder.json"))
-    copy = path.parent / "copy"
+            add(opened, number)
+        copy = as_after_a_crash(opened, tmp_path / "copy")
     spoil(copy, 2)
     log, main = (copy / "journal.sqlite-wal").read_bytes(), (copy / "journal.sqlite").read_bytes()
     done = repair_store(copy)
@@ -395,7 +349,7 @@ def test_what_the_log_holds_is_kept_with_the_damaged_journal(path):
     assert agrees(copy, kept=24, latest=10)
     assert done.aside.read_bytes() == main
     assert (copy / "journal.sqlite.damaged-wal").read_bytes() == log
-    # And can be read there, with all its rows, by whoever looks into it.
+    # And whoever looks into it there can read it, with all its rows.
     with closing(sqlite3.connect(done.aside)) as connection:
         assert connection.execute("SELECT count(*) FROM record").fetchone() == (24,)
 
@@ -403,14 +357,14 @@ def test_what_the_log_holds_is_kept_with_the_damaged_journal(path):
 def test_a_journal_of_another_store_keeps_its_rows_and_no_generation_of_this_one(path, tmp_path):
     with Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
         for number in range(1, 4):
-            other.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
+            add(other, number)
         for upto in (2, 3):
-            other.commit(state(upto), upto=upto, chunks={"rows": 25})
+            commit(other.commit, upto)
     shutil.copy(tmp_path / "other" / "journal.sqlite", path / "journal.sqlite")
-    assert "another identity" in " ".join(one.what for one in damage(path))
+    assert "another identity" in " ".join(problem.what for problem in damage(path))
     done = repair_store(path)
     assert done.kept == 3
-    assert sorted(entry.name for entry in (path / "generations").iterdir()) == ["00000001.damaged", "00000002.damaged"]
+    assert folders(path) == ["00000001.damaged", "00000002.damaged"]
     assert damage(path) == []
     with Store.open(path) as opened:
         assert opened.identity == IDENTITY | {"other": True}
@@ -426,15 +380,14 @@ def test_damaged_journals_are_never_written_over(path):
         done = repair_store(path)
         assert done.aside == path / expected
         assert done.kept == last - 1
-    assert len([one for one in check_store(path) if one.kind == "leftover"]) >= 3
+    assert len([problem for problem in check_store(path) if problem.kind == "leftover"]) >= 3
     assert agrees(path, kept=17, latest=15)
 
 
 def test_what_a_repair_lost_is_noted_in_the_journal(path):
     change(path, "DELETE FROM record WHERE sequence = 8")
     done = repair_store(path)
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection:
-        (noted,) = connection.execute("SELECT value FROM meta WHERE key = 'repaired'").fetchone()
+    ((noted,),) = query(path, "SELECT value FROM meta WHERE key = 'repaired'")
     assert json.loads(noted) == {
         "aside": "journal.sqlite.damaged",
         "heads": [[8, 8]],
@@ -457,66 +410,26 @@ def test_while_a_writer_has_it_nothing_is_done(path):
     assert repair_store(path).kept == 17
 
 
-def test_where_there_is_no_store_none_is_repaired(tmp_path):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "thesis.txt").write_text("mine")
-    (tmp_path / "database").mkdir()
-    with closing(sqlite3.connect(tmp_path / "database" / "journal.sqlite")) as connection:
-        connection.execute("CREATE TABLE mine (x)")
-    (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    before = contents(tmp_path)
-    for name in ("folder", "database", "loop", "nothing"):
-        with pytest.raises(NotAStoreError, match=name):
-            repair_store(tmp_path / name)
-    assert contents(tmp_path) == before
+def test_a_folder_that_may_not_be_written_is_left(path, small_disk):
+    change(path, "DELETE FROM record WHERE sequence = 18")
+    shutil.copytree(path, small_disk / "s")
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with pytest.raises(ReadOnlyError):
+        repair_store(small_disk / "s")
+    assert "row 18 is missing" in " ".join(problem.what for problem in damage(small_disk / "s"))
 
 
-def test_a_newer_format_is_not_touched(path):
-    change(path, "PRAGMA user_version = 2", "DELETE FROM meta WHERE key = 'format'")
-    before = contents(path)
-    with pytest.raises(VersionError):
-        repair_store(path)
-    assert contents(path) == before
-
-
-def test_a_folder_that_may_not_be_written_is_left(path, tmp_path):
-    mount, command = tmp_path / "disk", shutil.which("mount")
-    mount.mkdir()
-    arguments = [command, "-t", "tmpfs", "-o", "size=2m", "tmpfs", mount]
-    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
-        pytest.skip("no file system can be mounted here")
-    try:
-        change(path, "DELETE FROM record WHERE sequence = 18")
-        shutil.copytree(path, mount / "s")
-        subprocess.run(["mount", "-o", "remount,ro", mount], check=True)
-        assert "row 18 is missing" in " ".join(one.what for one in damage(mount / "s"))
-        with pytest.raises(ReadOnlyError):
-            repair_store(mount / "s")
-        assert "row 18 is missing" in " ".join(one.what for one in damage(mount / "s"))
-    finally:
-        subprocess.run(["umount", mount], check=True)
-
-
-def test_a_full_disk_leaves_the_damaged_store_as_it_was(path, tmp_path):
-    mount, command = tmp_path / "disk", shutil.which("mount")
-    mount.mkdir()
-    arguments = [command, "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount]
-    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
-        pytest.skip("no file system can be mounted here")
-    try:
-        change(path, "DELETE FROM record WHERE sequence = 18")
-        shutil.copytree(path, mount / "s")
-        free = shutil.disk_usage(mount).free
-        (mount / "ballast").write_bytes(bytes(free - 3 * 4096))
-        journal = (mount / "s" / "journal.sqlite").read_bytes()
-        with pytest.raises(store.StoreFullError):
-            repair_store(mount / "s")
-        assert (mount / "s" / "journal.sqlite").read_bytes() == journal
-        (mount / "ballast").unlink()
-        assert repair_store(mount / "s").kept == 17
-        assert agrees(mount / "s", kept=17, latest=15)
-    finally:
-        subprocess.run(["umount", mount], check=True)
+def test_a_full_disk_leaves_the_damaged_store_as_it_was(path, small_disk):
+    change(path, "DELETE FROM record WHERE sequence = 18")
+    shutil.copytree(path, small_disk / "s")
+    (small_disk / "ballast").write_bytes(bytes(shutil.disk_usage(small_disk).free - 3 * 4096))
+    journal = (small_disk / "s" / "journal.sqlite").read_bytes()
+    with pytest.raises(StoreFullError):
+        repair_store(small_disk / "s")
+    assert (small_disk / "s" / "journal.sqlite").read_bytes() == journal
+    (small_disk / "ballast").unlink()
+    assert repair_store(small_disk / "s").kept == 17
+    assert agrees(small_disk / "s", kept=17, latest=15)
 
 
 class KilledError(BaseException):
@@ -547,13 +460,13 @@ def steps_of(monkeypatch, at):
 
 
 @pytest.mark.parametrize("how", ["row", "row and generation", "no journal", "description"])
-def test_killed_before_any_step_it_can_be_begun_again(made, tmp_path, monkeypatch, how):
-    source = shutil.copytree(made[how == "description"], tmp_path / "source")
+def test_killed_before_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch, how):
+    source = shutil.copytree(stores[how == "description"], tmp_path / "source")
     if how == "no journal":
         (source / "journal.sqlite").unlink()
     elif how == "description":
         spoil(source, 2, "zarr.json")
-        assert [one.kind for one in damage(source)] == ["spare"]
+        assert [problem.kind for problem in damage(source)] == ["spare"]
     else:
         change(source, "DELETE FROM payload WHERE sequence IN (8, 18)")
     if how == "row and generation":
@@ -594,8 +507,8 @@ def test_killed_before_any_step_it_can_be_begun_again(made, tmp_path, monkeypatc
             assert found.latest().upto == right.latest().upto
         # The damaged journal is never lost on the way.
         if how != "no journal":
-            asides = [one for one in path.iterdir() if one.name.startswith("journal.sqlite.damaged")]
-            assert (source / "journal.sqlite").read_bytes() in [one.read_bytes() for one in asides]
+            asides = [file for file in path.iterdir() if file.name.startswith("journal.sqlite.damaged")]
+            assert (source / "journal.sqlite").read_bytes() in [file.read_bytes() for file in asides]
     assert interrupted >= 8
 
 
@@ -606,7 +519,7 @@ def test_what_an_interrupted_repair_made_is_not_believed_after_the_store_went_on
         repair_store(path)
     assert (path / "journal.sqlite.repaired").exists()
     with Store.open(path) as opened:
-        opened.append("a", "row 21", b"")
+        add(opened, 21)
     assert not (path / "journal.sqlite.repaired").exists()
     (path / "journal.sqlite").unlink()
     assert repair_store(path).kept == 15

@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from store_builds import as_after_a_crash, damage
 
 from store import DamageError, Store, check_store, repair_store
 from store.writeahead import FRAME_BYTES, HEADER_BYTES, damaged_frame, mend_log
@@ -27,7 +28,7 @@ def crashed(tmp_path_factory):
             sizes.append((home / "s" / "journal.sqlite-wal").stat().st_size)
             if number == 20:
                 opened.commit({"x": np.arange(20)}, upto=20)
-        shutil.copytree(home / "s", home / "c", ignore=shutil.ignore_patterns("*-shm", "lock", "holder.json"))
+        as_after_a_crash(opened, home / "c")
     return home / "c", sizes
 
 
@@ -82,7 +83,7 @@ def test_a_flipped_bit_is_found_before_sqlite_drops_the_rows_behind_it(crashed, 
         assert log_of(copy).read_bytes() == data
         done = repair_store(copy)
         assert (done.aside.parent / (done.aside.name + "-wal")).read_bytes() == data
-        assert [one for one in check_store(copy) if one.kind != "leftover"] == []
+        assert damage(copy) == []
         # All, but where the newest version of a row behind the generation was hit; of one before it, its arrays.
         assert right(copy) == done.kept >= 20
         assert (done.kept == ROWS) == all("retracted" in lost for lost in done.lost)

@@ -1,13 +1,13 @@
 """Compaction: a base stands for rows that have given up their arrays."""
 
 import logging
-import shutil
 import sqlite3
 import threading
 from contextlib import closing
 
 import numpy as np
 import pytest
+from store_builds import as_after_a_crash, change, folders, query
 
 import store.generations
 from store import CompactedError, DamageError, RecordError, Store, StoreError
@@ -38,18 +38,13 @@ def opened(tmp_path):
         yield fresh
 
 
-def folders(opened):
-    return sorted(entry.name for entry in (opened.path / "generations").iterdir())
-
-
 def spoil(opened, number):
     chunk = opened.path / "generations" / f"{number:08d}" / "bulk" / "c" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-1])
 
 
 def payloads(path):
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection:
-        return [row[0] for row in connection.execute("SELECT sequence FROM payload ORDER BY sequence")]
+    return [sequence for (sequence,) in query(path, "SELECT sequence FROM payload ORDER BY sequence")]
 
 
 def agrees(opened, compacted, last=LAST):
@@ -117,21 +112,21 @@ def test_the_base_stays_while_generations_come_and_go(opened):
         opened.commit(sums(number), upto=number)
         assert agrees(opened, 5, number)
         assert opened.base().number == base
-    assert len(folders(opened)) == 3  # the current, the one before it, and the base
+    assert len(folders(opened.path)) == 3  # the current, the one before it, and the base
     with Store.open(opened.path, mode="read") as reader:
         assert agrees(reader, 5, LAST + 5)
 
 
 def test_a_compaction_leaves_the_newest_generation_and_the_base_only(opened):
     """One older than the newest would need arrays that are gone to be gone on from."""
-    assert folders(opened) == ["00000001", "00000002"]
+    assert folders(opened.path) == ["00000001", "00000002"]
     opened.compact(sums(5), upto=5)
-    assert folders(opened) == ["00000002", "00000003"]
+    assert folders(opened.path) == ["00000002", "00000003"]
     add(opened, LAST + 1)
     opened.commit(sums(LAST + 1), upto=LAST + 1)
-    assert folders(opened) == ["00000002", "00000003", "00000004"]
+    assert folders(opened.path) == ["00000002", "00000003", "00000004"]
     opened.compact(sums(9), upto=9)
-    assert folders(opened) == ["00000004", "00000005"]
+    assert folders(opened.path) == ["00000004", "00000005"]
     assert agrees(opened, 9, LAST + 1)
 
 
@@ -175,7 +170,7 @@ def test_a_damaged_base_is_named_and_the_newest_generation_gone_on_from(opened, 
     for number in range(LAST + 1, LAST + 4):
         add(opened, number)
         opened.commit(sums(number), upto=number)
-    assert "00000003" in folders(opened)
+    assert "00000003" in folders(opened.path)
     assert caplog.records == []
 
 
@@ -202,8 +197,7 @@ def test_a_damaged_newest_generation_is_passed_over_for_the_base(opened, caplog)
 @pytest.mark.parametrize("assignment", ["base = 0", "upto = 6", "checksum = x''", "base = 7"])
 def test_a_damaged_row_of_the_base_is_not_believed(opened, assignment, caplog):
     opened.compact(sums(5), upto=5)
-    with closing(sqlite3.connect(opened.path / "journal.sqlite")) as connection, connection:
-        connection.execute(f"UPDATE generation SET {assignment} WHERE number = 3")
+    change(opened.path, f"UPDATE generation SET {assignment} WHERE number = 3")
     assert opened.compacted == 0
     with pytest.raises(DamageError, match="the arrays of row 1 are missing"):
         list(opened.records())
@@ -218,13 +212,12 @@ def test_a_damaged_row_of_the_base_is_not_believed(opened, assignment, caplog):
         add(opened, number)
         opened.commit(sums(number), upto=number)
     # Nobody knows what it was, so it stays for a repair to find.
-    assert "00000003" in folders(opened)
+    assert "00000003" in folders(opened.path)
 
 
 def test_a_row_that_passes_for_a_base_is_not_believed(opened, caplog):
     """A flipped bit in `base` of a generation that is none."""
-    with closing(sqlite3.connect(opened.path / "journal.sqlite")) as connection, connection:
-        connection.execute("UPDATE generation SET base = 1 WHERE number = 2")
+    change(opened.path, "UPDATE generation SET base = 1 WHERE number = 2")
     assert opened.compacted == 0
     assert len(list(opened.records())) == LAST
     assert opened.latest().upto == 8
@@ -254,18 +247,18 @@ def test_a_crash_between_two_steps_leaves_all_of_it_or_none(opened, monkeypatch,
         with pytest.raises(CrashError):
             opened.compact(sums(5), upto=5)
     # Both as another process would find it, and in this one, which goes on.
-    shutil.copytree(opened.path, tmp_path / "copy", ignore=shutil.ignore_patterns("*-shm", "lock", "holder.json"))
+    as_after_a_crash(opened, tmp_path / "copy")
     with Store.open(tmp_path / "copy", mode="read") as reader:
         assert agrees(reader, 5 if done else 0)
     with Store.open(tmp_path / "copy") as again:
         assert agrees(again, 5 if done else 0)
-        assert len(folders(again)) == 2
+        assert len(folders(again.path)) == 2
     assert agrees(opened, 5 if done else 0)
     assert opened.latest().upto == LAST
     opened.commit(sums(LAST), upto=LAST)
     opened.compact(sums(6), upto=6)
     assert agrees(opened, 6)
-    assert len(folders(opened)) == 2
+    assert len(folders(opened.path)) == 2
 
 
 def test_a_failed_transaction_keeps_its_folder_until_it_is_certain_that_nothing_names_it(opened, monkeypatch):
@@ -274,10 +267,10 @@ def test_a_failed_transaction_keeps_its_folder_until_it_is_certain_that_nothing_
         broken.setattr(opened._journal, "make_current", crash)
         with pytest.raises(CrashError):
             opened.commit(sums(LAST), upto=LAST)
-    assert folders(opened) == ["00000001", "00000002", "00000003"]
+    assert folders(opened.path) == ["00000001", "00000002", "00000003"]
     assert opened.latest().number == 2
     assert opened.commit(sums(LAST), upto=LAST) == 4
-    assert folders(opened) == ["00000002", "00000004"]
+    assert folders(opened.path) == ["00000002", "00000004"]
 
 
 def test_space_that_cannot_be_given_back_is_no_failure(opened, monkeypatch, caplog):

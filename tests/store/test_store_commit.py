@@ -7,23 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from store_builds import folders
 
 import store.generations
 import store.groups
-import store.generations
 from store import DamageError, Store, StoreError
 
 ONE = {"x": np.arange(10)}
-
-
-@pytest.fixture
-def opened(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as fresh:
-        yield fresh
-
-
-def folders(opened):
-    return sorted(entry.name for entry in (opened.path / "generations").iterdir())
 
 
 class Gate:
@@ -43,7 +33,7 @@ class Gate:
 
 def test_the_current_and_the_one_before_it_are_kept(opened):
     assert [opened.commit(ONE, upto=0) for _ in range(4)] == [1, 2, 3, 4]
-    assert folders(opened) == ["00000003", "00000004"]
+    assert folders(opened.path) == ["00000003", "00000004"]
 
 
 def test_committing_later_gives_what_committing_gives(opened):
@@ -112,7 +102,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
     if surface.__code__.co_names != ("close",):
         opened.flush()
-        assert folders(opened) == []
+        assert folders(opened.path) == []
         assert opened.commit(ONE, upto=0) == 1
 
 
@@ -140,7 +130,7 @@ def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
             broken.setattr(store.groups, name, fail)
             with pytest.raises(StoreError, match="the disk says no"):
                 opened.commit({"x": np.arange(3)}, upto=0)
-        assert folders(opened) == ["00000001"]
+        assert folders(opened.path) == ["00000001"]
         assert opened.latest().arrays["x"].tobytes() == ONE["x"].tobytes()
 
 
@@ -154,9 +144,9 @@ def test_what_an_interrupted_commit_left_is_removed_by_the_next_writer(opened):
     (parent / "notes").mkdir()
     with Store.open(opened.path, mode="read") as reader:
         assert reader.latest().number == 1
-    assert folders(opened) == ["00000001", "00000002", "00000003.partial", "notes"]
+    assert folders(opened.path) == ["00000001", "00000002", "00000003.partial", "notes"]
     with Store.open(opened.path) as again:
-        assert folders(again) == ["00000001", "notes"]
+        assert folders(again.path) == ["00000001", "notes"]
         assert again.commit(ONE, upto=0) == 2
 
 

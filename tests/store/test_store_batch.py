@@ -11,10 +11,9 @@ from store import ReadOnlyError, RecordError, Store, StoreClosedError, StoreErro
 
 
 @pytest.fixture
-def opened(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as fresh:
-        fresh.append("a", "before", b"")
-        yield fresh
+def opened(opened):
+    opened.append("a", "before", b"")
+    return opened
 
 
 def labels(opened):

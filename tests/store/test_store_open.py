@@ -4,7 +4,6 @@ import errno
 import json
 import multiprocessing
 import os
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from store_builds import change, contents
 
 import store.store
 from store import (
@@ -30,10 +30,6 @@ from store import (
 )
 
 ROOT = Path(store.__file__).parents[1]
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_path):
@@ -251,8 +247,7 @@ def test_a_mode_is_read_or_write(tmp_path):
 
 def test_a_future_format_is_refused_and_not_touched(tmp_path):
     Store.open(tmp_path, identity={}).close()
-    with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as connection:
-        connection.execute("PRAGMA user_version = 7")
+    change(tmp_path, "PRAGMA user_version = 7")
     before = contents(tmp_path)
     for mode in ("read", "write"):
         with pytest.raises(VersionError, match=r"format 7; .* up to format 1: upgrade"):
@@ -291,19 +286,6 @@ def test_generations_without_a_journal_are_not_taken_for_an_empty_folder(tmp_pat
     (tmp_path / "journal.sqlite").unlink()
     with pytest.raises(DamageError, match="generations but no"):
         Store.open(tmp_path, identity={})
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of one megabyte, which only root may mount."""
-    mount = tmp_path / "disk"
-    mount.mkdir()
-    command = shutil.which("mount")
-    arguments = [command, "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount]
-    if command is None or subprocess.run(arguments, capture_output=True, check=False).returncode:
-        pytest.skip("no small file system can be mounted here")
-    yield mount
-    subprocess.run(["umount", mount], check=True)
 
 
 def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):

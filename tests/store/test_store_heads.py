@@ -1,31 +1,23 @@
 """Rows without their arrays, and single rows."""
 
-import sqlite3
-from contextlib import closing
-
 import numpy as np
 import pytest
+from store_builds import change
 
 import store.journal
 from store import CompactedError, DamageError, Head, Record, RecordError, Store
 
 
 @pytest.fixture
-def opened(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as fresh:
-        for number in range(1, 11):
-            kind, label = ("add", "take")[number % 3 == 0], ("wool", "é'\"\U0001f9f6")[number % 2]
-            fresh.append(kind, label, bytes([number]), arrays={"x": np.arange(number)}, attributes={"n": number})
-        yield fresh
+def opened(opened):
+    for number in range(1, 11):
+        kind, label = ("add", "take")[number % 3 == 0], ("wool", "é'\"\U0001f9f6")[number % 2]
+        opened.append(kind, label, bytes([number]), arrays={"x": np.arange(number)}, attributes={"n": number})
+    return opened
 
 
 def sequences(rows):
     return [row.sequence for row in rows]
-
-
-def change(opened, statement):
-    with closing(sqlite3.connect(opened.path / "journal.sqlite")) as connection, connection:
-        connection.execute(statement)
 
 
 @pytest.mark.parametrize("together", [1, 3, 10, 4096])
@@ -69,7 +61,7 @@ def test_heads_from_before_the_beginning_are_refused(opened):
 
 
 def test_damaged_heads_are_named(opened):
-    change(opened, "UPDATE record SET time = time + 1 WHERE sequence = 6")
+    change(opened.path, "UPDATE record SET time = time + 1 WHERE sequence = 6")
     rows = opened.heads()
     assert [next(rows).sequence for _ in range(5)] == [1, 2, 3, 4, 5]
     with pytest.raises(DamageError, match="row 6 fails its checksum") as caught:
@@ -84,7 +76,7 @@ def test_damaged_heads_are_named(opened):
 @pytest.mark.parametrize("gone", ["4 AND 6", "1 AND 2", "9 AND 10"])
 def test_missing_heads_are_named_where_all_are_asked_for(opened, monkeypatch, together, gone):
     monkeypatch.setattr(store.journal, "TOGETHER", together)
-    change(opened, f"DELETE FROM record WHERE sequence BETWEEN {gone}")
+    change(opened.path, f"DELETE FROM record WHERE sequence BETWEEN {gone}")
     with pytest.raises(DamageError, match=f"rows {gone.replace('AND', 'to')} are missing"):
         list(opened.heads())
     assert set(sequences(opened.heads(kind="take"))) <= {3, 6, 9}
@@ -105,8 +97,8 @@ def test_a_record_that_is_not_there_is_refused(opened, wrong):
 
 
 def test_damage_of_one_record_is_not_that_of_another(opened):
-    change(opened, "UPDATE payload SET bytes = x'00' WHERE sequence = 4")
-    change(opened, "DELETE FROM record WHERE sequence = 5")
+    change(opened.path, "UPDATE payload SET bytes = x'00' WHERE sequence = 4")
+    change(opened.path, "DELETE FROM record WHERE sequence = 5")
     for sequence, said in ((4, "the arrays of row 4 fail"), (5, "rows 5 to 5 are missing")):
         with pytest.raises(DamageError, match=said):
             opened.record(sequence)

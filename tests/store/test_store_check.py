@@ -9,54 +9,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from store_builds import LAST, add, change, commit, contents, damage, flip, folders, state, values
 
 import store.schema
 from store import DamageError, NotAStoreError, Problem, Store, StoreError, VersionError, check_store, repair_store
 
-LAST = 20
-
-
-def values(number):
-    return np.random.default_rng(number).integers(0, 2**40, 200)
-
-
-def state(upto):
-    return {"sum": np.array(upto), "rows": np.arange(400.0).reshape(100, 4) + upto, "names": np.array(["wool", "é"])}
-
-
-@pytest.fixture(scope="module", params=["plain", "compacted"])
-def made(request, tmp_path_factory):
-    """Twenty rows, generations up to rows 10 and 15, and, where compacted, a base up to row 6 in place of the first."""
-    path = tmp_path_factory.mktemp("made") / "s"
-    with Store.open(path, identity={"for": "checks"}) as opened:
-        for number in range(1, LAST + 1):
-            opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)})
-            if number in (10, 15):
-                opened.commit(state(number), upto=number, chunks={"rows": 25})
-            if number == 15 and request.param == "compacted":
-                opened.compact(state(6), upto=6, chunks={"rows": 25})
-    return path
-
 
 @pytest.fixture
-def path(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "s")
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def change(path, *statements):
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
-        for statement in statements:
-            connection.execute(statement)
-
-
-def flip(file, place=-9, bit=2):
-    data = bytearray(file.read_bytes())
-    data[place] ^= 1 << bit
-    file.write_bytes(data)
+def path(either):
+    return either
 
 
 def newest(path):
@@ -64,12 +25,16 @@ def newest(path):
 
 
 def older(path):
-    (found,) = [one for one in (path / "generations").iterdir() if one != newest(path)]
-    return found
+    (name,) = [name for name in folders(path) if name != newest(path).name]
+    return path / "generations" / name
 
 
 def texts(problems):
-    return " | ".join(f"{one.kind}: {one.what}" for one in problems)
+    return " | ".join(f"{problem.kind}: {problem.what}" for problem in problems)
+
+
+def found(path):
+    return texts(check_store(path))
 
 
 def test_a_sound_store_has_no_problems_and_stays_as_it_is(path):
@@ -120,10 +85,10 @@ HEADS = {
 def test_damaged_rows_are_lost(path, statement, said):
     change(path, statement)
     problems = check_store(path)
-    assert {one.path for one in problems} == {path / "journal.sqlite"}
+    assert {problem.path for problem in problems} == {path / "journal.sqlite"}
     assert f"lost: {said}" in texts(problems)
     # The arrays that belong to a missing row are told of, too, but not as another loss.
-    assert [one.kind for one in problems].count("lost") == 1
+    assert [problem.kind for problem in problems].count("lost") == 1
 
 
 def test_exchanged_arrays_are_found(path):
@@ -139,8 +104,8 @@ def test_exchanged_arrays_are_found(path):
 
 def test_arrays_too_many_are_found(path):
     change(path, "INSERT INTO payload VALUES (25, x'00')")
-    assert "rows 21 to 25 are missing" in texts(check_store(path))
-    assert "holds arrays of row 25 that no row has" in texts(check_store(path))
+    assert "rows 21 to 25 are missing" in found(path)
+    assert "holds arrays of row 25 that no row has" in found(path)
 
 
 def test_arrays_that_were_given_up_and_are_there_are_found(path):
@@ -175,22 +140,22 @@ def spoil_chunk(folder, chunk):
     file.write_bytes(data)
 
 
-@pytest.mark.parametrize("which", [newest, older])
+@pytest.mark.parametrize("choose", [newest, older])
 @pytest.mark.parametrize(("spoil", "said"), GENERATIONS.values(), ids=GENERATIONS)
-def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said, which):
-    folder = which(path)
+def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said, choose):
+    folder = choose(path)
     spoil(folder)
     problems = check_store(path)
     assert said in texts(problems)
-    assert all(one.path.is_relative_to(folder) and str(one.path) in one.what for one in problems)
+    assert all(problem.path.is_relative_to(folder) and str(problem.path) in problem.what for problem in problems)
     base = folder.name == "00000003"
-    assert {one.kind for one in problems} == {"lost" if base else "spare"}
+    assert {problem.kind for problem in problems} == {"lost" if base else "spare"}
 
 
 def test_every_damaged_chunk_is_named_and_no_other(path):
     for chunk in (0, 3):
         spoil_chunk(newest(path), chunk)
-    assert [one.what.split(" (")[0] for one in check_store(path)] == ["chunk 0", "chunk 3"]
+    assert [problem.what.split(" (")[0] for problem in check_store(path)] == ["chunk 0", "chunk 3"]
 
 
 def test_the_only_copy_of_a_state_is_lost(path):
@@ -198,7 +163,7 @@ def test_the_only_copy_of_a_state_is_lost(path):
     shutil.rmtree(older(path))
     shutil.rmtree(newest(path))
     change(path, "UPDATE record SET label = 'z' WHERE sequence = 9")
-    kinds = {one.path.parent.name: one.kind for one in check_store(path)}
+    kinds = {problem.path.parent.name: problem.kind for problem in check_store(path)}
     assert kinds[newest(path).name] == "lost"
 
 
@@ -218,7 +183,7 @@ def test_what_a_group_says_of_itself_is_checked(path):
 def test_a_generation_in_anothers_place_is_found(path):
     shutil.rmtree(newest(path))
     shutil.copytree(older(path), newest(path))
-    assert "is of another generation, or of another store" in texts(check_store(path))
+    assert "is of another generation, or of another store" in found(path)
 
 
 def test_a_generation_of_another_store_is_found(path, tmp_path):
@@ -228,7 +193,7 @@ def test_a_generation_of_another_store_is_found(path, tmp_path):
             other.commit(state(upto), upto=upto, chunks={"rows": 25})
     shutil.rmtree(newest(path))
     shutil.copytree(newest(tmp_path / "other"), newest(path))
-    assert "it says another identity: {'for': 'other checks'}" in texts(check_store(path))
+    assert "it says another identity: {'for': 'other checks'}" in found(path)
 
 
 @pytest.mark.parametrize("assignment", ["upto = 99", "content = '{}'", "checksum = x''", "base = 1 - base", "time = 0"])
@@ -238,7 +203,7 @@ def test_a_damaged_row_of_a_generation_is_spare_where_the_group_knows_better(pat
     assert (problem.kind, problem.path) == ("spare", path / "journal.sqlite")
     assert "the row of generation 2" in problem.what
     shutil.rmtree(newest(path))
-    assert "the row of generation 2" in texts(check_store(path))
+    assert "the row of generation 2" in found(path)
 
 
 TYPES = [
@@ -277,7 +242,7 @@ def test_a_value_of_another_type_is_damage_and_no_surprise(tmp_path, monkeypatch
         except DamageError:
             pass
     assert repair_store(tmp_path).kept == 5
-    assert [one for one in check_store(tmp_path) if one.kind != "leftover"] == []
+    assert damage(tmp_path) == []
 
 
 META = {
@@ -325,9 +290,9 @@ def test_all_the_rest_is_checked_where_the_journal_is_malformed(path, spoil, sai
     spoil(path / "journal.sqlite")
     flip(newest(path) / "names" / "c" / "0" / "0", 20)
     before = contents(path)
-    found = texts(check_store(path))
-    assert said in found
-    assert "array 'names' of generation 2" in found
+    told = found(path)
+    assert said in told
+    assert "array 'names' of generation 2" in told
     assert contents(path).items() >= before.items()
     with pytest.raises(StoreError):
         Store.open(path)
@@ -339,7 +304,7 @@ def test_sqlites_own_structure_is_checked(path):
     # The fourth page is the root of table record; here the number of its cells.
     data[3 * 4096 + 4] ^= 1
     file.write_bytes(data)
-    assert "SQLite finds in" in texts(check_store(path))
+    assert "SQLite finds in" in found(path)
 
 
 def test_what_is_there_too_much_is_left_over_and_no_damage(path):
@@ -352,8 +317,8 @@ def test_what_is_there_too_much_is_left_over_and_no_damage(path):
     (path / "journal.sqlite.repaired").write_bytes(b"half")
     (path / "thesis.txt").write_text("mine")
     problems = check_store(path)
-    assert {one.kind for one in problems} == {"leftover"}
-    assert sorted(one.path.name for one in problems) == [
+    assert {problem.kind for problem in problems} == {"leftover"}
+    assert sorted(problem.path.name for problem in problems) == [
         "00000001.damaged",
         "00000009",
         "00000010.partial",
@@ -361,7 +326,7 @@ def test_what_is_there_too_much_is_left_over_and_no_damage(path):
         "journal.sqlite.repaired",
     ]
     Store.open(path).close()
-    left = {one.path.name for one in check_store(path)}
+    left = {problem.path.name for problem in check_store(path)}
     assert left == {"00000001.damaged", "journal.sqlite.damaged"}
 
 
@@ -374,12 +339,12 @@ def test_everything_that_is_wrong_is_told_at_once(path):
     )
     spoil_chunk(newest(path), 1)
     flip(older(path) / "names" / "c" / "0" / "0", 20)
-    found = texts(check_store(path))
+    told = found(path)
     for said in ("created", "row 8 fails", "row 12 has lost", "row 18 fails", "chunk 1 (rows 25", "array 'names'"):
-        assert said in found
+        assert said in told
 
 
-def test_where_there_is_no_store_none_is_checked(tmp_path):
+def test_where_there_is_no_store_none_is_checked_or_repaired(tmp_path):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "thesis.txt").write_text("mine")
@@ -390,15 +355,19 @@ def test_where_there_is_no_store_none_is_checked(tmp_path):
     (tmp_path / "empty").mkdir()
     before = contents(tmp_path)
     for name in ("file", "folder", "database", "loop", "empty", "nothing"):
-        with pytest.raises(NotAStoreError, match=name):
-            check_store(tmp_path / name)
+        for call in (check_store, repair_store):
+            with pytest.raises(NotAStoreError, match=name):
+                call(tmp_path / name)
     assert contents(tmp_path) == before
 
 
-def test_a_newer_format_is_not_judged(path):
+def test_a_newer_format_is_neither_judged_nor_touched(path):
     change(path, "PRAGMA user_version = 2", "DELETE FROM meta WHERE key = 'format'")
-    with pytest.raises(VersionError, match="format 2"):
-        check_store(path)
+    before = contents(path)
+    for call in (check_store, repair_store):
+        with pytest.raises(VersionError, match="format 2"):
+            call(path)
+    assert contents(path) == before
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="this user may read everything")
@@ -413,21 +382,21 @@ def test_a_folder_without_permission_is_no_damage(path):
 
 
 def test_a_store_that_is_being_written_is_checked_beside_the_writer(path):
-    stop, found = threading.Event(), []
+    stop, wrong = threading.Event(), []
 
     def look():
         while not stop.is_set():
-            found.extend(one for one in check_store(path) if one.kind != "leftover")
+            wrong.extend(damage(path))
 
     with Store.open(path) as opened:
         thread = threading.Thread(target=look)
         thread.start()
         for number in range(LAST + 1, LAST + 25):
-            opened.append("a", f"row {number}", b"", arrays={"x": values(number)})
-            opened.commit(state(number), upto=number, chunks={"rows": 25})
+            add(opened, number)
+            commit(opened.commit, number)
             if number % 4 == 0:
-                opened.compact(state(number - 2), upto=number - 2)
+                commit(opened.compact, number - 2)
         stop.set()
         thread.join()
-    assert found == []
+    assert wrong == []
     assert check_store(path) == []

@@ -170,63 +170,61 @@ def decode_payload(payload: bytes) -> dict[str, np.ndarray]:
     Raises VersionError for a payload of a newer version and ValueError for bytes that are no payload.
     """
     try:
-        return _Reader(payload).arrays()
+        return _decode(_Cursor(payload))
     except (struct.error, UnicodeDecodeError, RuntimeError, TypeError) as error:
         raise ValueError(f"not a payload of arrays: {error}") from error
 
 
-class _Reader:
+class _Cursor:
     def __init__(self, payload: bytes) -> None:
-        self.payload = memoryview(payload)
-        self.position = 0
-
-    def unpack(self, layout: str) -> tuple[int, ...]:
-        values = struct.unpack_from(layout, self.payload, self.position)
-        self.position += struct.calcsize(layout)
-        return values
+        self._payload, self._position = memoryview(payload), 0
 
     def take(self, length: int) -> bytes:
-        part = bytes(self.payload[self.position : self.position + length])
+        part = bytes(self._payload[self._position : self._position + length])
         if len(part) != length:
             raise ValueError("the payload ends early")
-        self.position += length
+        self._position += length
         return part
+
+    def unpack(self, layout: str) -> tuple[int, ...]:
+        return struct.unpack(layout, self.take(struct.calcsize(layout)))
 
     def text(self) -> str:
         return self.take(*self.unpack("<B")).decode("ascii")
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        if self.take(4) != MAGIC:
-            raise ValueError("the payload does not start with its magic number")
-        version, count = self.unpack("<BH")
-        if version > PAYLOAD_VERSION:
-            raise VersionError(
-                f"a record's arrays are written in payload format {version}; this release reads up to "
-                f"{PAYLOAD_VERSION}: upgrade it"
-            )
-        described = [self._description() for _ in range(count)]
-        return {name: self._array(array, codec, stored) for name, array, codec, stored in described}
 
-    def _description(self) -> tuple[str, np.ndarray, int, int]:
-        name, dtype = self.text(), self.text()
-        (dimensions,) = self.unpack("<B")
-        shape = self.unpack(f"<{dimensions}Q")
-        codec, size, stored = self.unpack("<BQQ")
-        array = np.empty(shape, np.dtype(dtype))
+def _decode(cursor: _Cursor) -> dict[str, np.ndarray]:
+    if cursor.take(4) != MAGIC:
+        raise ValueError("the payload does not start with its magic number")
+    version, count = cursor.unpack("<BH")
+    if version > PAYLOAD_VERSION:
+        raise VersionError(
+            f"a record's arrays are written in payload format {version}; this release reads up to "
+            f"{PAYLOAD_VERSION}: upgrade it"
+        )
+    described = []
+    for _ in range(count):
+        name, dtype = cursor.text(), cursor.text()
+        (dimensions,) = cursor.unpack("<B")
+        array = np.empty(cursor.unpack(f"<{dimensions}Q"), np.dtype(dtype))
+        codec, size, stored = cursor.unpack("<BQQ")
         if array.nbytes != size:
             raise ValueError(f"array {name!r} of {array.nbytes} bytes is said to have {size}")
-        return name, array, codec, stored
+        described.append((name, array, codec, stored))
+    for _, array, codec, stored in described:
+        _fill(array, codec, cursor.take(stored))
+    return {name: array for name, array, _, _ in described}
 
-    def _array(self, array: np.ndarray, codec: int, stored: int) -> np.ndarray:
-        buffer, target = self.take(stored), flat_bytes(array)
-        if codec == RAW:
-            target[:] = np.frombuffer(buffer, np.uint8)
-        elif codec == BLOSC:
-            from numcodecs import blosc
 
-            if struct.unpack_from("<I", buffer, 4)[0] != array.nbytes:
-                raise ValueError("a compressed array has another length than its description")
-            blosc.decompress(buffer, target)
-        else:
-            raise ValueError(f"unknown codec {codec}")
-        return array
+def _fill(array: np.ndarray, codec: int, buffer: bytes) -> None:
+    target = flat_bytes(array)
+    if codec == RAW:
+        target[:] = np.frombuffer(buffer, np.uint8)
+    elif codec == BLOSC:
+        from numcodecs import blosc
+
+        if struct.unpack_from("<I", buffer, 4)[0] != array.nbytes:
+            raise ValueError("a compressed array has another length than its description")
+        blosc.decompress(buffer, target)
+    else:
+        raise ValueError(f"unknown codec {codec}")

@@ -13,11 +13,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from store.exceptions import DamageError, StoreError, reported
+from store.exceptions import DamageError, RecordError, StoreError, reported
 from store.files import remove_tree
 from store.groups import PARTIAL, GroupReader, folder_name, write_group
 from store.journal import Journal
 from store.records import Generation, GenerationRow, from_json
+from store.schema import GENERATIONS
 
 __all__ = ["Generations", "highest_number", "numbers", "remove_others"]
 
@@ -33,19 +34,29 @@ Commit = tuple[Mapping[str, np.ndarray], int, str, Mapping[str, int]]
 
 
 class Generations:
-    """The generations in folder `parent` that the journal names. The methods are `Store`'s of the same names."""
+    """The generations of the store in `folder` that the journal names. `Store` has methods of the same names."""
 
-    def __init__(self, parent: Path, journal: Journal) -> None:
-        self._parent = parent
+    def __init__(self, folder: Path, journal: Journal) -> None:
+        self._folder = folder
+        self._parent = folder / GENERATIONS
         self._journal = journal
         self._committing = threading.Lock()
         # Numbers of generations that failed to verify: they do not count as a fallback.
         self._spoilt: set[int] = set()
-        self._worker = ThreadPoolExecutor(1, f"store commit {parent.parent.name}")
+        self._worker = ThreadPoolExecutor(1, f"store commit {folder.name}")
         self._queue = threading.Lock()
         self._waiting: Commit | None = None
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
+        for row in journal.generations():
+            if not row.sound:
+                # It may be the base's: nothing else would show that until a generation behind it is damaged, too.
+                logger.warning(
+                    "%s: the row of generation %s fails its checksum and does not count: check_store tells what it is "
+                    "needed for",
+                    folder,
+                    row.number,
+                )
 
     def latest(self) -> Generation | None:
         """Return the newest generation that verifies, None when there is none."""
@@ -73,7 +84,7 @@ class Generations:
         )
         if rows is None:
             wanted = "no generation" if number is None else f"generation {number} no longer"
-            raise StoreError(f"{self._parent.parent} has {wanted}: look at the newest again, with latest()")
+            raise StoreError(f"{self._folder} has {wanted}: look at the newest again, with latest()")
         return rows
 
     def _find(self, wanted: Callable[[GenerationRow], bool]) -> GenerationRow | None:
@@ -133,6 +144,27 @@ class Generations:
         bases = [row for row in earlier if row.sound and row.base]
         return sound[: KEPT_GENERATIONS - 1] + bases[:1] + [row for row in earlier if not row.sound]
 
+    def compact(self, arrays: Mapping[str, np.ndarray], upto: int, attributes: str, chunks: Mapping[str, int]) -> None:
+        """Commit a base; raise DamageError or RecordError where no sound generation with all rows is beside it."""
+        newest, named = self.latest(), self._journal.newest()
+        if named is not None and (newest is None or newest.number != named):
+            raise DamageError(
+                f"{self._folder} cannot be compacted: generation {named}, which has to be whole beside the base, could "
+                "not be read back; nothing was given up. Commit another, and compact again",
+                path=self._parent / folder_name(named),
+            )
+        if newest is None or newest.upto != self._journal.last():
+            there = "there is none" if newest is None else f"the newest has those up to {newest.upto}"
+            raise RecordError(
+                f"{self._folder} can be compacted only beside a generation with all {self._journal.last()} records; "
+                f"{there}: commit one first"
+            )
+        self.commit(arrays, upto, attributes, chunks, base=True)
+        try:
+            self._journal.shrink()
+        except StoreError as error:
+            logger.warning("%s: the space was not given back yet: %s", self._folder, error)
+
     def commit_later(self, commit: Commit) -> None:
         """Do `commit` in a background thread; a newer one takes the place of one that still waits.
 
@@ -150,7 +182,7 @@ class Generations:
         try:
             self.commit(*commit)
         except Exception as error:
-            logger.exception("%s: a background commit failed; the journal still holds its rows", self._parent.parent)
+            logger.exception("%s: a background commit failed; the journal still holds its rows", self._folder)
             self._failure = error
 
     def wait(self) -> None:

@@ -38,20 +38,13 @@ HEADER_LENGTH = 100
 # the change for which the count of pages was made.
 CHANGE_AT, PAGES_AT, FREE_AT, VERSION_AT, APPLICATION_AT, COUNTED_AT = 24, 28, 32, 60, 68, 92
 
-# What every journal's header says, and where; between these, and behind, are counts that change. `log` is 2
-# for a write-ahead log, and 1 without one, which another program may have made of it; `spare` are the bytes
+# What every journal's header says at offsets 0 and 44; between these, and behind, are counts that change. `log`
+# is 2 for a write-ahead log, and 1 without one, which another program may have made of it; `spare` are the bytes
 # kept free at the end of a page, of which Apple's builds of SQLite want 12.
-FIXED = (
-    (
-        0,
-        tuple(
-            SQLITE_MAGIC + struct.pack(">H6B", PAGE_BYTES, log, log, spare, 64, 32, 32)
-            for log in (2, 1)
-            for spare in (0, 12)
-        ),
-    ),
-    (44, (struct.pack(">7I", 4, 0, 0, 1, FORMAT_VERSION, 0, APPLICATION_ID) + bytes(20),)),
+BEGINNINGS = tuple(
+    SQLITE_MAGIC + struct.pack(">H6B", PAGE_BYTES, log, log, spare, 64, 32, 32) for log in (2, 1) for spare in (0, 12)
 )
+FORMAT = struct.pack(">7I", 4, 0, 0, 1, FORMAT_VERSION, 0, APPLICATION_ID) + bytes(20)
 
 
 def holds_store(folder: Path) -> bool:
@@ -131,7 +124,7 @@ def _require_ours(journal: Path, header: bytes) -> None:
 def header_fault(journal: Path) -> str | None:
     """Return in words what is wrong with the header of a journal, None for a sound one. A writer may be at work."""
     header = _header(journal)
-    if len(header) < HEADER_LENGTH or not all(header.startswith(wanted, at) for at, wanted in FIXED):
+    if len(header) < HEADER_LENGTH or not (header.startswith(BEGINNINGS) and header.startswith(FORMAT, 44)):
         return f"{journal} does not begin as a journal of format {FORMAT_VERSION}"
     (pages,) = struct.unpack_from(">I", header, PAGES_AT)
     size = file_size(journal)

@@ -99,13 +99,16 @@ def check_text(what: str, text: str) -> str:
         raise RecordError(f"{what} must be a str, not {type(text).__name__}")
     if "\0" in text:
         raise RecordError(f"{what} {text!r} contains a NUL character, at which many readers would cut it off")
+    return _check_pairs(what, text)
+
+
+def _check_pairs(what: str, text: str) -> str:
+    # UTF-8 has no form for half of a surrogate pair, and two halves in JSON would come back as one character.
     try:
         text.encode("utf-8")
     except UnicodeEncodeError as error:
-        raise RecordError(
-            f"{what} {text!r} has no UTF-8 form: position {error.start} holds half of a surrogate pair"
-        ) from error
-    return text
+        raise RecordError(f"{what} {text!r} holds half of a surrogate pair at position {error.start}") from error
+    return str(text)
 
 
 def check_key(key: bytes) -> bytes:
@@ -154,9 +157,9 @@ def _plain(where: str, value: JSON) -> JSON:
     if isinstance(value, Mapping):
         if strange := [name for name in value if not isinstance(name, str)]:
             raise RecordError(f"{where} has the key {strange[0]!r}; JSON keys are strings")
-        return {_paired(where, name): _plain(f"{where}[{name!r}]", part) for name, part in value.items()}
+        return {_check_pairs(where, name): _plain(f"{where}[{name!r}]", part) for name, part in value.items()}
     if isinstance(value, str):
-        return _paired(where, value)
+        return _check_pairs(where, value)
     if isinstance(value, list | tuple):
         return [_plain(f"{where}[{index}]", part) for index, part in enumerate(value)]
     if value is None or isinstance(value, bool | int):
@@ -166,15 +169,6 @@ def _plain(where: str, value: JSON) -> JSON:
             raise RecordError(f"{where} is {value!r}, which JSON cannot hold; use None or a string")
         return float(value)
     raise RecordError(f"{where} is a {type(value).__name__}, not JSON: convert it, or keep it as an array")
-
-
-def _paired(where: str, text: str) -> str:
-    # Two halves of a surrogate pair beside each other would come back as one character.
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise RecordError(f"{where} holds half of a surrogate pair: {text!r}") from error
-    return str(text)
 
 
 def checksum(table: str, *fields: int | float | bytes) -> bytes:

@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -145,18 +146,16 @@ class Salvage:
             self.damage.append(f"the tables of {self.path} are not where and what they were made as")
 
     def _is_readable(self, connection: sqlite3.Connection) -> bool:
-        try:
-            return has_our_schema(connection)
-        except SQLITE_ERRORS as error:
-            self._require_damage(error)
-            self.damage.append(f"SQLite refuses to read {self.path}: {error}")
-        # With this it reads even a file that is shorter than it says; nothing is written.
-        connection.execute("PRAGMA writable_schema = ON")
-        try:
-            return has_our_schema(connection)
-        except SQLITE_ERRORS as error:
-            self._require_damage(error)
-            return False
+        # With a writable schema SQLite reads even a file that is shorter than it says; nothing is written.
+        for setting in ("OFF", "ON"):
+            try:
+                connection.execute(f"PRAGMA writable_schema = {setting}")
+                return has_our_schema(connection)
+            except SQLITE_ERRORS as error:
+                self._require_damage(error)
+                if setting == "OFF":
+                    self.damage.append(f"SQLite refuses to read {self.path}: {error}")
+        return False
 
     def _found_by_sqlite(self) -> list[str]:
         rows, whole = self._until_damage("PRAGMA integrity_check")
@@ -247,6 +246,13 @@ class Salvage:
         """Return the payload of a row, not verified, None where there is none; and whether that could be read."""
         rows, whole = self._until_damage("SELECT bytes FROM payload WHERE sequence = ?", sequence)
         found = rows[0][0] if rows else None
+        if found is None and self.damage:
+            # A damaged index leads past the row; a scan from a little before or behind it still meets it.
+            near = "SELECT bytes, sequence FROM payload WHERE sequence"
+            for side in ("> ? - 256 ORDER BY sequence", "< ? + 256 ORDER BY sequence DESC"):
+                for row in islice(self._scan(f"{near} {side}", sequence), 512):
+                    if row is not None and row[1] == sequence:
+                        found = row[0]
         # A flipped bit can also change a value's type; no payload is empty.
         return (found if found is None or isinstance(found, bytes) else b""), whole
 

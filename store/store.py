@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time as clock
@@ -17,7 +16,6 @@ import numpy as np
 from store.encoding import check_arrays, check_chunks, encode_payload
 from store.exceptions import (
     CompactedError,
-    DamageError,
     NotAStoreError,
     ReadOnlyError,
     RecordError,
@@ -27,7 +25,6 @@ from store.exceptions import (
 )
 from store.files import file_size, tree_size
 from store.generations import Generations
-from store.groups import folder_name
 from store.header import holds_store, lock_to_write
 from store.journal import Journal
 from store.lock import WriterLock
@@ -36,8 +33,6 @@ from store.schema import GENERATIONS, JOURNAL_FILE
 from store.writeahead import require_whole_log
 
 __all__ = ["Store"]
-
-logger = logging.getLogger(__name__)
 
 
 class Store:
@@ -93,10 +88,9 @@ class Store:
             self._journal = self._opened(folder / JOURNAL_FILE)
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
-            self._generations = Generations(folder / GENERATIONS, self._journal)
+            self._generations = Generations(folder, self._journal)
             if mode == "write":
                 self._generations.remove_unfinished()
-            self._warn_of_damaged_generations()
             undo.pop_all()
 
     def _opened(self, journal: Path) -> Journal:
@@ -107,17 +101,6 @@ class Store:
             if self.mode == "write" or not holds_store(journal.parent):
                 raise
             return Journal(journal, write=False)
-
-    def _warn_of_damaged_generations(self) -> None:
-        # It may be the base's: nothing else would show that until a generation behind it is damaged, too.
-        for row in self._journal.generations():
-            if not row.sound:
-                logger.warning(
-                    "%s: the row of generation %s fails its checksum and does not count: check_store tells what it is "
-                    "needed for",
-                    self.path,
-                    row.number,
-                )
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -312,24 +295,7 @@ class Store:
         """
         checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
         self._idle()
-        newest, named = self._generations.latest(), self._journal.newest()
-        if named is not None and (newest is None or newest.number != named):
-            raise DamageError(
-                f"{self.path} cannot be compacted: generation {named}, which has to be whole beside the base, could "
-                "not be read back; nothing was given up. Commit another, and compact again",
-                path=self.path / GENERATIONS / folder_name(named),
-            )
-        if newest is None or newest.upto != self._journal.last():
-            there = "there is none" if newest is None else f"the newest has those up to {newest.upto}"
-            raise RecordError(
-                f"{self.path} can be compacted only beside a generation with all {self._journal.last()} records; "
-                f"{there}: commit one first"
-            )
-        self._generations.commit(checked, upto, text, pieces, base=True)
-        try:
-            self._journal.shrink()
-        except StoreError as error:
-            logger.warning("%s: the space was not given back yet: %s", self.path, error)
+        self._generations.compact(checked, upto, text, pieces)
 
     def commit_later(
         self,

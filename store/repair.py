@@ -22,13 +22,12 @@ from store.records import (
     GenerationRow,
     Spans,
     from_json,
-    lost_heads,
     payload_digest,
     read_head,
     to_json,
     united,
 )
-from store.salvage import Fault, Progress, Salvage, require_salvageable, survey_rows
+from store.salvage import Fault, Salvage, require_salvageable
 from store.schema import (
     DAMAGED_FILE,
     DRAFT_FILE,
@@ -40,7 +39,7 @@ from store.schema import (
     new_meta,
     remove_drafts,
 )
-from store.survey import FoundGeneration, Survey
+from store.survey import FoundGeneration, Progress, Survey
 
 __all__ = ["Repair", "repair_store"]
 
@@ -87,7 +86,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
                 with closing(Salvage(folder / JOURNAL_FILE)) as salvage:
                     survey = Survey(folder, salvage, progress or (lambda *_: None))
                     if not survey.problems():
-                        return Repair(survey.rows.last, [], None)
+                        return Repair(survey.last, [], None)
                     noted = _write_repaired(survey)
                 _put_generations_aside(survey)
                 _put_in_place(folder, str(noted["aside"]))
@@ -115,18 +114,18 @@ class _Plan:
 
     @classmethod
     def of(cls, survey: Survey) -> _Plan:
-        sound, rows = survey.sound, survey.rows
+        sound = survey.sound
         newest = sound[0].upto if sound else 0
         standing = survey.compacted if survey.has_base else 0
         # Up to `compacted` no row has arrays; without the base that stood for them they are as good as damaged.
-        fresh = bool(rows.faulty(standing + 1, newest)) or (standing < survey.compacted and newest > 0)
+        fresh = bool(survey.faulty(standing + 1, newest)) or (standing < survey.compacted and newest > 0)
         base = newest if fresh else standing
-        behind = rows.faulty(newest + 1, rows.last)
-        kept = behind[0][0] - 1 if behind else rows.last
+        behind = survey.faulty(newest + 1, survey.last)
+        kept = behind[0][0] - 1 if behind else survey.last
         if survey.compacted > newest:
             kept = newest
-        lost = [(first, last) for first, last, fault in rows.faulty(1, base) if fault.takes_head]
-        heads = united([*lost, *((first, last) for first, last in lost_heads(survey.meta) if last <= base)])
+        lost = [(first, last) for first, last, fault in survey.faulty(1, base) if fault.takes_head]
+        heads = united([*lost, *((first, last) for first, last in survey.lost_heads if last <= base)])
         bases = [found for found in sound if found.is_base and found.upto == base]
         # A generation that does not describe itself has to be written again: only where it is needed.
         needed = [
@@ -138,23 +137,23 @@ class _Plan:
 
 
 def _lost_rows(survey: Survey, plan: _Plan) -> list[str]:
-    rows, newest = survey.rows, survey.sound[0].upto if survey.sound else 0
+    newest = survey.sound[0].upto if survey.sound else 0
     which = f"generation {survey.sound[0].number}" if survey.sound else ""
     lost = [
         f"{fault.describe(first, last)}; what they did is in {which}, but can no longer be retracted"
-        for first, last, fault in rows.faulty(1, newest)
+        for first, last, fault in survey.faulty(1, newest)
     ]
     if plan.fresh:
         lost.append(
             f"rows 1 to {plan.base} give up their arrays, {which} stands for them: none of them can be retracted any "
             "more"
         )
-    if plan.kept < rows.last:
-        behind = rows.faulty(newest + 1, rows.last)
+    if plan.kept < survey.last:
+        behind = survey.faulty(newest + 1, survey.last)
         first, last, fault = behind[0] if behind else (0, 0, None)
         why = fault.describe(first, last) if fault else "the base that they continue is lost"
         lost.append(
-            f"rows {plan.kept + 1} to {rows.last} are dropped, also those that verify: {why}, and nobody knows what "
+            f"rows {plan.kept + 1} to {survey.last} are dropped, also those that verify: {why}, and nobody knows what "
             "that did to the others"
         )
     if survey.salvage.is_gone:
@@ -218,7 +217,7 @@ def _write_repaired(survey: Survey) -> dict[str, JSON]:
     draft = folder / DRAFT_FILE
     try:
         build_journal(draft, meta, fill)
-        _verify(draft, plan, rows, survey.progress)
+        _verify(survey, draft, plan, rows)
         draft.rename(folder / REPAIRED_FILE)
         sync_folder(folder)
     except BaseException:
@@ -230,7 +229,7 @@ def _write_repaired(survey: Survey) -> dict[str, JSON]:
 
 def _copy_rows(survey: Survey, plan: _Plan, connection: sqlite3.Connection) -> None:
     marks = ",".join("?" * len(HEAD_COLUMNS.split(",")))
-    for sequence, _, row in survey.salvage.rows(plan.kept, lost_heads(survey.meta), whole=True):
+    for sequence, _, row in survey.salvage.rows(plan.kept, survey.lost_heads, whole=True):
         if sequence > plan.kept:
             break
         head = None if isinstance(row, Fault) else read_head(row)
@@ -250,13 +249,11 @@ def _copy_rows(survey: Survey, plan: _Plan, connection: sqlite3.Connection) -> N
             connection.execute("INSERT INTO payload (sequence, bytes) VALUES (?, ?)", (sequence, payload))
 
 
-def _verify(draft: Path, plan: _Plan, generations: Sequence[GenerationRow], progress: Progress) -> None:
-    with closing(Salvage(draft)) as written:
-        upto = max((row.upto for row in generations), default=0)
-        rows = survey_rows(written, plan.base, upto, plan.heads, progress)
-        found, whole = written.generations()
-        same = sorted(found, key=lambda row: row.number) == sorted(generations, key=lambda row: row.number)
-        if written.damage or rows.faults or rows.strays or rows.last != plan.kept or not whole or not same:
+def _verify(survey: Survey, draft: Path, plan: _Plan, generations: Sequence[GenerationRow]) -> None:
+    with closing(Salvage(draft)) as salvage:
+        again = Survey(survey.folder, salvage, survey.progress)
+        found = set(salvage.generations()[0])
+        if again.problems() or again.last != plan.kept or found != set(generations):
             raise DamageError(f"{draft} does not read back as it was just written: {DISTRUST}", path=draft)
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import enum
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,20 +28,13 @@ from store.records import (
     HEAD_COLUMNS,
     GenerationRow,
     Spans,
-    payload_digest,
-    read_head,
     read_meta,
-    uncovered,
     united,
 )
 from store.schema import FORMAT_VERSION, JOURNAL_FILE, LOG, PAGE_BYTES, build_journal, connect, has_our_schema
 from store.writeahead import damaged_frame, describe_frame, mend_log
 
-__all__ = ["Fault", "Progress", "RowSurvey", "Salvage", "require_salvageable", "survey_rows"]
-
-# Called with what is being done, how many of it are done, and how many there are.
-Progress = Callable[[str, int, int], object]
-REPORT_EVERY = 256  # rows
+__all__ = ["Fault", "Row", "Salvage", "require_salvageable"]
 
 # Sequences in a row that cannot be read, behind which no more are tried: more than one page can lead to.
 GIVE_UP = 16384
@@ -283,68 +275,3 @@ def _mended(path: Path, scratch: Path, *, page: bool, log: bool) -> Path:
         with copy.open("r+b") as file:
             file.write(new_first_page((scratch / "new").read_bytes()[:PAGE_BYTES]))
     return copy
-
-
-@dataclass
-class RowSurvey:
-    """Which rows do not verify: (first, last, fault), ascending, consecutive ones with the same fault as one.
-
-    `last` is the last sequence of which there is any sign. `strays` are payloads that ought not to be there.
-    """
-
-    last: int = 0
-    faults: list[tuple[int, int, Fault]] = field(default_factory=list)
-    strays: Spans = field(default_factory=list)
-
-    def add(self, first: int, last: int, fault: Fault) -> None:
-        """Note a fault of rows behind all those that were noted before."""
-        if self.faults and self.faults[-1][1] == first - 1 and self.faults[-1][2] is fault:
-            first = self.faults.pop()[0]
-        self.faults.append((first, last, fault))
-
-    def faulty(self, first: int, last: int) -> list[tuple[int, int, Fault]]:
-        """Return the faults of rows `first` to `last`, cut off at these."""
-        return [
-            (max(begin, first), min(end, last), fault)
-            for begin, end, fault in self.faults
-            if max(begin, first) <= min(end, last)
-        ]
-
-
-def survey_rows(salvage: Salvage, compacted: int, upto: int, lost: Spans, progress: Progress) -> RowSurvey:
-    """Verify every row, and the arrays of those behind `compacted`.
-
-    upto: the last row that a generation contains. lost: the rows that an earlier repair left out.
-    """
-    last, whole = salvage.last()
-    found = RowSurvey(last=max(last, upto))
-    for first, through, row in salvage.rows(found.last, lost, whole=whole):
-        if isinstance(row, Fault):
-            for begin, end in uncovered(first, through, lost):
-                found.add(begin, end, row)
-            continue
-        found.last = max(found.last, through)
-        if first % REPORT_EVERY == 0:
-            progress("rows", first, found.last)
-        fault = _fault(salvage, row, arrays=first > compacted)
-        if fault is Fault.NO_ARRAYS and not found.faulty(first - 1, first - 1):
-            # A writer may have compacted it since.
-            compacted = max(compacted, salvage.compacted())
-            fault = fault if first > compacted else None
-        if fault is not None:
-            found.add(first, first, fault)
-    found.faults = found.faulty(1, found.last)
-    found.strays = salvage.strays(compacted)
-    return found
-
-
-def _fault(salvage: Salvage, row: Row, *, arrays: bool) -> Fault | None:
-    head = read_head(row)
-    if head is None:
-        return Fault.DAMAGED
-    if not arrays:
-        return None
-    payload, readable = salvage.payload(row[0])
-    if payload is None:
-        return Fault.NO_ARRAYS if readable else Fault.UNREADABLE_ARRAYS
-    return None if payload_digest(payload) == head[1] else Fault.DAMAGED_ARRAYS

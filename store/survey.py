@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -12,11 +12,25 @@ from typing import Any, Literal
 from store.exceptions import DamageError, reported
 from store.generations import numbers
 from store.groups import PARTIAL, GroupReader, folder_name, read_own_description
-from store.records import JSON, GenerationRow, from_json, lost_heads, to_json
-from store.salvage import Progress, RowSurvey, Salvage, require_salvageable, survey_rows
+from store.records import (
+    JSON,
+    GenerationRow,
+    Spans,
+    from_json,
+    lost_heads,
+    payload_digest,
+    read_head,
+    to_json,
+    uncovered,
+)
+from store.salvage import Fault, Row, Salvage, require_salvageable
 from store.schema import DAMAGED_FILE, DRAFT_FILE, GENERATIONS, JOURNAL_FILE, REPAIRED_FILE
 
-__all__ = ["FoundGeneration", "Problem", "Survey", "check_store"]
+__all__ = ["FoundGeneration", "Problem", "Progress", "Survey", "check_store"]
+
+# Called with what is being done, how many of it are done, and how many there are.
+Progress = Callable[[str, int, int], object]
+REPORT_EVERY = 256  # rows
 
 
 @dataclass(frozen=True)
@@ -80,47 +94,88 @@ class FoundGeneration:
         return self.row is not None and bool(self.row.base)
 
 
-@dataclass
 class Survey:
     """All that is found of the store in `folder`, whose journal is `salvage`, and whether it verifies.
 
-    `identity` is None where it is lost, `compacted` the last row whose arrays a base stands for, whether that
-    base is sound or not, and `unnamed` are the folders of generations that the journal does not know.
-    A writer may be at work meanwhile. Raises VersionError for a newer format, and StoreError for a file that
-    cannot be read for a reason that says nothing against it.
+    `identity` is None where it is lost; `compacted` is the last row whose arrays a base stands for, whether that
+    base is sound or not; `unnamed` are the folders of generations that the journal does not know. `last` is the
+    last sequence of which there is any sign; `faults` are the rows that do not verify, as (first, last, fault),
+    ascending; `strays` are payloads that ought not to be there. A writer may be at work meanwhile. Raises
+    VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
+    against it.
     """
 
-    folder: Path
-    salvage: Salvage
-    progress: Progress
-    identity: dict[str, JSON] | None = None
-    generations: list[FoundGeneration] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
+    def __init__(self, folder: Path, salvage: Salvage, progress: Progress) -> None:
+        self.folder, self.salvage, self.progress, self.journal = folder, salvage, progress, salvage.path
         # The folders before the rows: a generation that is committed in between is then known, not a leftover.
         parent = self.folder / GENERATIONS
         there = numbers(parent)
-        self.journal = self.salvage.path
-        self.meta, self.damaged_meta = self.salvage.meta()
-        rows, whole = self.salvage.generations()
+        self.meta, self.damaged_meta = salvage.meta()
+        rows, whole = salvage.generations()
         self.damaged_generation_rows = [row.number for row in rows if not row.sound]
-        trusted = whole and not self.damaged_generation_rows and not self.salvage.damage
+        trusted = whole and not self.damaged_generation_rows and not salvage.damage
         named = {row.number: row for row in rows if row.sound}
+        self.lost_heads = lost_heads(self.meta)
         self.identity = _identity(parent, self.meta, there)
+        self.generations: list[FoundGeneration] = []
         chosen = [*named, *(number for number in there if number not in named and not trusted)]
         for done, number in enumerate(chosen):
-            self.progress("generations", done, len(chosen))
+            progress("generations", done, len(chosen))
             found = self._examine(parent / folder_name(number), number, named.get(number))
             # A writer may have replaced it while it was read: that is no damage.
-            still_named = number in {row.number for row in self.salvage.generations()[0]}
+            still_named = number in {row.number for row in salvage.generations()[0]}
             if found.sound or number not in named or still_named:
                 self.generations.append(found)
         self.unnamed = [parent / folder_name(number) for number in there if number not in chosen]
         self.compacted = max((found.upto for found in self.generations if found.is_base), default=0)
-        upto = max((found.upto for found in self.generations), default=0)
-        self.rows: RowSurvey = survey_rows(
-            self.salvage, self.compacted, max(upto, 0), lost_heads(self.meta), self.progress
-        )
+        self.faults: list[tuple[int, int, Fault]] = []
+        self._verify_rows(max((found.upto for found in self.generations), default=0))
+
+    def _verify_rows(self, upto: int) -> None:
+        """Verify every row, and the arrays of those behind the base; `upto` is the last that a generation contains."""
+        last, whole = self.salvage.last()
+        self.last, compacted = max(last, upto), self.compacted
+        for first, through, row in self.salvage.rows(self.last, self.lost_heads, whole=whole):
+            if isinstance(row, Fault):
+                for begin, end in uncovered(first, through, self.lost_heads):
+                    self._note(begin, end, row)
+                continue
+            self.last = max(self.last, through)
+            if first % REPORT_EVERY == 0:
+                self.progress("rows", first, self.last)
+            fault = self._fault(row, arrays=first > compacted)
+            if fault is Fault.NO_ARRAYS and not self.faulty(first - 1, first - 1):
+                # A writer may have compacted it since.
+                compacted = max(compacted, self.salvage.compacted())
+                fault = fault if first > compacted else None
+            if fault is not None:
+                self._note(first, first, fault)
+        self.faults = self.faulty(1, self.last)
+        self.strays: Spans = self.salvage.strays(compacted)
+
+    def _fault(self, row: Row, *, arrays: bool) -> Fault | None:
+        head = read_head(row)
+        if head is None:
+            return Fault.DAMAGED
+        if not arrays:
+            return None
+        payload, readable = self.salvage.payload(row[0])
+        if payload is None:
+            return Fault.NO_ARRAYS if readable else Fault.UNREADABLE_ARRAYS
+        return None if payload_digest(payload) == head[1] else Fault.DAMAGED_ARRAYS
+
+    def _note(self, first: int, last: int, fault: Fault) -> None:
+        if self.faults and self.faults[-1][1] == first - 1 and self.faults[-1][2] is fault:
+            first = self.faults.pop()[0]
+        self.faults.append((first, last, fault))
+
+    def faulty(self, first: int, last: int) -> list[tuple[int, int, Fault]]:
+        """Return the faults of rows `first` to `last`, cut off at these."""
+        return [
+            (max(begin, first), min(end, last), fault)
+            for begin, end, fault in self.faults
+            if max(begin, first) <= min(end, last)
+        ]
 
     @property
     def sound(self) -> list[FoundGeneration]:
@@ -194,9 +249,9 @@ class Survey:
             yield Problem(self.journal, what, "spare" if self.identity is not None else "lost")
 
     def _in_rows(self) -> Iterator[Problem]:
-        for first, last, fault in self.rows.faults:
+        for first, last, fault in self.faults:
             yield Problem(self.journal, f"{fault.describe(first, last)} in {self.journal}", "lost")
-        for first, last in self.rows.strays:
+        for first, last in self.strays:
             rows = f"row {first}" if first == last else f"rows {first} to {last}"
             what = f"{self.journal} holds arrays of {rows} that no row has, or a base stands for"
             yield Problem(self.journal, what, "spare")
@@ -218,12 +273,12 @@ class Survey:
 
     def _is_spare(self, generation: FoundGeneration | None) -> bool:
         """Return whether the state that a generation holds can be had without it."""
-        upto = self.rows.last if generation is None or generation.row is None else generation.upto
+        upto = self.last if generation is None or generation.row is None else generation.upto
         uptos = [other.upto for other in self.sound if other is not generation]
         if generation is not None and generation.is_base and upto == self.compacted:
             return upto in uptos
         starts = [start for start in [*uptos, *([0] if not self.compacted else [])] if start >= self.compacted]
-        return any(start >= upto or not self.rows.faulty(start + 1, upto) for start in starts)
+        return any(start >= upto or not self.faulty(start + 1, upto) for start in starts)
 
     def leftovers(self) -> Iterator[Problem]:
         """Yield the files that are there too many, and who removes them."""

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, State, after, expected, opened, perform, seen, warm
+from faults.model import Operation, State, after, opened, perform, seen, settle, warm
 from faults.plans import prepare
 from faults.shim import Shim
 from store import ReadOnlyError, StoreError, StoreFullError
@@ -122,8 +122,9 @@ class Bench:
 
     def require(self, where: str, learner: Any, state: State) -> None:
         """What is seen of a learner is what is expected."""
-        if (found := seen(learner)) != (told := expected(state)):
-            self.failures.append(f"{where}: differs in {[key for key in found if found[key] != told[key]]}")
+        found, differ = settle(seen(learner), [state])
+        if found is None:
+            self.failures.append(f"{where}: differs in {differ}")
 
     def then(self, operation: Operation) -> State:
         """The state after an operation."""

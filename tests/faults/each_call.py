@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, warm
+from faults.model import Operation, Other, State, after, one_scale, opened, perform, seen, settle, warm
 from faults.plans import prepare
 from faults.shim import Shim
 from faults.zygote import Zygote
@@ -267,12 +267,10 @@ class Trial:
         return step.name not in GENERATIONS or number % SECOND_LOOK == 0
 
     def _require(self, where: str, found: dict[str, Any], states: list[State]) -> State:
-        for state in states:
-            if found == expected(state):
-                return state
-        differ = [[key for key in found if found[key] != expected(state)[key]] for state in states]
-        self.failures.append(f"{where}: differs in {differ}")
-        return states[-1]
+        state, differ = settle(found, states)
+        if state is None:
+            self.failures.append(f"{where}: differs in {differ}")
+        return state or states[-1]
 
     def told(self) -> None:
         """Show failures as they come."""

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, Other, State, after, expected, opened, perform, seen, warm
+from faults.model import Operation, Other, State, after, opened, perform, seen, settle, warm
 from faults.plans import KINDS, history, prepare
 from faults.zygote import Child, Zygote
 
@@ -157,14 +157,13 @@ class Killing:
 
     def _settle(self, found: dict[str, Any], where: str) -> None:
         """Find which of the candidates it is; that one holds from now on."""
-        for state in self.candidates:
-            if found == expected(state):
-                if len(self.candidates) > 1:
-                    self.counts["begun, and found " + ("done" if state is self.candidates[1] else "not done")] += 1
-                self.state, self.candidates = state, [state]
-                return
-        differ = [[key for key in found if found[key] != expected(state)[key]] for state in self.candidates]
-        self.failures.append(f"{where}: differs from all candidates, in {differ}")
+        state, differ = settle(found, self.candidates)
+        if state is None:
+            self.failures.append(f"{where}: differs from all candidates, in {differ}")
+            return
+        if len(self.candidates) > 1:
+            self.counts["begun, and found " + ("done" if state is self.candidates[1] else "not done")] += 1
+        self.state, self.candidates = state, [state]
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -292,6 +293,12 @@ def expected(state: State) -> dict[str, Any]:
     said = {material: dict(constituents) for material, constituents in state.said}
     told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
     return _felt(state.pairs) | told
+
+
+def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None, list[list[str]]]:
+    """The first of the states that is the one seen, None where none is; and what differs from each of them."""
+    differ = [[key for key in found if found[key] != expected(state)[key]] for state in states]
+    return next((state for state, keys in zip(states, differ, strict=True) if not keys), None), differ
 
 
 def _taught(pairs: Pairs) -> TactileLearner:

@@ -27,7 +27,7 @@ import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.disks import STYLES, Disk, Event, events
-from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, warm
+from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, settle, warm
 from faults.plans import KINDS, draw, history, prepare
 from faults.shim import Shim
 
@@ -157,10 +157,8 @@ class Cutting:
     def _opens(self, where: str, path: Path, candidates: list[State]) -> State | None:
         """Open a disk, find which state it is in, and go on from it."""
         with opened(path) as learner:
-            found = seen(learner)
-            state = next((one for one in candidates if found == expected(one)), None)
+            state, differ = settle(seen(learner), candidates)
             if state is None:
-                differ = [[key for key in found if found[key] != expected(one)[key]] for one in candidates]
                 self.failures.append(f"{where}: differs in {differ}")
                 return None
             if len(candidates) > 1 and candidates[0] != candidates[1]:

@@ -172,7 +172,10 @@ class Generations:
         """
         with self._queue:
             self._waiting = commit
+        try:
             self._submitted = self._worker.submit(self._commit_newest)
+        except RuntimeError:  # the interpreter is shutting down, and starts no job any more
+            self._commit_newest()
 
     def _commit_newest(self) -> None:
         with self._queue:

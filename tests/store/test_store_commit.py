@@ -2,6 +2,8 @@
 
 import logging
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from store_builds import folders
 
 import store.generations
 import store.groups
-from store import DamageError, Store, StoreError
+from store import DamageError, Store, StoreError, check_store
 
 ONE = {"x": np.arange(10)}
 
@@ -76,6 +78,23 @@ def test_closing_finishes_what_was_handed_over(tmp_path):
     with Store.open(tmp_path) as opened:
         assert opened.latest().number == 1
     assert "store commit" not in " ".join(thread.name for thread in threading.enumerate())
+
+
+def test_a_program_that_forgets_to_close_ends_and_loses_no_row(tmp_path):
+    """zarr writes nothing any more while the interpreter shuts down: then a commit fails, and is logged."""
+    code = """
+import atexit, sys, numpy, store
+opened = store.Store.open(sys.argv[1], identity={})
+atexit.register(lambda: opened.commit_later({"x": numpy.arange(3)}, upto=1))
+opened.append("a", "b", b"")
+opened.commit_later({"x": numpy.arange(2)}, upto=1)
+"""
+    root = Path(store.__file__).parents[1]
+    subprocess.run([sys.executable, "-c", code, tmp_path / "s"], cwd=root, check=True, timeout=60, capture_output=True)
+    with Store.open(tmp_path / "s") as again:
+        assert again.last == 1
+        assert again.commit(ONE, upto=1)
+    assert check_store(tmp_path / "s") == []
 
 
 def fail(*_):

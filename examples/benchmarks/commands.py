@@ -11,10 +11,10 @@ from rich.table import Table
 from examples.benchmarks.buffer_study import run_buffers
 from examples.benchmarks.frontier import measure_frontier
 from examples.benchmarks.interleaved import run_interleaved
-from examples.benchmarks.numerics import find_nist, run_numerics
+from examples.benchmarks.numerics.comparison import find_nist, run_numerics
+from examples.benchmarks.numerics.plots_numerics import draw_numerics
+from examples.benchmarks.numerics.show_numerics import show_numerics
 from examples.benchmarks.plots_frontier import draw_frontier
-from examples.benchmarks.plots_numerics import draw_numerics
-from examples.benchmarks.show_numerics import show_numerics
 from examples.benchmarks.show_speed import show_speed
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.timing import circumstances

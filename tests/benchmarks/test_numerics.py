@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from examples.benchmarks.cases import FAMILIES, Case, make_cases
-from examples.benchmarks.long_runs import run_schedules, run_updates
-from examples.benchmarks.measures import bars, error_of, measure
-from examples.benchmarks.numerics import find_nist, run_numerics
-from examples.benchmarks.plots_numerics import NO_ANSWER, draw_numerics, points
-from examples.benchmarks.recorded import digits, nist_cases
-from examples.benchmarks.solvers.solvers import SOLVERS
-from examples.benchmarks.truth import TruthError, exact_weights, refined_weights
+from examples.benchmarks.numerics.cases import FAMILIES, Case, make_cases
+from examples.benchmarks.numerics.comparison import find_nist, run_numerics
+from examples.benchmarks.numerics.long_runs import run_schedules, run_updates
+from examples.benchmarks.numerics.measures import bars, error_of, measure
+from examples.benchmarks.numerics.plots_numerics import NO_ANSWER, draw_numerics, points
+from examples.benchmarks.numerics.recorded import digits, nist_cases
+from examples.benchmarks.numerics.truth import TruthError, exact_weights, refined_weights
+from examples.benchmarks.solvers.methods import SOLVERS
 from scroll_tactile.errors import DatasetError, InputError
 
 RNG = np.random.default_rng(0)
@@ -233,16 +233,16 @@ def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path)
 
 
 def test_data_that_is_not_there_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("examples.benchmarks.numerics.make_cases", lambda *_: iter(()))
-    monkeypatch.setattr("examples.benchmarks.numerics.run_updates", lambda *_: iter(()))
-    monkeypatch.setattr("examples.benchmarks.numerics.run_schedules", lambda *_: iter(()))
+    monkeypatch.setattr("examples.benchmarks.numerics.comparison.make_cases", lambda *_: iter(()))
+    monkeypatch.setattr("examples.benchmarks.numerics.comparison.run_updates", lambda *_: iter(()))
+    monkeypatch.setattr("examples.benchmarks.numerics.comparison.run_schedules", lambda *_: iter(()))
     told = run_numerics(quick=True, data=tmp_path)["not_measured"]
     assert set(told) == {"NIST StRD", "biotac", "roboskin"}
     assert "raw_data" in told["biotac"]
 
 
 def test_real_features(real_data):
-    from examples.benchmarks.recorded import real_case
+    from examples.benchmarks.numerics.recorded import real_case
 
     case = real_case("roboskin", real_data, 0, 64, 60)
     one = measure(case, "exact", 0)

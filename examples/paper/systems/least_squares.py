@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from examples.benchmarks.solvers.solvers import SOLVERS
+from examples.benchmarks.solvers.floating import Gram64
 from examples.paper.systems.inputs import Image, picture
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile.embeddings.runtimes import full_float32
@@ -44,7 +44,7 @@ class Ridge:
 def ridge(features: FloatArray, wanted: FloatArray, penalty: float) -> Ridge:
     """W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² of centred features x, (N, d), and targets y, (N, C); λ is the penalty."""
     center, offset = features.mean(axis=0), wanted.mean(axis=0)
-    solver = SOLVERS["gram64"]()  # λ ≥ 1e-6 on unit vectors: exactness is not what this row is about
+    solver = Gram64()  # λ ≥ 1e-6 on unit vectors: exactness is not what this row is about
     solver.start(features.shape[1], wanted.shape[1], penalty)
     solver.update(features - center, wanted - offset)
     return Ridge(center, solver.weights(), offset)

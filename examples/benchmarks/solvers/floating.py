@@ -1,4 +1,4 @@
-"""Solvers of the ridge regression, side by side: what a memory of sums is compared with.
+"""Solvers of the ridge regression in floating point: what exact sums are compared with.
 
 All find W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² of rows that come in batches, through one interface (`Solver`). With A =
 Σ x xᵀ and B = Σ x yᵀ:
@@ -8,13 +8,12 @@ covariance             P ← P − P Xᵀ (I + X P Xᵀ)⁻¹ X P,  W ← W + P 
 covariance-symmetric   the same, with P ← (P + Pᵀ) / 2 after each update
 qr                     R'R = A + λ I by orthogonal updates of R, Q'Y carried along:  W = R⁻¹ Q'Y
 gram64, gram32         A and B in float64 or float32, then Cholesky:  W = (A + λ I)⁻¹ B
-exact, exact24, exact20  A and B in integers, Cholesky, refinement against the exact residual (`exact`)
 ====================== ======================================================================================
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +21,11 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dgemm, dger, dsyrk, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtpqrt, spotrf, spotrs
 
-from examples.benchmarks.solvers.exact import Exact, Exact20, Exact24
-from examples.benchmarks.solvers.solver_protocol import RidgeBase, Solver
+from examples.benchmarks.solvers.solver_protocol import RidgeBase
 from scroll_tactile.errors import InputError, SingularError
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["SOLVERS", "Covariance", "CovarianceSymmetric", "Gram32", "Gram64", "SquareRoot"]
+__all__ = ["Covariance", "CovarianceSymmetric", "Gram32", "Gram64", "SquareRoot"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,19 +46,6 @@ class Covariance(RidgeBase):
             raise InputError("expected λ > 0: the covariance form begins with P = I / λ. Take the exact or the QR form")
         self._covariance: FloatArray = np.asfortranarray(np.eye(self.dimension) / self.penalty)
         self._weights = np.zeros((self.dimension, self.outputs))
-
-    @classmethod
-    def resume(cls, covariance: FloatArray, weights: FloatArray) -> Self:
-        """Go on from a P of shape (d, d) and a W of shape (d, C) that were come by otherwise; they are taken over."""
-        made = cls()
-        made.start(len(weights), weights.shape[1], 1.0)
-        made._covariance, made._weights = np.asfortranarray(covariance), weights
-        return made
-
-    @property
-    def coefficients(self) -> FloatArray:
-        """W of shape (d, C) as it is now, not a copy and without a diagnosis."""
-        return self._weights
 
     def _take(self, x: FloatArray, y: FloatArray) -> None:
         # Where P has lost its definiteness numbers grow without bound: the diagnosis says so, not a warning.
@@ -198,16 +183,3 @@ class Gram32(Gram64):
     """`Gram64` in float32."""
 
     kind = np.float32
-
-
-SOLVERS: dict[str, type[Solver]] = {
-    "covariance": Covariance,
-    "covariance-symmetric": CovarianceSymmetric,
-    "qr": SquareRoot,
-    "gram64": Gram64,
-    "gram32": Gram32,
-    "exact": Exact,
-    "exact24": Exact24,
-    "exact20": Exact20,
-}
-"""Name → class; each is made without arguments and then started."""

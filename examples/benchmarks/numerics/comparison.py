@@ -10,11 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from examples.benchmarks.cases import Case, make_cases
-from examples.benchmarks.long_runs import run_scatter, run_schedules, run_updates
-from examples.benchmarks.measures import bars, measure
-from examples.benchmarks.recorded import NIST, nist_cases, real_case
-from examples.benchmarks.solvers.solvers import SOLVERS
+from examples.benchmarks.numerics.cases import Case, make_cases
+from examples.benchmarks.numerics.long_runs import run_scatter, run_schedules, run_updates
+from examples.benchmarks.numerics.measures import bars, measure
+from examples.benchmarks.numerics.recorded import NIST, nist_cases, real_case
+from examples.benchmarks.solvers.methods import SOLVERS
 from scroll_tactile.errors import DatasetError
 
 __all__ = ["find_nist", "run_numerics"]
@@ -35,7 +35,7 @@ SCHEDULED = ("exact", "exact24", "exact20", "gram64", "gram32", "qr", "covarianc
 
 def find_nist(data: Path | None) -> Path | None:
     """NIST's file in the folder of the data, or beside a checkout of the project; None where it is in neither."""
-    places = [Path(__file__).resolve().parents[3] / "shared" / "data" / NIST]
+    places = [Path(__file__).resolve().parents[4] / "shared" / "data" / NIST]
     if data is not None:
         places.insert(0, data / NIST)
     return next((place for place in places if place.is_file()), None)

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from examples.benchmarks.cases import Case
+from examples.benchmarks.numerics.cases import Case
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import DatasetError

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from examples.benchmarks.truth import TruthError, exact_weights, refined_weights
+from examples.benchmarks.numerics.truth import TruthError, exact_weights, refined_weights
 
 __all__ = ["FAMILIES", "Case", "make_cases", "updates"]
 

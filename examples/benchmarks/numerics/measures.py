@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from examples.benchmarks.cases import Case
-from examples.benchmarks.recorded import digits
+from examples.benchmarks.numerics.cases import Case
+from examples.benchmarks.numerics.recorded import digits
 from examples.benchmarks.solvers.exact import Exact
+from examples.benchmarks.solvers.methods import SOLVERS
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
-from examples.benchmarks.solvers.solvers import SOLVERS
 from scroll_tactile.errors import InputError, SingularError
 from scroll_tactile.statistics.moments import one_thread
 

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.cases import Case, updates
-from examples.benchmarks.measures import Record, error_of, new_solver, record, solved
+from examples.benchmarks.numerics.cases import Case, updates
+from examples.benchmarks.numerics.measures import Record, error_of, new_solver, record, solved
+from examples.benchmarks.numerics.truth import refined_weights
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
-from examples.benchmarks.truth import refined_weights
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["run_scatter", "run_schedules", "run_updates"]

@@ -1,0 +1,1 @@
+"""Speed against error: exact sums beside recursive, QR and plain ones, on cases that are hard."""

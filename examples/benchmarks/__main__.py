@@ -1,8 +1,208 @@
-"""`python -m examples.benchmarks`: speed beside error."""
+"""`python -m examples.benchmarks`: speed beside error, side by side in one run."""
 
-from examples.benchmarks.commands import bench as app
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from examples.benchmarks.buffers import run_buffers
+from examples.benchmarks.frontier import measure_frontier
+from examples.benchmarks.interleaved import run_interleaved
+from examples.benchmarks.numerics.comparison import find_nist, run_numerics
+from examples.benchmarks.numerics.plots_numerics import draw_numerics
+from examples.benchmarks.numerics.show_numerics import show_numerics
+from examples.benchmarks.plots_frontier import draw_frontier
+from examples.benchmarks.show_speed import show_frontier, show_interleaved, show_speed, show_vision
+from examples.benchmarks.speed import run_speed
+from examples.benchmarks.vision_speed import run_vision
+from examples.paper.commands.sets import Dataset, read, require_folders
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.embeddings import Kernels
 
 __all__ = ["app"]
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, help="Measure speed beside error, side by side in one run.")
+
+Json = Annotated[Path | None, typer.Option(help="Write the result to this file.")]
+
+
+def _written(context: typer.Context, path: Path | None, result: Mapping[str, Any]) -> None:
+    """Write a result, with the command that makes it and what else ran meanwhile, where a file was asked for."""
+    if path is None:
+        return
+    load = [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None
+    write_json(path, {"command": _command(context), **result, "load_average_after": load})
+    say(f"written to {path}")
+
+
+def _command(context: typer.Context) -> str:
+    """The command that is being run, with what was given to it; a path, which is of one machine, by its name."""
+    words = [f"python -m examples.benchmarks {context.info_name}"]
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        source = context.get_parameter_source(name)
+        if source is None or source.name == "DEFAULT" or name in ("json", "plot"):
+            continue
+        value = context.params[name]
+        said = name.upper() if isinstance(value, Path) else str(getattr(value, "value", value))
+        if parameter.param_type_name == "argument":
+            words.append(said)
+        else:
+            words.append(f"--{name}" if value is True else f"--{name} {said}")
+    return " ".join(words)
+
+
+@app.command()
+def speed(
+    context: typer.Context,
+    observations: Annotated[int, typer.Option(min=1000, help="Size of the large memory.")] = 100_000,
+    rounds: Annotated[int, typer.Option(min=5, help="In each of them each call is timed five times.")] = 50,
+    before: Annotated[
+        Path | None, typer.Option(help="An older checkout of the project: the same calls, in turns, and their ratios.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
+    json: Json = None,
+) -> None:
+    """Time a user's calls, an update, λ and a large memory beside what they are to be compared with.
+
+    Filling the large memory takes a few minutes; 10000 observations take twenty seconds.
+    """
+    require_folders(json)
+    with progress_bar() as progress:
+        result = run_speed(
+            seed=seed,
+            observations=observations,
+            rounds=rounds,
+            before=before,
+            note=lambda what: progress(what, 0, 1),
+        )
+    show_speed(result)
+    _written(context, json, result)
+
+
+@app.command()
+def frontier(
+    context: typer.Context,
+    data: Annotated[Path, typer.Option(help="Folder of BioTac_slide_20_50, or the one it lies in.")],
+    quick: Annotated[bool, typer.Option(help="One fold and two widths.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of BioTac's folds, and of the peers.")] = 0,
+    json: Json = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw error against time into this file.")] = None,
+) -> None:
+    """Measure error against time on both recorded sets: width, readout and length of a touch, and other learners.
+
+    The whole takes an hour or so.
+    """
+    require_folders(json, plot)
+    with progress_bar() as progress:
+        sets = [read(dataset, data, seed) for dataset in (Dataset.BIOTAC, Dataset.ROBOSKIN)]
+        result = measure_frontier(sets, seed=seed, quick=quick, note=lambda what: progress(what, 0, 1))
+    show_frontier(result)
+    if plot is not None:
+        draw_frontier(plot, result["frontier"], result["peers"], default=result["knee"]["default"])
+        say(f"drawn to {plot}")
+    _written(context, json, result)
+
+
+@app.command()
+def vision(
+    context: typer.Context,
+    weights: Annotated[
+        Path | None, typer.Option(help="A .safetensors or .pth file; random weights cost the same.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="BioTac_slide_20_50: also the accuracy of each runtime on RoboSkin. Minutes.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches and the random weights.")] = 0,
+    quick: Annotated[bool, typer.Option(help="A few rounds: for a look, not for a report.")] = False,
+    json: Json = None,
+) -> None:
+    """Time the vision embedding beside a bare forward pass of its network, in each runtime that is installed."""
+    require_folders(json)
+    with progress_bar() as progress:
+        result = run_vision(
+            weights=weights, data=data, seed=seed, rounds=5 if quick else 30, note=lambda what: progress(what, 0, 1)
+        )
+    show_vision(result)
+    _written(context, json, result)
+
+
+@app.command()
+def buffers(
+    context: typer.Context,
+    dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
+    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
+    seed: Annotated[int, typer.Option(min=0, help="Draws the orders, the random buffer and BioTac's folds.")] = 0,
+    json: Json = None,
+) -> None:
+    """Compare ways of choosing exemplars: gap to the class means, overlap of two schedules, accuracy of f*."""
+    require_folders(json)
+    with progress_bar() as progress:
+        recordings = read(dataset, data, seed)
+        result = run_buffers(recordings, Kernels(), seed=seed, note=lambda what: progress(what, 0, 1))
+    table = Table("exemplars", "way", "gap to full herding's", "overlap", "f*", "f", title=f"{recordings.name}, fold 0")
+    for record in result["records"]:
+        shares = [percent(record[name]) for name in ("overlap", "tuned", "f")]
+        table.add_row(str(record["capacity"]), record["way"], f"{record['ratio']:.3f}", *shares)
+    console().print(table)
+    _written(context, json, result)
+
+
+@app.command()
+def interleaved(
+    context: typer.Context,
+    streams: Annotated[int, typer.Option(min=100, help="Learned before anything is timed.")] = 2000,
+    pairs: Annotated[int, typer.Option(min=10, help="Of an observation and a prediction, timed.")] = 300,
+    interleavings: Annotated[int, typer.Option(min=100, help="Of the run that shows that nothing drifts.")] = 100_000,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the streams.")] = 0,
+    json: Json = None,
+) -> None:
+    """Time observing and predicting in turns, 50 materials and 512 features, beside other learners."""
+    require_folders(json)
+    with progress_bar() as progress:
+        result = run_interleaved(
+            streams=streams,
+            pairs=pairs,
+            interleavings=interleavings,
+            seed=seed,
+            note=lambda what: progress(what, 0, 1),
+        )
+    show_interleaved(result)
+    _written(context, json, result)
+
+
+@app.command()
+def numerics(
+    context: typer.Context,
+    json: Json = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw speed against error into this file.")] = None,
+    quick: Annotated[bool, typer.Option(help="Every case and method, small: under a minute.")] = False,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with biotac_slide_20_50: also cases of real features.")
+    ] = None,
+    nist: Annotated[
+        Path | None, typer.Option(help="NIST's linear regressions, nist_strd.json; looked for with the data.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the made-up cases, batches and schedules.")] = 0,
+) -> None:
+    """Compare exact sums with RLS, QR and plain ones on hard cases: errors in weights against the truth, and time.
+
+    The whole takes half an hour.
+    """
+    require_folders(json, plot)
+    with progress_bar() as progress:
+        result = run_numerics(seed=seed, quick=quick, data=data, nist=nist or find_nist(data), progress=progress)
+    show_numerics(result)
+    if plot is not None:
+        draw_numerics(plot, result["records"], title=f"Speed against error, seed {seed}{', quick' * quick}")
+        say(f"drawn to {plot}")
+    _written(context, json, result)
+
 
 if __name__ == "__main__":
     app(prog_name="python -m examples.benchmarks")

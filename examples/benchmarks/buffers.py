@@ -1,7 +1,10 @@
-"""How well a buffer stands for its classes, and how much of it depends on the schedule: four ways of choosing.
+"""`python -m examples.benchmarks buffers`: ways of choosing exemplars, by how well they stand for their classes.
 
 `full` herds from all touches (what a memory of everything could do), `pooled` from candidates chosen by their hash
 (ours), `live` again at every observation (SCROLL's own, Wang et al.), `random` picks by chance.
+
+Beside the gap to the class means and the overlap of two schedules stands the accuracy of an f* fine-tuned on the
+buffer, by itself: also where the learner would not let it answer.
 """
 
 from __future__ import annotations
@@ -9,19 +12,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from examples.benchmarks.timing import circumstances
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.embeddings import Embedding
+from scroll_tactile.finetune.fine_tune import fine_tune
+from scroll_tactile.finetune.network import TunedReader
+from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, mean_code, quotas, rank
+from scroll_tactile.pipelines.classification import hold_out
+from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 
-__all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap"]
+__all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap", "run_buffers"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = npt.NDArray[np.int32]
 Buffer = dict[str, list[bytes]]
+Note = Callable[[str], None]
 
 
 class Chooser(Protocol):
@@ -161,3 +173,58 @@ def _chosen(
         counts[name] = counts.get(name, 0) + 1
         chooser.add(name, keys[at], codes[at], mean_code(sums[name], counts[name]))
     return chooser.buffer()
+
+
+def run_buffers(
+    recordings: Recordings,
+    embedding: Embedding,
+    capacities: Sequence[int] = (100, 200, 400),
+    *,
+    seed: int = 0,
+    note: Note = lambda _: None,
+) -> dict[str, Any]:
+    """Learn all folds but the first, choose buffers of these capacities in every way, and fine-tune on each.
+
+    Returns circumstances and a list of records: capacity, way, gap, ratio to full herding's, overlap of two schedules,
+    accuracy of f* by itself and of f, on the first fold.
+    """
+    lessons, exam = hold_out(recordings, recordings.fold == 0)
+    learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=len(recordings))
+    note("learning")
+    for touch in lessons:
+        learner.observe(*touch)
+    assert learner._memory.exemplars is not None
+    kept = list(learner._memory.exemplars)
+    codes, keys = np.stack([one.code for one in kept]), [one.key for one in kept]
+    f = float(np.mean([learner.predict(stream).material == name for name, stream in exam]))
+    records = []
+    for capacity in capacities:
+        for way, choice in compare(codes, keys, [one.material for one in kept], capacity, seed).items():
+            note(f"{capacity} exemplars, {way}: fine-tuning")
+            records.append(
+                {
+                    "capacity": capacity,
+                    "way": way,
+                    "gap": choice.gap,
+                    "ratio": choice.to_full,
+                    "overlap": choice.shared,
+                    "tuned": _tuned(learner, choice.buffer, kept, exam, seed),
+                    "f": f,
+                }
+            )
+    return {"bench": "buffers", "dataset": recordings.name, **circumstances(seed), "records": records}
+
+
+def _tuned(
+    learner: TactileLearner, buffer: Buffer, kept: Sequence[Exemplar], exam: Sequence[tuple[str, Any]], seed: int
+) -> float:
+    """Accuracy of an f* fine-tuned on a buffer, whether it would be kept or not."""
+    of = {one.key: one for one in kept}
+    exemplars = {name: [of[key] for key in those] for name, those in buffer.items()}
+    tuned, _ = fine_tune(learner.embedding, learner.model(), exemplars, learner.sensor, seed=seed)
+    reader = TunedReader(learner.embedding, learner._reading, tuned)
+    right = []
+    for name, stream in exam:
+        logits = reader.logits(tactile_image(stream))
+        right.append(max(logits, key=logits.__getitem__) == name)
+    return float(np.mean(right))

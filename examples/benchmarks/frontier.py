@@ -1,9 +1,9 @@
-"""The frontier of `scroll-tactile bench speed`: error against milliseconds, on recorded touches.
+"""`python -m examples.benchmarks frontier`: error against milliseconds, on recorded touches.
 
-Width of the embedding × readout × length of the touch asked about, learned from one pass over the other folds; and
-beside it other libraries' learners on the same feature vectors, one for each touch. Times are of the processor, on one
-thread, and medians over the touches of one fold: what others do on a shared machine must not count. Errors are of all
-folds asked for.
+Width of the embedding × readout × length of the touch asked about, learned from one pass over the other folds into a
+memory on disk; and beside it other libraries' learners on the same feature vectors, one for each touch. Times are of
+the processor, on one thread, the median and the 99th percentile over the touches of one fold. Errors are of all folds
+asked for.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.ours import Ours
+from examples.benchmarks.timing import Timing, circumstances, timed
 from examples.benchmarks.vector_peers import (
     GradientSteps,
     OneVsRest,
+    Ours,
     Peer,
     PseudoInverse,
     RecursiveFilters,
@@ -52,13 +53,14 @@ def measure_frontier(
     sets: Sequence[Recordings], *, seed: int = 0, quick: bool = False, note: Note = lambda what: None
 ) -> Record:
     """The records of `run_frontier` and `run_peers` on some sets, and the `knee`; quick: one fold, two widths."""
+    result = {"bench": "frontier", **circumstances(seed), "clock": "processor", "quick": quick}
     widths = WIDTHS[:2] if quick else WIDTHS
     frontier, peers = [], []
     for recordings in sets:
         folds = [0] if quick else sorted(set(recordings.fold.tolist()))
         frontier += run_frontier(recordings, folds, widths, note=note)
         peers += run_peers(recordings, 0, seed, note=note)
-    return {"frontier": frontier, "peers": peers, "knee": knee(frontier)}
+    return result | {"frontier": frontier, "peers": peers, "knee": knee(frontier)}
 
 
 def run_frontier(
@@ -87,17 +89,14 @@ def _one_fold(recordings: Recordings, fold: int, width: int) -> list[tuple[tuple
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         path, embedding = Path(folder, "memory"), Kernels(dimension=width)
         with TactileLearner.open(path, sensor=recordings.sensor, embedding=embedding, exemplars=0) as learner:
-            observing = [_timed(partial(learner.observe, *one)) for one in learned]
+            observing = [timed(partial(learner.observe, *one), "processor") for one in learned]
         for readout in get_args(ReadoutName):
             with TactileLearner.open(path, embedding=embedding, readout=readout, mode="read") as learner:
-                first = _timed(partial(learner.predict, asked[0][1]))
+                first = timed(partial(learner.predict, asked[0][1]), "processor")
                 for seconds in LENGTHS:
                     wrong, predicting = _answered(learner, asked, seconds)
-                    times = {
-                        "observe_ms": _milliseconds(observing),
-                        "predict_ms": _milliseconds(predicting),
-                        "first_predict_ms": _milliseconds([first]),
-                    }
+                    times = {**_times("observe", observing), **_times("predict", predicting)}
+                    times |= {"first_predict_ms": 1e3 * first}
                     found.append(((readout, "all" if seconds is None else f"{seconds:g} s"), wrong, times))
     return found
 
@@ -114,14 +113,9 @@ def _answered(learner: TactileLearner, asked: Sequence[Labelled], seconds: float
     return wrong / len(asked), taken
 
 
-def _milliseconds(seconds: Sequence[float]) -> float:
-    return 1e3 * float(np.median(seconds))
-
-
-def _timed(call: Callable[[], object]) -> float:
-    begun = time.process_time()
-    call()
-    return time.process_time() - begun
+def _times(verb: str, seconds: Sequence[float]) -> Record:
+    timing = Timing.of(seconds, "processor")
+    return {f"{verb}_ms": timing.median, f"{verb}_p99_ms": timing.p99}
 
 
 def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lambda what: None) -> list[Record]:
@@ -174,9 +168,9 @@ def _measured(
 ) -> Record:
     observing, fresh = [], []
     for step, at in enumerate(order):
-        observing.append(_timed(partial(peer.observe, places[at], rows[at])))
+        observing.append(timed(partial(peer.observe, places[at], rows[at]), "processor"))
         if step >= len(order) - SLOW:
-            fresh.append(_timed(partial(peer.predict, questions[0])))
+            fresh.append(timed(partial(peer.predict, questions[0]), "processor"))
     taken, wrong = [], 0
     for row, place in zip(questions, truth, strict=True):
         begun = time.process_time()
@@ -185,9 +179,9 @@ def _measured(
         wrong += said != place
     return {
         "wrong": wrong / len(truth),
-        "observe_ms": _milliseconds(observing),
-        "predict_ms": _milliseconds(taken),
-        "fresh_ms": _milliseconds(fresh),
+        **_times("observe", observing),
+        **_times("predict", taken),
+        **_times("fresh", fresh),
     }
 
 

@@ -1,4 +1,4 @@
-"""The picture of `bench speed` on recorded touches: error against milliseconds, ours by width, others as points."""
+"""The picture of `benchmarks frontier`: error against milliseconds, ours by width, others as points."""
 
 from __future__ import annotations
 

@@ -1,14 +1,15 @@
-"""`scroll-tactile bench speed`: what a prediction, a statistics update, λ and a large memory cost, as ratios.
+"""`python -m examples.benchmarks speed`: what a user waits for, and what it stands beside, as ratios of one run.
 
-Every pair is timed in turns in one run; the error stands beside the time. Streams are simulated: their content
-does not change the cost. Linear algebra is timed on one thread, in processor time.
+Calls of a learner are timed by the clock on the wall, on a memory on disk, each of a touch of its own. Linear algebra
+is timed on one thread, in processor time. Touches are simulated: their content does not change the cost.
 """
 
 from __future__ import annotations
 
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ import numpy.typing as npt
 import torch
 from scipy.linalg.blas import dsyrk
 
-from examples.benchmarks.bare_resnet import resnet18
-from examples.benchmarks.timing import Timing, circumstances, take_turns
+from examples.benchmarks.before import run_before
+from examples.benchmarks.timing import Clock, Timing, circumstances, take_turns, timed
+from examples.benchmarks.vision_speed import BareResNet
 from scroll_tactile import sensors
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.rows import pack_codes
 from scroll_tactile.memory.state import OBSERVE
@@ -35,71 +38,105 @@ from scroll_tactile.statistics.statistics import Statistics
 __all__ = ["run_speed"]
 
 Record = dict[str, Any]
-WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 Note = Callable[[str], None]
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 BLOCK = 64  # rows in which the plain update is fed, and ours
+TAUGHT = 20  # touches of each of twenty materials, before a user's calls are timed
+FRESH = 20  # observations, each with a prediction after it: a second or more each
+PROCESSOR: Clock = "processor"
 
 
-def run_speed(*, seed: int = 0, observations: int = 100_000, rounds: int = 50, note: Note = lambda _: None) -> Record:
-    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records."""
-    note("a prediction beside a ResNet-18")
-    records = [_predict_and_resnet(seed, rounds)]
+def run_speed(
+    *,
+    seed: int = 0,
+    observations: int = 100_000,
+    rounds: int = 50,
+    before: Path | None = None,
+    note: Note = lambda _: None,
+) -> Record:
+    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
+
+    rounds: each call is timed five times in a round. before: a checkout of the project to be timed beside this one.
+    """
+    result = {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads()}
+    note(f"a memory of {TAUGHT} touches of each material: observe, predict, beside a ResNet-18")
+    records = _user_calls(seed, rounds)
     note("a statistics update beside a plain dsyrk")
     records.append(_update_and_dsyrk(seed, rounds))
     note("one row beside half of A")
     records.append(_row_and_memory(seed, rounds))
     note("many λ from one factorisation beside one of each")
-    records += [_path_and_refits(seed, count, max(3, rounds // 10)) for count in (4, 16)]
+    records += [_path_and_refits(seed, number, max(3, rounds // 10)) for number in (4, 16)]
     note(f"a memory of {observations} observations beside one of 1000")
     records += _large_and_small(seed, observations, rounds)
-    return {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads(), "records": records}
+    result["records"] = records
+    if before is not None:
+        note("this checkout beside the one before")
+        result["before"] = run_before(before, seed=seed, touches=TAUGHT, pairs=FRESH)
+    return result
 
 
 def _record(case: str, ours: Timing, other: Timing, against: str, error: str, bar: str) -> Record:
     return {
         "case": case,
-        "milliseconds": ours.least * 1e3,
-        "median_milliseconds": ours.median * 1e3,
+        **ours.record(),
+        "calls": ours.calls,
+        "clock": ours.clock,
         "against": against,
-        "against_milliseconds": other.least * 1e3,
-        "ratio": ours.least / other.least,
+        **other.record("against_"),
+        "ratio": ours.median / other.median,
         "error": error,
         "bar": bar,
     }
 
 
-def _taught(seed: int, touches: int) -> tuple[TactileLearner, Scene]:
+def _touches(scene: Scene, first: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
+    """Touches of all materials in turn, without end, from a repetition on: (material, readings)."""
+    for repetition in count(first):
+        for name in scene.materials:
+            yield name, np.array(scene.touch(name, repetition).readings)
+
+
+def _ready(scene: Scene, first: int, number: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
+    """So many touches made beforehand, again and again: making them must not be timed."""
+    touches = _touches(scene, first)
+    made = [next(touches) for _ in range(number)]
+    return (made[i % number] for i in count())
+
+
+def _user_calls(seed: int, rounds: int) -> list[Record]:
+    """Observe, predict, and predict right after an observe, on a memory of the default learner on disk."""
     scene = Scene(sensor=sensors.BIOTAC, seed=seed)
-    learner = TactileLearner(sensor=sensors.BIOTAC)
-    for name in scene.materials:
-        for repetition in range(touches):
-            learner.observe(name, scene.touch(name, repetition))
-    return learner, scene
-
-
-def _predict_and_resnet(seed: int, rounds: int) -> Record:
-    learner, scene = _taught(seed, 3)
-    stream = scene.touch(scene.materials[0], 99)
-    readings = np.array(stream.readings)
-    network = resnet18(seed)
-    image = torch.from_numpy(three_planes(tactile_image(stream))[None])
+    network = BareResNet(ResNet.random(seed)).eval()
+    image = torch.from_numpy(three_planes(tactile_image(scene.touch(scene.materials[0], 99)))[None])
+    asked, told = _ready(scene, 1000, 200), _ready(scene, 2000, FRESH)
 
     def forward() -> None:
         with torch.inference_mode():
             network(image)
 
-    calls: dict[str, Callable[[], object]] = {"predict": lambda: learner.predict(readings), "resnet": forward}
-    timings = take_turns(calls, rounds)
-    tries = [(name, 50 + at) for name in scene.materials for at in range(3)]
-    wrong = np.mean([learner.predict(scene.touch(*one)).material != one[0] for one in tries])
-    return _record(
-        "predict, 4 s of BioTac, end to end",
-        timings["predict"],
-        timings["resnet"],
-        "ResNet-18 forward of the same image, torch",
-        f"{100 * wrong:.1f} % of simulated touches wrong",
-        "ratio ≤ 0.2",
-    )
+    with tempfile.TemporaryDirectory() as folder, TactileLearner.open(folder, sensor=scene.sensor) as learner:
+        observing = []
+        touches = _touches(scene, 0)
+        for _ in range(TAUGHT * len(scene.materials)):
+            observing.append(timed(partial(learner.observe, *next(touches))))
+        calls: dict[str, Callable[[], object]] = {"predict": lambda: learner.predict(next(asked)[1]), "resnet": forward}
+        turns = take_turns(calls, rounds)
+        fresh = []
+        for name, readings in (next(told) for _ in range(FRESH)):
+            observing.append(timed(partial(learner.observe, name, readings)))
+            fresh.append(timed(partial(learner.predict, next(asked)[1])))
+        tries = [next(asked) for _ in range(60)]
+        wrong = np.mean([learner.predict(readings).material != name for name, readings in tries])
+    predict = turns["predict"]
+    memory = f"memory of {TAUGHT * len(scene.materials)} touches on disk"
+    error = f"{100 * wrong:.1f} % of simulated touches wrong"
+    beside = "ResNet-18 forward of the same image, torch"
+    return [
+        _record(f"predict, 4 s of BioTac, {memory}", predict, turns["resnet"], beside, error, "ratio ≤ 0.2"),
+        _record(f"observe, {memory}", Timing.of(observing), predict, "predict", "exact", "no bar"),
+        _record(f"predict right after an observe, {memory}", Timing.of(fresh), predict, "predict", error, "no bar"),
+    ]
 
 
 def _update_and_dsyrk(seed: int, rounds: int) -> Record:
@@ -124,7 +161,7 @@ def _update_and_dsyrk(seed: int, rounds: int) -> Record:
 
     with one_thread():
         calls: dict[str, Callable[[], object]] = {"ours": ours, "plain": plain}
-        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=time.process_time)
+        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=PROCESSOR)
     backwards = plain(list(range(len(blocks)))[::-1])
     upper = np.triu_indices(dimension)
     differing = float(np.mean(plain()[upper] != backwards[upper]))
@@ -155,9 +192,9 @@ def _row_and_memory(seed: int, rounds: int) -> Record:
 
     with one_thread():
         calls: dict[str, Callable[[], object]] = {"ours": ours, "memory": memory}
-        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=time.process_time)
+        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=PROCESSOR)
     each = {
-        name: Timing(taken.least / of, taken.median / of)
+        name: Timing(taken.median / of, taken.p99 / of, taken.mean / of, taken.calls, taken.clock)
         for (name, taken), of in zip(timings.items(), (rows, 16), strict=True)
     }
     return _record(
@@ -184,7 +221,7 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
             "path": lambda: fit_readouts(task, penalties),
             "each": lambda: [fit_readout(task, penalty) for penalty in penalties],
         }
-        timings = take_turns(calls, rounds, warm_up=1, clock=time.process_time)
+        timings = take_turns(calls, rounds, warm_up=1, clock=PROCESSOR)
     pairs = zip(fit_readouts(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
     worst = max(float(np.abs(one.weights - two.weights).max() / np.abs(two.weights).max()) for one, two in pairs)
     return _record(
@@ -199,17 +236,21 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
 
 def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
     scene = Scene(sensor=sensors.BIOTAC, seed=seed)
-    stream = np.array(scene.touch(scene.materials[0], 99).readings)
+    fresh = [_ready(scene, 1000, 5 * rounds + 3) for _ in range(2)]
+    asked = [_ready(scene, 5000, 100) for _ in range(2)]
     with tempfile.TemporaryDirectory() as folder:
         small = _filled(Path(folder) / "small", scene, 1000, seed)
         large = _filled(Path(folder) / "large", scene, observations, seed)
         with small, large:
             calls: dict[str, Callable[[], object]] = {
-                "observe, small": lambda: small.observe("new", stream),
-                "observe, large": lambda: large.observe("new", stream),
+                "observe, small": lambda: small.observe("new", next(fresh[0])[1]),
+                "observe, large": lambda: large.observe("new", next(fresh[1])[1]),
             }
             observing = take_turns(calls, rounds)
-            calls = {"small": lambda: small.predict(stream), "large": lambda: large.predict(stream)}
+            calls = {
+                "small": lambda: small.predict(next(asked[0])[1]),
+                "large": lambda: large.predict(next(asked[1])[1]),
+            }
             predicting = take_turns(calls, rounds)
     pairs = [
         ("observe", observing["observe, large"], observing["observe, small"]),

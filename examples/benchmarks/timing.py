@@ -1,40 +1,69 @@
-"""Timing on machines that are shared and noisy: alternatives take turns, and the least of many rounds counts."""
+"""Timing of calls as a user makes them, on machines that are shared: alternatives take turns in one run.
+
+A figure is the median of many calls with the 99th percentile beside it. Milliseconds do not carry over to another
+machine, ratios of one run do.
+"""
 
 from __future__ import annotations
 
+import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["Timing", "circumstances", "take_turns"]
+__all__ = ["CLOCKS", "Clock", "Timing", "circumstances", "take_turns", "timed"]
 
-
+Clock = Literal["wall", "processor"]
+CLOCKS: dict[Clock, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
 IN_A_ROW = 5
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds a call: the least, and the median, over the rounds."""
+    """Milliseconds of calls that were timed one by one.
 
-    least: float
+    median, p99: over the calls; with fewer than a hundred p99 is near the largest. clock: "wall" is what a user waits;
+    "processor" leaves out other programs and waiting for a disk, and adds up threads.
+    """
+
     median: float
+    p99: float
+    mean: float
+    calls: int
+    clock: Clock
+
+    @classmethod
+    def of(cls, seconds: Sequence[float], clock: Clock = "wall", times: int = 1) -> Timing:
+        """Of the seconds that each call took; times: how many of what is reported a call does."""
+        taken = 1e3 * np.asarray(seconds, dtype=np.float64) / times
+        return cls(
+            float(np.median(taken)), float(np.percentile(taken, 99)), float(taken.mean()), len(seconds) * times, clock
+        )
+
+    def record(self, prefix: str = "") -> dict[str, float]:
+        """Median and p99 for a record, their names with a prefix."""
+        return {f"{prefix}median_milliseconds": self.median, f"{prefix}p99_milliseconds": self.p99}
+
+
+def timed(call: Callable[[], object], clock: Clock = "wall") -> float:
+    """The seconds of one call."""
+    begun = CLOCKS[clock]()
+    call()
+    return CLOCKS[clock]() - begun
 
 
 def take_turns(
-    calls: Mapping[str, Callable[[], object]],
-    rounds: int,
-    warm_up: int = 3,
-    clock: Callable[[], float] = time.perf_counter,
+    calls: Mapping[str, Callable[[], object]], rounds: int, warm_up: int = 3, clock: Clock = "wall"
 ) -> dict[str, Timing]:
     """Time calls by name; in every round each is called a few times, so that a slow moment of the machine hits all.
 
-    A few, not once: the first call after another's finds its data pushed out of the processor's cache. clock: seconds;
-    `time.process_time` for what runs on one thread, where others are at work on the machine.
+    A few, not once: the first call after another's finds its data pushed out of the processor's cache.
     """
     for call in calls.values():
         for _ in range(warm_up):
@@ -42,20 +71,28 @@ def take_turns(
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            for _ in range(IN_A_ROW):
-                begin = clock()
-                call()
-                seconds[name].append(clock() - begin)
-    return {name: Timing(min(taken), float(np.median(taken))) for name, taken in seconds.items()}
+            seconds[name] += [timed(call, clock) for _ in range(IN_A_ROW)]
+    return {name: Timing.of(taken, clock) for name, taken in seconds.items()}
 
 
-def circumstances(seed: int) -> dict[str, object]:
-    """What a result has to be read with: date, seed, versions, machine."""
-    names = ("scroll-tactile", "torch", "numpy", "scipy", "zarr")
+def circumstances(seed: int) -> dict[str, Any]:
+    """What a result has to be read with: date, seed, versions, machine, and what else ran on it as it began.
+
+    load_average: of the last 1, 5 and 15 minutes, in processes; above `cores` they waited for each other.
+    """
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "seed": seed,
         "python": platform.python_version(),
         "machine": f"{platform.machine()}, {platform.processor() or platform.system()}",
-        "versions": {name: version(name) for name in names},
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None,
+        "versions": {name: _version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy", "zarr")},
     }
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # a clone that was not installed
+        return "not installed"

@@ -1,4 +1,4 @@
-"""`scroll-tactile bench vision`: what the vision embedding costs beside a bare forward pass of its network.
+"""`python -m examples.benchmarks vision`: what the vision embedding costs beside a bare forward pass of its network.
 
 For the images of BioTac and RoboSkin all alternatives take turns in one run; beside each stands how far its features
 lie from those of torch in float32. Streams are simulated: their content does not change the cost.
@@ -6,18 +6,22 @@ lie from those of torch in float32. Streams are simulated: their content does no
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
+from torch.nn import functional
 
-from examples.benchmarks.bare_resnet import Plain
 from examples.benchmarks.timing import circumstances, take_turns
 from scroll_tactile import sensors
 from scroll_tactile.datasets.biotac_slide import load
@@ -30,7 +34,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 
-__all__ = ["run_vision"]
+__all__ = ["BareResNet", "run_vision"]
 
 Record = dict[str, Any]
 Note = Callable[[str], None]
@@ -39,6 +43,18 @@ Image = npt.NDArray[np.float32]
 USUAL, ALL = (1, 2, 3), (0, 1, 2, 3, 4)  # stages: those that Vision has by default, and all
 TOUCHES = 3  # of each material, learned before `predict` is timed
 YARDSTICK, ONE_THREAD = "bare forward, torch", "bare forward, torch, one thread"
+
+
+class BareResNet(nn.Module):
+    """A network without its classifier, the yardstick: all layers, batch normalisation as trained, a global average."""
+
+    def __init__(self, net: ResNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, planes: torch.Tensor) -> torch.Tensor:
+        """(B, 3, H, W) → (B, planes of layer 4, 1, 1)."""
+        return functional.adaptive_avg_pool2d(self.net(planes)[-1], 1)
 
 
 @dataclass(frozen=True)
@@ -82,6 +98,7 @@ def run_vision(
     weights: of a ResNet, a random ResNet-18 where it is None: the cost is the same, the errors are not.
     data: folder of BioTac_slide_20_50, for the accuracy on RoboSkin beside each runtime (a minute for each); or None.
     """
+    result = {"bench": "vision", **circumstances(seed), "threads": torch.get_num_threads(), "rounds": rounds}
     net = ResNet.random(seed) if weights is None else load_network(weights)
     state = net.state_dict()
     here = [name for name in ("onnxruntime",) if find_spec(name) and find_spec("onnx")]
@@ -90,17 +107,12 @@ def run_vision(
     for sensor in (sensors.BIOTAC, sensors.ROBOSKIN):
         note(f"{sensor.name}: embeddings beside a bare forward pass")
         records += _one_sensor(sensor, net, [(way.name, way.make(state)) for way in ways], here, seed, rounds)
-    return {
-        "bench": "vision",
-        **circumstances(seed),
+    usual = [way for way in ways if way.stages == USUAL]
+    return result | {
         "runtimes": {name: version(name) for name in here},
-        "weights": "random" if weights is None else str(weights),
-        "threads": torch.get_num_threads(),
-        "rounds": rounds,
+        "weights": "random" if weights is None else weights.name,
         "records": records,
-        "accuracy": {}
-        if data is None
-        else _accuracies(data, state, [way for way in ways if way.stages == USUAL], note),
+        "accuracy": {} if data is None else _accuracies(data, state, usual, note),
     }
 
 
@@ -113,19 +125,21 @@ def _one_sensor(
     planes = to_planes(torch.from_numpy(image[None]))
     calls = _bare(net, planes, here)
     calls |= {name: _embedding(embedding, image) for name, embedding in embeddings}
-    for name, embedding in embeddings:
-        if "all stages" not in name and "bfloat16" not in name:
-            calls[f"predict with {name}"] = _predicting(scene, embedding, np.array(stream.readings))
-    timings = take_turns(calls, rounds)
+    with ExitStack() as stack:
+        for name, embedding in embeddings:
+            if "all stages" not in name and "bfloat16" not in name:
+                calls[f"predict with {name}"] = stack.enter_context(_predicting(scene, embedding))
+        timings = take_turns(calls, rounds)
     errors = _errors(embeddings, image)
     return [
         {
             "case": case,
             "image": f"{image.shape[0]} × {image.shape[1]} ({sensor.name})",
-            "milliseconds": timing.least * 1e3,
-            "median_milliseconds": timing.median * 1e3,
-            "ratio": timing.least / timings[YARDSTICK].least,
-            "ratio_to_one_thread": timing.least / timings[ONE_THREAD].least,
+            **timing.record(),
+            "calls": timing.calls,
+            "clock": timing.clock,
+            "ratio": timing.median / timings[YARDSTICK].median,
+            "ratio_to_one_thread": timing.median / timings[ONE_THREAD].median,
             "relative_error": errors.get(case),
         }
         for case, timing in timings.items()
@@ -134,7 +148,7 @@ def _one_sensor(
 
 def _bare(net: ResNet, planes: torch.Tensor, here: list[str]) -> dict[str, Callable[[], object]]:
     """The networks alone: all their layers, with the image made ready."""
-    plain = Plain(net).eval()
+    plain = BareResNet(net).eval()
     made: dict[str, Run] = {}
     if "onnxruntime" in here:
         made["bare session, onnxruntime, one thread"] = make_runtime("onnxruntime", net, 4)
@@ -159,12 +173,18 @@ def _embedding(embedding: Vision, image: Image) -> Callable[[], object]:
     return lambda: embedding.embed(image)
 
 
-def _predicting(scene: Scene, embedding: Vision, readings: npt.NDArray[np.float32]) -> Callable[[], object]:
-    learner = TactileLearner(sensor=scene.sensor, embedding=embedding)
-    for name in scene.materials:
-        for repetition in range(TOUCHES):
-            learner.observe(name, scene.touch(name, repetition))
-    return lambda: learner.predict(readings)
+@contextmanager
+def _predicting(scene: Scene, embedding: Vision) -> Iterator[Callable[[], object]]:
+    """A prediction of touches in turn, by a memory on disk."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        TactileLearner.open(folder, sensor=scene.sensor, embedding=embedding) as learner,
+    ):
+        for name in scene.materials:
+            for repetition in range(TOUCHES):
+                learner.observe(name, scene.touch(name, repetition))
+        asked = cycle([np.array(scene.touch(name, TOUCHES).readings) for name in scene.materials])
+        yield lambda: learner.predict(next(asked))
 
 
 def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], note: Note) -> dict[str, float]:
@@ -172,7 +192,7 @@ def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], no
     recordings = load(data, "roboskin", 0)
     touches = list(zip(recordings.materials, recordings.streams, (recordings.fold == 0).tolist(), strict=True))
     shares = {}
-    for way in (way for way in ways if way.stages == USUAL):
+    for way in ways:
         note(f"accuracy of {way.name}")
         learner = TactileLearner(sensor=recordings.sensor, embedding=way.make(state), exemplars=0)
         for material, stream, held_out in touches:

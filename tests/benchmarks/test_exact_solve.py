@@ -423,7 +423,7 @@ def test_other_bounds_are_another_grid():
 
 
 def test_a_hundred_schedules_give_the_same_bytes_where_plain_sums_do_not():
-    """The thousand, with two threads, are measured by `bench numerics`."""
+    """The thousand, with two threads, are measured by `benchmarks numerics`."""
     rng = np.random.default_rng(9)
     rows, targets = rng.normal(size=(120, 9)), np.eye(3)[rng.integers(3, size=120)]
     exact, plain = set(), set()

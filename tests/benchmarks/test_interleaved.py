@@ -21,7 +21,10 @@ def test_every_learner_is_taught_and_timed(tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "r").read_text())
     assert [record["measured"] for record in found["records"]] == [True] * 9
-    assert all(record["milliseconds"] > 0 and record["times_ours"] > 0 for record in found["records"])
+    for record in found["records"]:
+        assert 0 < record["median_milliseconds"] <= record["p99_milliseconds"]
+        assert record["observe_median_milliseconds"] + record["predict_median_milliseconds"] > 0
+        assert record["times_ours"] > 0
     assert found["drift"]["largest_relative_difference"] < 1e-10
     assert 0 < found["drift"]["of_the_recursion"] < 1e-8
     assert {"date", "versions", "machine", "seed"} <= found.keys()

@@ -1,4 +1,4 @@
-"""`bench numerics`: its truths, its cases, what it measures and what it shows."""
+"""`benchmarks numerics`: its truths, its cases, what it measures and what it shows."""
 
 import json
 from fractions import Fraction

@@ -225,7 +225,7 @@ def test_qr_and_the_exact_form_are_all_that_is_left_on_laeuchlis_matrix():
 
 
 def test_ten_thousand_updates_of_one_row_leave_no_drift():
-    """The error after 10⁴ is what it was after 10³; the million is measured by `bench numerics`."""
+    """The error after 10⁴ is what it was after 10³; the million is measured by `benchmarks numerics`."""
     rng = np.random.default_rng(3)
     x = np.rint(rng.uniform(0, 1, size=(1000, 8)) * 2**20) / 2**20
     y = np.eye(2)[rng.integers(2, size=1000)]

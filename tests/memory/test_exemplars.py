@@ -315,7 +315,7 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
 
 
 def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
-    from examples.benchmarks.buffer_study import run_buffers
+    from examples.benchmarks.buffers import run_buffers
     from scroll_tactile import Kernels
     from scroll_tactile.datasets import Recordings
     from scroll_tactile.datasets.simulator import Scene

@@ -1,4 +1,4 @@
-"""Hard cases of ridge regression, by name and seeded, for `bench numerics`: rows, targets, λ, and the true weights.
+"""Hard cases of ridge regression, by name and seeded: rows, targets, λ, and the true weights.
 
 Decisions are judged on rows of their own (`asked`). `size` scales them: 1 is the report, smaller is a quick look.
 """

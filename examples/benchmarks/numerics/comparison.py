@@ -1,4 +1,4 @@
-"""`scroll-tactile bench numerics`: speed against error, the exact form beside its alternatives, on hard cases.
+"""`python -m examples.benchmarks numerics`: speed against error, the exact form beside its alternatives, on hard cases.
 
 Every record is one method on one case: the relative error of its weights, decisions that it flips, seconds of the
 processor for each row, and what it says of itself.
@@ -15,6 +15,7 @@ from examples.benchmarks.numerics.long_runs import run_scatter, run_schedules, r
 from examples.benchmarks.numerics.measures import bars, measure
 from examples.benchmarks.numerics.recorded import NIST, nist_cases, real_case
 from examples.benchmarks.solvers.methods import SOLVERS
+from examples.benchmarks.timing import circumstances
 from scroll_tactile.errors import DatasetError
 
 __all__ = ["find_nist", "run_numerics"]
@@ -53,6 +54,7 @@ def run_numerics(
 
     data: a folder with biotac_slide_20_50; nist: the file of certified regressions. Without them these are left out.
     """
+    result = {"bench": "numerics", **circumstances(seed), "quick": quick}
     missing: dict[str, str] = {}
     cases = [*make_cases(seed, QUICK if quick else 1.0), *_from_files(seed, quick, data, nist, missing)]
     steps = len(cases) * len(SOLVERS) + 40
@@ -73,9 +75,7 @@ def run_numerics(
     for dimension, most in (QUICK_UPDATES if quick else UPDATES).items():
         records += run_updates(seed, dimension, most, note)
     records += run_schedules(seed, SCHEDULED, 20 if quick else 1000, 32, note)
-    return {"bench": "numerics", "seed": seed, "quick": quick, "records": records, "bars": bars(records)} | {
-        "not_measured": missing
-    }
+    return result | {"records": records, "bars": bars(records), "not_measured": missing}
 
 
 def _from_files(seed: int, quick: bool, data: Path | None, nist: Path | None, missing: dict[str, str]) -> list[Case]:

@@ -1,4 +1,4 @@
-"""What `bench numerics` measures beside weights of a case: long streams, schedules, and the scatter of classes."""
+"""What `benchmarks numerics` measures beside weights of a case: long streams, schedules, and the scatter of classes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How `bench numerics` measures one solver on one case, and what it writes down."""
+"""How `benchmarks numerics` measures one solver on one case, and what it writes down."""
 
 from __future__ import annotations
 

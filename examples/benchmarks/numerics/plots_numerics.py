@@ -1,4 +1,4 @@
-"""The picture of `bench numerics`: speed against error, one point for each method and family of cases."""
+"""The picture of `benchmarks numerics`: speed against error, one point for each method and family of cases."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def points(records: Records) -> list[tuple[str, str, float, float]]:
 
 
 def draw_numerics(path: Path, records: Records, *, title: str) -> None:
-    """Draw the records of `bench numerics` into a picture.
+    """Draw the records of `benchmarks numerics` into a picture.
 
     Raises InputError where matplotlib is missing or the file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Cases of `bench numerics` that are read from files: NIST's certified regressions, and features of real touches."""
+"""Cases that are read from files: NIST's certified regressions, and features of real touches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How `bench numerics` is shown: a table of cases and methods, the bar, and what was not measured."""
+"""How `benchmarks numerics` is shown: a table of cases and methods, the bar, and what was not measured."""
 
 from __future__ import annotations
 

@@ -1,0 +1,104 @@
+"""This checkout beside an older one in one run: the same calls of a learner on disk, in turns, and their ratios.
+
+Milliseconds that were taken on different days, or machines, say nothing of a change; ratios of one run do.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from examples.benchmarks.timing import Timing
+from scroll_tactile import sensors
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+
+__all__ = ["run_before"]
+
+Record = dict[str, Any]
+HERE = Path(__file__).resolve().parent
+AGAIN = 5  # predictions of other touches after the one that follows an observation
+
+
+def run_before(before: Path, *, seed: int, touches: int, pairs: int) -> list[Record]:
+    """Records of observe, predict right after an observe, and predict again: now, before, and the ratio of medians.
+
+    before: a checkout of the project. touches: of each of twenty materials, learned first; pairs: of an observation
+    and a prediction, timed then. Raises InputError for a folder that is none.
+    """
+    if not (before / "scroll_tactile" / "__init__.py").is_file():
+        raise InputError(f"expected a checkout of the project in {before}; it has no scroll_tactile/__init__.py")
+    taken: dict[str, dict[str, list[float]]] = {name: {} for name in ("now", "before")}
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        places = _write_touches(Path(folder, "touches.npz"), seed, touches, pairs)
+        checkouts = {"now": HERE.parents[1], "before": before.resolve()}
+        workers = {
+            name: stack.enter_context(_Worker(checkout, Path(folder, "touches.npz"), Path(folder, name)))
+            for name, checkout in checkouts.items()
+        }
+        for i in range(places):
+            calls = [("observe", "observe", i)]
+            if i >= places - pairs:
+                calls.append(("predict right after an observe", "predict", i - pairs))
+                calls += [("predict again", "predict", i - pairs - 1 - k) for k in range(AGAIN)]
+            for name, worker in workers.items():
+                for case, verb, touch in calls:
+                    taken[name].setdefault(case, []).append(worker.time(verb, touch))
+    return [_record(case, Timing.of(taken["now"][case]), Timing.of(taken["before"][case])) for case in taken["now"]]
+
+
+def _record(case: str, now: Timing, before: Timing) -> Record:
+    ratio = {"ratio": now.median / before.median, "calls": now.calls, "clock": now.clock}
+    return {"case": case, **now.record(), **before.record("before_"), **ratio}
+
+
+def _write_touches(path: Path, seed: int, touches: int, pairs: int) -> int:
+    """Simulated touches of BioTac into a file; their number."""
+    scene = Scene(sensor=sensors.BIOTAC, seed=seed)
+    total = touches * len(scene.materials) + pairs
+    names = [scene.materials[i % len(scene.materials)] for i in range(total)]
+    readings = [scene.touch(name, i // len(scene.materials)).readings for i, name in enumerate(names)]
+    np.savez(path, readings=np.stack(readings), materials=np.array(names))
+    return total
+
+
+class _Worker:
+    """A process of `worker` with a checkout's path, ready to be asked."""
+
+    def __init__(self, checkout: Path, touches: Path, folder: Path) -> None:
+        # -P: beside the checkout's own path nothing of this folder's is to be imported.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(HERE / "worker.py"), str(touches), str(folder)],
+            env={**os.environ, "PYTHONPATH": str(checkout)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> _Worker:
+        self._answer()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate()
+
+    def time(self, verb: str, touch: int) -> float:
+        """The seconds of a call with a touch."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{verb} {touch}\n")
+        self._process.stdin.flush()
+        return float(self._answer())
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise InputError(f"expected an answer of {self._process.args!r}; it ended with {self._process.wait()}")
+        return line

@@ -233,6 +233,13 @@ def test_an_ill_conditioned_system_names_the_direction_it_determines_least():
     assert "columns 1, 3" in str(diagnosis)
 
 
+def test_a_column_that_only_the_penalty_determines_is_brought_to_size_like_the_others():
+    rows = np.c_[GAUSSIAN, np.zeros(30)]
+    _, diagnosis = solved(rows, np.ones((30, 1)), 1e-30)
+    assert diagnosis.verdict == "sound"
+    assert diagnosis.condition < 100
+
+
 def test_targets_of_zeros_and_a_single_row():
     assert not solved(GAUSSIAN, np.zeros((30, 2)))[0].any()
     found, _ = solved(np.array([[2.0]]), np.array([[3.0, 0.0]]), 1.0)

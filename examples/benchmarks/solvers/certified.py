@@ -26,6 +26,7 @@ Verdict = Literal["sound", "rounded", "ill conditioned", "singular", "out of ran
 
 ILL = 2.0**53  # condition: from here on the last bit of a row can change the first digit of the weights
 PART = 0.1  # of the largest entry of a direction: columns with less are not named
+NOTHING = -(2**20)  # the length in bits of zero: below that of any sum of doubles' products
 FIRST_BITS = 128
 ENOUGH_BITS = 60  # of a weight: then it is rounded to the nearest double, or to its neighbour
 ZERO_BITS = 200  # below the largest weight of its column: a weight so small counts as zero
@@ -57,10 +58,10 @@ class IntegerSystem:
         """
         mantissa, exponent = self.penalty
         places = exponent - 2 * self.units  # of λ in the units of the matrix
-        of_ridge = places + fmpz(mantissa).bit_length() if mantissa else np.zeros_like(places)
-        of_matrix = [self.matrix[j, j].bit_length() for j in range(self.dimension)]
-        lengths = np.maximum(of_matrix, of_ridge)
-        q = np.where(lengths == 0, 0, (lengths.max() - lengths) // 2)
+        of_ridge = places + fmpz(mantissa).bit_length() if mantissa else np.full_like(places, NOTHING)
+        diagonal = [self.matrix[j, j] for j in range(self.dimension)]
+        lengths = np.maximum([value.bit_length() if value else NOTHING for value in diagonal], of_ridge)
+        q = np.where(lengths == NOTHING, 0, (lengths.max() - lengths) // 2)
         if mantissa:  # and λ whole
             q += max(0, -int((places + 2 * q).min() // 2))
         up = [int(power) for power in q]

@@ -29,7 +29,7 @@ PART = 0.1  # of the largest entry of a direction: columns with less are not nam
 NOTHING = -(2**20)  # the length in bits of zero: below that of any sum of doubles' products
 FIRST_BITS = 128
 ENOUGH_BITS = 60  # of a weight: then it is rounded to the nearest double, or to its neighbour
-ZERO_BITS = 200  # below the largest weight of its column: a weight so small counts as zero
+ZERO_BITS = 128  # below the largest weight of its column: a weight so small is not waited for
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The true weights of a ridge regression on given doubles, by ways that share nothing with the solvers measured.
 
-Small cases: the normal equations as Python's integers, solved by fraction-free elimination (Bareiss 1968, Mathematics
-of Computation 22): exact. Larger ones: Householder's QR of the rows in float64 (LAPACK), then corrections from what
+Small cases: the normal equations in whole numbers, solved in fractions by FLINT: exact, and not in ball arithmetic.
+Larger ones: Householder's QR of the rows in float64 (LAPACK), then corrections from what
 the equations R + XW = Y and XᵀR = λW leave over, formed exactly in Python's integers, until they are below 2⁻⁷⁰ of the
 weights. That they shrink, each to a small share of the one before, verifies the answer; else TruthError is raised.
 """
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from flint import fmpq_mat, fmpz_mat
 from scipy.linalg import solve_triangular
 
 __all__ = ["TruthError", "exact_weights", "refined_weights"]
@@ -57,15 +58,17 @@ def exact_weights(rows: FloatArray, targets: FloatArray, penalty: float, repeats
     gram, right = repeats * (x.T @ x), repeats * (x.T @ y)
     # In units: A_ij = 2^(p_i + p_j) gram_ij, so λ counts 2^(−2 p_i) λ on the diagonal; all brought to whole numbers.
     ridge = [Fraction(penalty) / Fraction(2) ** (2 * place) for place in places]
-    solution = _bareiss(gram, right, ridge)
+    solution = _rational(gram, right, ridge)
     if solution is None:
         size = max((Fraction(2) ** (2 * p) * int(gram[j, j]) for j, p in enumerate(places)), default=Fraction(1))
         least = (size or Fraction(1)) / 2**VANISHING
-        solution = _bareiss(gram, right, [least / Fraction(2) ** (2 * place) for place in places])
+        solution = _rational(gram, right, [least / Fraction(2) ** (2 * place) for place in places])
     assert solution is not None
     weights = np.zeros((len(places), len(above)), dtype=np.longdouble)
     for row, column in np.ndindex(weights.shape):
-        weights[row, column] = _long(solution[row][column] * Fraction(2) ** (above[column] - places[row]))
+        found = solution[row, column]
+        value = Fraction(int(found.p), int(found.q)) * Fraction(2) ** (above[column] - places[row])
+        weights[row, column] = _long(value)
     return weights
 
 
@@ -79,28 +82,15 @@ def _long(value: Fraction) -> Any:
     return np.ldexp(np.longdouble(high) * np.longdouble(2**32) + np.longdouble(low), -shift)
 
 
-def _bareiss(gram: Integers, right: Integers, ridge: list[Fraction]) -> list[list[Fraction]] | None:
-    """The solution of (gram + ridge) X = right, as fractions; None where the matrix is singular."""
+def _rational(gram: Integers, right: Integers, ridge: list[Fraction]) -> fmpq_mat | None:
+    """The solution of (gram + ridge) X = right in fractions; None where the matrix is singular."""
     common = max((value.denominator for value in ridge), default=1)  # powers of two: the largest is a multiple of all
-    table = np.concatenate([gram * common, right * common], axis=1)
-    size = len(gram)
-    table[np.arange(size), np.arange(size)] += np.array([int(value * common) for value in ridge], dtype=object)
-    before = 1
-    for k in range(size):
-        pivot = next((row for row in range(k, size) if table[row, k]), None)
-        if pivot is None:
-            return None
-        table[[k, pivot]] = table[[pivot, k]]
-        others = table[k + 1 :, k + 1 :] * table[k, k] - table[k + 1 :, k, None] * table[k, k + 1 :]
-        table[k + 1 :, k + 1 :] = others // before
-        before = table[k, k]
-    found = [[Fraction(0)] * right.shape[1] for _ in range(size)]
-    for column in range(right.shape[1]):
-        for row in range(size - 1, -1, -1):
-            rest = Fraction(table[row, size + column])
-            rest -= sum((table[row, at] * found[at][column] for at in range(row + 1, size)), start=Fraction(0))
-            found[row][column] = rest / int(table[row, row])
-    return found
+    system = gram * common
+    system[np.diag_indices(len(gram))] += np.array([int(value * common) for value in ridge], dtype=object)
+    try:
+        return fmpq_mat(fmpz_mat(system.tolist())).solve(fmpq_mat(fmpz_mat((right * common).tolist())))
+    except ZeroDivisionError:
+        return None
 
 
 def refined_weights(rows: FloatArray, targets: FloatArray, penalty: float) -> LongArray:

@@ -70,7 +70,7 @@ def _write_touches(path: Path, seed: int, touches: int, pairs: int) -> int:
 
 
 class _Worker:
-    """A process of `worker` with a checkout's path, ready to be asked."""
+    """A process of `worker` with a checkout's path, ready for calls."""
 
     def __init__(self, checkout: Path, touches: Path, folder: Path) -> None:
         # -P: beside the checkout's own path nothing of this folder's is to be imported.

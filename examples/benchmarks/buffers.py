@@ -57,13 +57,13 @@ class LiveHerding:
         """Feel a touch: herd its material again, and cut the others to their quotas."""
         candidates = [*self._kept.get(material, []), (key, code)]
         order = herd(np.stack([code for _, code in candidates]), [key for key, _ in candidates], mean, len(candidates))
-        self._kept[material] = [candidates[at] for at in order]
-        places = quotas({name: len(those) for name, those in self._kept.items()}, self.capacity)
-        self._kept = {name: those[: places[name]] for name, those in self._kept.items()}
+        self._kept[material] = [candidates[i] for i in order]
+        places = quotas({name: len(chosen) for name, chosen in self._kept.items()}, self.capacity)
+        self._kept = {name: chosen[: places[name]] for name, chosen in self._kept.items()}
 
     def buffer(self) -> Buffer:
         """Material → keys of its exemplars, in herding order."""
-        return {name: [key for key, _ in those] for name, those in sorted(self._kept.items())}
+        return {name: [key for key, _ in chosen] for name, chosen in sorted(self._kept.items())}
 
 
 class UniformRandom:
@@ -77,12 +77,12 @@ class UniformRandom:
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
         """Feel a touch: draw its number, and cut all materials to their quotas."""
         self._kept[material] = sorted([*self._kept.get(material, []), (self._rng.random(), key)])
-        places = quotas({name: len(those) for name, those in self._kept.items()}, self.capacity)
-        self._kept = {name: those[: places[name]] for name, those in self._kept.items()}
+        places = quotas({name: len(chosen) for name, chosen in self._kept.items()}, self.capacity)
+        self._kept = {name: chosen[: places[name]] for name, chosen in self._kept.items()}
 
     def buffer(self) -> Buffer:
         """Material → keys of its exemplars."""
-        return {name: [key for _, key in those] for name, those in sorted(self._kept.items())}
+        return {name: [key for _, key in chosen] for name, chosen in sorted(self._kept.items())}
 
 
 class _Pooled:
@@ -94,7 +94,7 @@ class _Pooled:
 
     def buffer(self) -> Buffer:
         ranked = rank(self._pool, lambda material, _: self._means[material])
-        return {name: [one.key for one in those] for name, those in ranked.items()}
+        return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 
 def _pooled(capacity: int, ratio: int, means: Mapping[str, IntArray], _: int) -> Chooser:
@@ -138,23 +138,23 @@ def compare(
     codes: of the touches, shape (N, d). Returns `full`, `pooled-2` and so on, `live`, `random`.
     """
     names = np.array(materials)
-    felt = {name: codes[names == name] for name in sorted(set(materials))}
-    means = {name: mean_code(rows.sum(axis=0, dtype=np.int64), len(rows)) for name, rows in felt.items()}
+    observed = {name: codes[names == name] for name in sorted(set(materials))}
+    means = {name: mean_code(rows.sum(axis=0, dtype=np.int64), len(rows)) for name, rows in observed.items()}
     ways: dict[str, Callable[[int], Chooser]] = {"full": partial(_pooled, len(keys), 1, means)}
     for ratio in ratios:
         ways[f"pooled-{ratio}"] = partial(_pooled, capacity, ratio, means)
     ways |= {"live": lambda _: LiveHerding(capacity), "random": lambda number: UniformRandom(capacity, number)}
     orders = [np.random.default_rng([seed, number]).permutation(len(keys)) for number in range(2)]
     code_of = dict(zip(keys, codes, strict=True))
-    places = quotas({name: len(rows) for name, rows in felt.items()}, capacity)
+    places = quotas({name: len(rows) for name, rows in observed.items()}, capacity)
     choices: dict[str, Choice] = {}
     for way, make in ways.items():
         buffers = [
             _chosen(make(2 * seed + number), order, codes, keys, materials) for number, order in enumerate(orders)
         ]
-        buffers = [{name: those[: places[name]] for name, those in buffer.items()} for buffer in buffers]
+        buffers = [{name: chosen[: places[name]] for name, chosen in buffer.items()} for buffer in buffers]
         gaps = [mean_gap({n: np.stack([code_of[k] for k in b[n]]) for n in b}, means) for b in buffers]
-        kept = [{key for those in buffer.values() for key in those} for buffer in buffers]
+        kept = [{key for chosen in buffer.values() for key in chosen} for buffer in buffers]
         gap = float(np.mean(gaps))
         full = choices["full"].gap if choices else gap
         overlap = len(kept[0] & kept[1]) / max(len(kept[0]), 1)
@@ -167,11 +167,11 @@ def _chosen(
 ) -> Buffer:
     sums: dict[str, IntArray] = {}
     counts: dict[str, int] = {}
-    for at in order:
-        name = materials[at]
-        sums[name] = sums.get(name, np.zeros(codes.shape[1], np.int64)) + codes[at]
+    for i in order:
+        name = materials[i]
+        sums[name] = sums.get(name, np.zeros(codes.shape[1], np.int64)) + codes[i]
         counts[name] = counts.get(name, 0) + 1
-        chooser.add(name, keys[at], codes[at], mean_code(sums[name], counts[name]))
+        chooser.add(name, keys[i], codes[i], mean_code(sums[name], counts[name]))
     return chooser.buffer()
 
 
@@ -188,18 +188,18 @@ def run_buffers(
     Returns circumstances and a list of records: capacity, way, gap, ratio to full herding's, overlap of two schedules,
     accuracy of f* by itself and of f, on the first fold.
     """
-    lessons, exam = hold_out(recordings, recordings.fold == 0)
+    train, test = hold_out(recordings, recordings.fold == 0)
     learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=len(recordings))
     note("learning")
-    for touch in lessons:
+    for touch in train:
         learner.observe(*touch)
     assert learner._memory.exemplars is not None
     kept = list(learner._memory.exemplars)
-    codes, keys = np.stack([one.code for one in kept]), [one.key for one in kept]
-    f = float(np.mean([learner.predict(stream).material == name for name, stream in exam]))
+    codes, keys = np.stack([exemplar.code for exemplar in kept]), [exemplar.key for exemplar in kept]
+    f = float(np.mean([learner.predict(stream).material == name for name, stream in test]))
     records = []
     for capacity in capacities:
-        for way, choice in compare(codes, keys, [one.material for one in kept], capacity, seed).items():
+        for way, choice in compare(codes, keys, [exemplar.material for exemplar in kept], capacity, seed).items():
             note(f"{capacity} exemplars, {way}: fine-tuning")
             records.append(
                 {
@@ -208,7 +208,7 @@ def run_buffers(
                     "gap": choice.gap,
                     "ratio": choice.to_full,
                     "overlap": choice.shared,
-                    "tuned": _tuned(learner, choice.buffer, kept, exam, seed),
+                    "tuned": _tuned(learner, choice.buffer, kept, test, seed),
                     "f": f,
                 }
             )
@@ -216,15 +216,15 @@ def run_buffers(
 
 
 def _tuned(
-    learner: TactileLearner, buffer: Buffer, kept: Sequence[Exemplar], exam: Sequence[tuple[str, Any]], seed: int
+    learner: TactileLearner, buffer: Buffer, kept: Sequence[Exemplar], test: Sequence[tuple[str, Any]], seed: int
 ) -> float:
     """Accuracy of an f* fine-tuned on a buffer, whether it would be kept or not."""
-    of = {one.key: one for one in kept}
-    exemplars = {name: [of[key] for key in those] for name, those in buffer.items()}
+    of = {exemplar.key: exemplar for exemplar in kept}
+    exemplars = {name: [of[key] for key in chosen] for name, chosen in buffer.items()}
     tuned, _ = fine_tune(learner.embedding, learner.model(), exemplars, learner.sensor, seed=seed)
     reader = TunedReader(learner.embedding, learner._reading, tuned)
     right = []
-    for name, stream in exam:
+    for name, stream in test:
         logits = reader.logits(tactile_image(stream))
         right.append(max(logits, key=logits.__getitem__) == name)
     return float(np.mean(right))

@@ -1,9 +1,9 @@
 """`python -m examples.benchmarks frontier`: error against milliseconds, on recorded touches.
 
-Width of the embedding × readout × length of the touch asked about, learned from one pass over the other folds into a
+Width of the embedding × readout × length of the touch, learned from one pass over the other folds into a
 memory on disk; and beside it other libraries' learners on the same feature vectors, one for each touch. Times are of
 the processor, on one thread, the median and the 99th percentile over the touches of one fold. Errors are of all folds
-asked for.
+given.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from examples.benchmarks.vector_peers import (
     GradientSteps,
     OneVsRest,
     Ours,
-    Peer,
     PseudoInverse,
     RecursiveFilters,
     Refitted,
+    VectorPeer,
     lacking,
 )
 from examples.paper.studies.peers import touch_features
@@ -77,40 +77,40 @@ def run_frontier(
                 tried.setdefault(key, []).append(share)
                 times.setdefault(key, taken)
         for (readout, length), wrong in tried.items():
-            told = {"dataset": recordings.name, "width": width, "readout": readout, "length": length}
+            common = {"dataset": recordings.name, "width": width, "readout": readout, "length": length}
             touches = int(np.isin(recordings.fold, folds).sum())
-            records.append(told | {"wrong": float(np.mean(wrong)), "touches": touches} | times[readout, length])
+            records.append(common | {"wrong": float(np.mean(wrong)), "touches": touches} | times[readout, length])
     return records
 
 
 def _one_fold(recordings: Recordings, fold: int, width: int) -> list[tuple[tuple[str, str], float, Record]]:
-    learned, asked = hold_out(recordings, recordings.fold == fold)
+    train, test = hold_out(recordings, recordings.fold == fold)
     found = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         path, embedding = Path(folder, "memory"), Kernels(dimension=width)
         with TactileLearner.open(path, sensor=recordings.sensor, embedding=embedding, exemplars=0) as learner:
-            observing = [timed(partial(learner.observe, *one), "processor") for one in learned]
+            observing = [timed(partial(learner.observe, *touch), "processor") for touch in train]
         for readout in get_args(ReadoutName):
             with TactileLearner.open(path, embedding=embedding, readout=readout, mode="read") as learner:
-                first = timed(partial(learner.predict, asked[0][1]), "processor")
+                first = timed(partial(learner.predict, test[0][1]), "processor")
                 for seconds in LENGTHS:
-                    wrong, predicting = _answered(learner, asked, seconds)
+                    wrong, predicting = _answered(learner, test, seconds)
                     times = {**_times("observe", observing), **_times("predict", predicting)}
                     times |= {"first_predict_ms": 1e3 * first}
                     found.append(((readout, "all" if seconds is None else f"{seconds:g} s"), wrong, times))
     return found
 
 
-def _answered(learner: TactileLearner, asked: Sequence[Labelled], seconds: float | None) -> tuple[float, list[float]]:
+def _answered(learner: TactileLearner, test: Sequence[Labelled], seconds: float | None) -> tuple[float, list[float]]:
     """The share of touches that were taken for something else, and the seconds that each answer took."""
     wrong, taken = 0, []
-    for name, stream in asked:
+    for name, stream in test:
         cut = stream if seconds is None else stream.first(seconds)
         begun = time.process_time()
         said = learner.predict(cut).material
         taken.append(time.process_time() - begun)
         wrong += said != name
-    return wrong / len(asked), taken
+    return wrong / len(test), taken
 
 
 def _times(verb: str, seconds: Sequence[float]) -> Record:
@@ -124,28 +124,28 @@ def run_peers(recordings: Recordings, fold: int, seed: int, *, note: Note = lamb
     In a random order, which gradient steps need. `predict_ms` is of a prediction that follows others, `fresh_ms` of
     one that follows an observation.
     """
-    learned, asked = hold_out(recordings, recordings.fold == fold)
+    train, test = hold_out(recordings, recordings.fold == fold)
     embedding = Kernels(dimension=PEERS_WIDTH)
-    note(f"{recordings.name}: {PEERS_WIDTH} features of {len(learned) + len(asked)} touches")
+    note(f"{recordings.name}: {PEERS_WIDTH} features of {len(train) + len(test)} touches")
     names = sorted(set(recordings.materials))
-    rows = touch_features(embedding, [stream for _, stream in learned])
-    questions = touch_features(embedding, [stream for _, stream in asked])
-    places = [names.index(name) for name, _ in learned]
-    truth = [names.index(name) for name, _ in asked]
+    rows = touch_features(embedding, [stream for _, stream in train])
+    questions = touch_features(embedding, [stream for _, stream in test])
+    places = [names.index(name) for name, _ in train]
+    truth = [names.index(name) for name, _ in test]
     order = np.random.default_rng(seed).permutation(len(rows)).tolist()
     records = []
     for name, package, make in _peers(len(names), seed):
-        told = {"dataset": recordings.name, "learner": name, "features": PEERS_WIDTH}
+        common = {"dataset": recordings.name, "learner": name, "features": PEERS_WIDTH}
         if why := lacking(package):
-            records.append(told | {"measured": False, "why": why})
+            records.append(common | {"measured": False, "why": why})
             continue
         note(f"{recordings.name}: {name}")
         with threadpool_limits(1):
-            records.append(told | {"measured": True} | _measured(make(), rows, places, order, questions, truth))
+            records.append(common | {"measured": True} | _measured(make(), rows, places, order, questions, truth))
     return records
 
 
-def _peers(classes: int, seed: int) -> list[tuple[str, str, Callable[[], Peer]]]:
+def _peers(classes: int, seed: int) -> list[tuple[str, str, Callable[[], VectorPeer]]]:
     """Name, the package that it needs, how it is made."""
     return [
         ("ours, refit=0: λ at every change", "torch", lambda: Ours(PEERS_WIDTH, 0.0)),
@@ -159,7 +159,7 @@ def _peers(classes: int, seed: int) -> list[tuple[str, str, Callable[[], Peer]]]
 
 
 def _measured(
-    peer: Peer,
+    peer: VectorPeer,
     rows: FloatArray,
     places: Sequence[int],
     order: Sequence[int],
@@ -167,8 +167,8 @@ def _measured(
     truth: Sequence[int],
 ) -> Record:
     observing, fresh = [], []
-    for step, at in enumerate(order):
-        observing.append(timed(partial(peer.observe, places[at], rows[at]), "processor"))
+    for step, i in enumerate(order):
+        observing.append(timed(partial(peer.observe, places[i], rows[i]), "processor"))
         if step >= len(order) - SLOW:
             fresh.append(timed(partial(peer.predict, questions[0]), "processor"))
     taken, wrong = [], 0
@@ -192,23 +192,23 @@ def knee(records: Sequence[Record], readout: ReadoutName = "lda") -> Record:
     the next wider takes away, and how much longer it predicts. The knee is the first width from which no wider takes
     away more than a standard error, √(e (1 − e) / n) with n touches a data set.
     """
-    mine = [one for one in records if one["readout"] == readout and one["length"] == "all"]
-    widths = sorted({one["width"] for one in mine})
+    mine = [record for record in records if record["readout"] == readout and record["length"] == "all"]
+    widths = sorted({record["width"] for record in mine})
     steps = []
     for width in widths:
-        of = [one for one in mine if one["width"] == width]
+        of_width = [record for record in mine if record["width"] == width]
         steps.append(
             {
                 "width": width,
-                "wrong": float(np.mean([one["wrong"] for one in of])),
-                "predict_ms": float(np.mean([one["predict_ms"] for one in of])),
-                "observe_ms": float(np.mean([one["observe_ms"] for one in of])),
-                "touches": sum(one["touches"] for one in of),
+                "wrong": float(np.mean([record["wrong"] for record in of_width])),
+                "predict_ms": float(np.mean([record["predict_ms"] for record in of_width])),
+                "observe_ms": float(np.mean([record["observe_ms"] for record in of_width])),
+                "touches": sum(record["touches"] for record in of_width),
             }
         )
-    for at, step in enumerate(steps):
+    for i, step in enumerate(steps):
         spread = float(np.sqrt(max(step["wrong"] * (1 - step["wrong"]), 1e-6) / step["touches"]))
-        gained = max((step["wrong"] - wider["wrong"] for wider in steps[at + 1 :]), default=0.0)
+        gained = max((step["wrong"] - wider["wrong"] for wider in steps[i + 1 :]), default=0.0)
         step |= {"standard_error": spread, "gained_by_wider": gained}
     chosen = next(step["width"] for step in steps if step["gained_by_wider"] <= step["standard_error"])
     return {"readout": readout, "width": chosen, "default": Kernels().dimension, "steps": steps}

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from examples.benchmarks.timing import Timing, circumstances
-from examples.benchmarks.vector_peers import GradientSteps, Ours, Peer, PseudoInverse, Refitted, lacking
+from examples.benchmarks.vector_peers import GradientSteps, Ours, PseudoInverse, Refitted, VectorPeer, lacking
 from scroll_tactile.embeddings import Capabilities
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import Readout, fit_readout
@@ -87,8 +87,8 @@ def run_interleaved(
     sizes = {"streams": streams, "materials": materials, "features": AsIs.dimension}
     result: Record = {"bench": "interleaved", **circumstances(seed), **sizes}
     source = _Source(materials, AsIs.dimension, seed)
-    taught = [(i % materials, source.row(i % materials)) for i in range(streams)]
-    asked = [(place, source.row(place), source.row(place)) for place in source.places(pairs)]
+    train = [(i % materials, source.row(i % materials)) for i in range(streams)]
+    test = [(place, source.row(place), source.row(place)) for place in source.places(pairs)]
     records = []
     for name, package, make, number in _learners(materials, pairs, seed):
         if why := lacking(package):
@@ -96,21 +96,21 @@ def run_interleaved(
             continue
         note(f"{name}: {streams} streams, {number} pairs")
         learner = make()
-        for place, row in taught:
+        for place, row in train:
             learner.observe(place, row)
-        learner.predict(asked[0][1])  # the first fit is not a pair's
+        learner.predict(test[0][1])  # the first fit is not a pair's
         with threadpool_limits(1):
-            records.append({"learner": name, "measured": True} | _pairs(learner, asked[:number]))
+            records.append({"learner": name, "measured": True} | _pairs(learner, test[:number]))
         if isinstance(learner, _OnDisk):
             learner.close()
     note(f"{interleavings} interleavings")
     return result | {"records": _with_ratios(records), "drift": _drift(interleavings, seed)}
 
 
-def _pairs(learner: Peer, asked: list[tuple[int, FloatArray, FloatArray]]) -> Record:
+def _pairs(learner: VectorPeer, test: list[tuple[int, FloatArray, FloatArray]]) -> Record:
     """Times of an observation, of the prediction that follows it, and of both, and the share of wrong answers."""
     observing, predicting, right = [], [], 0
-    for place, row, question in asked:
+    for place, row, question in test:
         begun = time.perf_counter()
         learner.observe(place, row)
         between = time.perf_counter()
@@ -125,11 +125,11 @@ def _pairs(learner: Peer, asked: list[tuple[int, FloatArray, FloatArray]]) -> Re
         **Timing.of(predicting).record("predict_"),
         "pairs": pair.calls,
         "clock": pair.clock,
-        "wrong": 1 - right / len(asked),
+        "wrong": 1 - right / len(test),
     }
 
 
-def _learners(materials: int, pairs: int, seed: int) -> list[tuple[str, str, Callable[[], Peer], int]]:
+def _learners(materials: int, pairs: int, seed: int) -> list[tuple[str, str, Callable[[], VectorPeer], int]]:
     """Name, the package that it needs, how it is made, and how many pairs are timed."""
     few, d = max(2, pairs // 50), AsIs.dimension
     return [
@@ -182,19 +182,19 @@ def _drift(interleavings: int, seed: int) -> Record:
     def codes(place: int) -> npt.NDArray[np.int32]:
         return np.rint(source.row(place)[None] * 2**20).astype(np.int32)
 
-    for at in range(200):
-        statistics.add(names[at % materials], at % 3, {scale: codes(at % materials)})
+    for i in range(200):
+        statistics.add(names[i % materials], i % 3, {scale: codes(i % materials)})
     start = fit_readout(task_of(statistics, scale), DEFAULT)
     tracked, recursive = WoodburyReadout(statistics, scale, start), RecursiveLeastSquares(statistics, scale, start)
     worst = {"exact": 0.0, "recursive": 0.0}
-    for at, place in enumerate(source.places(interleavings)):
+    for i, place in enumerate(source.places(interleavings)):
         rows = codes(place)
-        statistics.add(names[place], at % 3, {scale: rows})
+        statistics.add(names[place], i % 3, {scale: rows})
         if not tracked.add(rows, place):
             tracked.anchor(statistics)
         recursive.add(rows, place)
         found = {"exact": tracked.readout()}
-        if at % max(1, interleavings // 100) == 0 or at + 1 == interleavings:
+        if i % max(1, interleavings // 100) == 0 or i + 1 == interleavings:
             anew = WoodburyReadout(statistics, scale, start).readout()
             found["recursive"] = recursive.readout()
             worst = {name: max(worst[name], _difference(readout, anew)) for name, readout in found.items()}

@@ -29,7 +29,7 @@ def draw_frontier(path: Path, records: Records, peers: Records, *, default: int)
     FigureCanvasAgg(figure)
     ours, others = figure.subplots(1, 2)
     _draw_widths(ours, records, default)
-    _draw_peers(others, [one for one in peers if one["measured"]])
+    _draw_peers(others, [record for record in peers if record["measured"]])
     for panel in (ours, others):
         panel.set(xscale="log", yscale="log", ylabel="touches taken for something else, %")
         panel.grid(alpha=0.25, which="both")
@@ -42,32 +42,38 @@ def draw_frontier(path: Path, records: Records, peers: Records, *, default: int)
 
 
 def _draw_widths(panel: Any, records: Records, default: int) -> None:
-    lines = dict.fromkeys((one["dataset"], one["length"], one["readout"]) for one in records)
-    colours = {key: f"C{at}" for at, key in enumerate(dict.fromkeys((dataset, length) for dataset, length, _ in lines))}
+    lines = dict.fromkeys((record["dataset"], record["length"], record["readout"]) for record in records)
+    colours = {key: f"C{i}" for i, key in enumerate(dict.fromkeys((dataset, length) for dataset, length, _ in lines))}
     for dataset, length, readout in lines:
-        mine = [one for one in records if (one["dataset"], one["length"], one["readout"]) == (dataset, length, readout)]
-        mine.sort(key=lambda one: one["width"])
-        at, errors = [one["predict_ms"] for one in mine], [_percent(one) for one in mine]
+        mine = [
+            record
+            for record in records
+            if (record["dataset"], record["length"], record["readout"]) == (dataset, length, readout)
+        ]
+        mine.sort(key=lambda record: record["width"])
+        times, errors = [record["predict_ms"] for record in mine], [_percent(record) for record in mine]
         colour = colours[dataset, length]
         label = f"{dataset}, {'whole touches' if length == 'all' else length}, {readout}"
-        panel.plot(at, errors, STYLES[readout], color=colour, marker=".", label=label)
-        marked = [place for place, one in enumerate(mine) if one["width"] == default]
-        panel.scatter([at[place] for place in marked], [errors[place] for place in marked], s=90, color=colour)
+        panel.plot(times, errors, STYLES[readout], color=colour, marker=".", label=label)
+        marked = [place for place, record in enumerate(mine) if record["width"] == default]
+        panel.scatter([times[place] for place in marked], [errors[place] for place in marked], s=90, color=colour)
     panel.set(xlabel="ms a prediction, embedding included", title=f"widths of the embedding; large: {default}, default")
 
 
 def _draw_peers(panel: Any, peers: Records) -> None:
-    names = list(dict.fromkeys(one["learner"] for one in peers))
-    markers = dict(zip(dict.fromkeys(one["dataset"] for one in peers), "os^D", strict=False))
-    for at, name in enumerate(names):
-        for one in (one for one in peers if one["learner"] == name):
-            label = f"{name}, {one['dataset']}"
-            pair = one["observe_ms"] + one["fresh_ms"]
-            panel.scatter(pair, _percent(one), s=70, color=f"C{at % 10}", marker=markers[one["dataset"]], label=label)
+    names = list(dict.fromkeys(record["learner"] for record in peers))
+    markers = dict(zip(dict.fromkeys(record["dataset"] for record in peers), "os^D", strict=False))
+    for i, name in enumerate(names):
+        for record in (record for record in peers if record["learner"] == name):
+            label = f"{name}, {record['dataset']}"
+            pair = record["observe_ms"] + record["fresh_ms"]
+            panel.scatter(
+                pair, _percent(record), s=70, color=f"C{i % 10}", marker=markers[record["dataset"]], label=label
+            )
     features = peers[0]["features"] if peers else ""
     panel.set(xlabel="ms an observation and the prediction that follows", title=f"the same {features} features for all")
 
 
-def _percent(one: Mapping[str, Any]) -> float:
+def _percent(record: Mapping[str, Any]) -> float:
     # None wrong has no place on a logarithmic axis: it stands where a tenth of a percent is.
-    return max(100.0 * float(one["wrong"]), 0.1)
+    return max(100.0 * float(record["wrong"]), 0.1)

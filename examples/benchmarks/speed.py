@@ -41,7 +41,7 @@ Record = dict[str, Any]
 Note = Callable[[str], None]
 WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 BLOCK = 64  # rows in which the plain update is fed, and ours
-TAUGHT = 20  # touches of each of twenty materials, before a user's calls are timed
+TRAIN_TOUCHES = 20  # touches of each of twenty materials, before a user's calls are timed
 FRESH = 20  # observations, each with a prediction after it: a second or more each
 PROCESSOR: Clock = "processor"
 
@@ -59,7 +59,7 @@ def run_speed(
     rounds: each call is timed five times in a round. before: a checkout of the project to be timed beside this one.
     """
     result = {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads()}
-    note(f"a memory of {TAUGHT} touches of each material: observe, predict, beside a ResNet-18")
+    note(f"a memory of {TRAIN_TOUCHES} touches of each material: observe, predict, beside a ResNet-18")
     records = _user_calls(seed, rounds)
     note("a statistics update beside a plain dsyrk")
     records.append(_update_and_dsyrk(seed, rounds))
@@ -72,7 +72,7 @@ def run_speed(
     result["records"] = records
     if before is not None:
         note("this checkout beside the one before")
-        result["before"] = run_before(before, seed=seed, touches=TAUGHT, pairs=FRESH)
+        result["before"] = run_before(before, seed=seed, touches=TRAIN_TOUCHES, pairs=FRESH)
     return result
 
 
@@ -109,7 +109,7 @@ def _user_calls(seed: int, rounds: int) -> list[Record]:
     scene = Scene(sensor=sensors.BIOTAC, seed=seed)
     network = BareResNet(ResNet.random(seed)).eval()
     image = torch.from_numpy(three_planes(tactile_image(scene.touch(scene.materials[0], 99)))[None])
-    asked, told = _ready(scene, 1000, 200), _ready(scene, 2000, FRESH)
+    evaluated, added = _ready(scene, 1000, 200), _ready(scene, 2000, FRESH)
 
     def forward() -> None:
         with torch.inference_mode():
@@ -118,18 +118,21 @@ def _user_calls(seed: int, rounds: int) -> list[Record]:
     with tempfile.TemporaryDirectory() as folder, TactileLearner.open(folder, sensor=scene.sensor) as learner:
         observing = []
         touches = _touches(scene, 0)
-        for _ in range(TAUGHT * len(scene.materials)):
+        for _ in range(TRAIN_TOUCHES * len(scene.materials)):
             observing.append(timed(partial(learner.observe, *next(touches))))
-        calls: dict[str, Callable[[], object]] = {"predict": lambda: learner.predict(next(asked)[1]), "resnet": forward}
+        calls: dict[str, Callable[[], object]] = {
+            "predict": lambda: learner.predict(next(evaluated)[1]),
+            "resnet": forward,
+        }
         turns = take_turns(calls, rounds)
         fresh = []
-        for name, readings in (next(told) for _ in range(FRESH)):
+        for name, readings in (next(added) for _ in range(FRESH)):
             observing.append(timed(partial(learner.observe, name, readings)))
-            fresh.append(timed(partial(learner.predict, next(asked)[1])))
-        tries = [next(asked) for _ in range(60)]
+            fresh.append(timed(partial(learner.predict, next(evaluated)[1])))
+        tries = [next(evaluated) for _ in range(60)]
         wrong = np.mean([learner.predict(readings).material != name for name, readings in tries])
     predict = turns["predict"]
-    memory = f"memory of {TAUGHT * len(scene.materials)} touches on disk"
+    memory = f"memory of {TRAIN_TOUCHES * len(scene.materials)} touches on disk"
     error = f"{100 * wrong:.1f} % of simulated touches wrong"
     beside = "ResNet-18 forward of the same image, torch"
     return [
@@ -144,8 +147,8 @@ def _update_and_dsyrk(seed: int, rounds: int) -> Record:
     dimension, rows = 1008, 16 * BLOCK
     features = rng.random((rows, dimension))
     codes = to_codes(features, 1.0)
-    blocks = [codes[at : at + BLOCK] for at in range(0, rows, BLOCK)]
-    plain_blocks = [np.asfortranarray(features[at : at + BLOCK].T) for at in range(0, rows, BLOCK)]
+    blocks = [codes[i : i + BLOCK] for i in range(0, rows, BLOCK)]
+    plain_blocks = [np.asfortranarray(features[i : i + BLOCK].T) for i in range(0, rows, BLOCK)]
 
     def ours() -> npt.NDArray[np.int64]:
         moment = SecondMoment(dimension)
@@ -155,8 +158,8 @@ def _update_and_dsyrk(seed: int, rounds: int) -> Record:
 
     def plain(order: list[int] | None = None) -> npt.NDArray[np.float64]:
         total = np.zeros((dimension, dimension), order="F")
-        for at in order or range(len(blocks)):
-            total = dsyrk(1.0, plain_blocks[at], beta=1.0, c=total, overwrite_c=1, lower=0)
+        for i in order or range(len(blocks)):
+            total = dsyrk(1.0, plain_blocks[i], beta=1.0, c=total, overwrite_c=1, lower=0)
         return total
 
     with one_thread():
@@ -223,7 +226,9 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
         }
         timings = take_turns(calls, rounds, warm_up=1, clock=PROCESSOR)
     pairs = zip(fit_readouts(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
-    worst = max(float(np.abs(one.weights - two.weights).max() / np.abs(two.weights).max()) for one, two in pairs)
+    worst = max(
+        float(np.abs(ours.weights - theirs.weights).max() / np.abs(theirs.weights).max()) for ours, theirs in pairs
+    )
     return _record(
         f"readouts of {count} λ, {dimension} features, {classes} materials: one tridiagonalisation",
         timings["path"],
@@ -237,7 +242,7 @@ def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
 def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
     scene = Scene(sensor=sensors.BIOTAC, seed=seed)
     fresh = [_ready(scene, 1000, 5 * rounds + 3) for _ in range(2)]
-    asked = [_ready(scene, 5000, 100) for _ in range(2)]
+    evaluated = [_ready(scene, 5000, 100) for _ in range(2)]
     with tempfile.TemporaryDirectory() as folder:
         small = _filled(Path(folder) / "small", scene, 1000, seed)
         large = _filled(Path(folder) / "large", scene, observations, seed)
@@ -248,8 +253,8 @@ def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
             }
             observing = take_turns(calls, rounds)
             calls = {
-                "small": lambda: small.predict(next(asked[0])[1]),
-                "large": lambda: large.predict(next(asked[1])[1]),
+                "small": lambda: small.predict(next(evaluated[0])[1]),
+                "large": lambda: large.predict(next(evaluated[1])[1]),
             }
             predicting = take_turns(calls, rounds)
     pairs = [
@@ -269,16 +274,16 @@ def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLe
     learner = TactileLearner.open(path, sensor=scene.sensor)
     rng = np.random.default_rng([seed, observations])
     widths = scales(scene.sensor)
-    one = extent(widths[-1], widths)
-    store, memory = learner._ledger.store, learner.memory
+    of_touch = extent(widths[-1], widths)
+    store, memory = learner._ledger.store, learner._memory
     assert store is not None
-    for at in range(observations):
+    for i in range(observations):
         codes = {
             Scale("window", width): rng.integers(0, 23, size=(1, learner.embedding.dimension), dtype=np.int32) * 2**14
-            for width in one
+            for width in of_touch
         }
         key = rng.bytes(32)
-        material = scene.materials[at % len(scene.materials)]
+        material = scene.materials[i % len(scene.materials)]
         columns = widths[0]
         record = store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=pack_codes(codes))
         memory.add(material, key, columns, codes, record.sequence)

@@ -21,13 +21,22 @@ from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 
-__all__ = ["GradientSteps", "OneVsRest", "Ours", "Peer", "PseudoInverse", "RecursiveFilters", "Refitted", "lacking"]
+__all__ = [
+    "GradientSteps",
+    "OneVsRest",
+    "Ours",
+    "PseudoInverse",
+    "RecursiveFilters",
+    "Refitted",
+    "VectorPeer",
+    "lacking",
+]
 
 FloatArray = npt.NDArray[np.float64]
 WHOLE = Scale("window", 1)
 
 
-class Peer(Protocol):
+class VectorPeer(Protocol):
     """Learns feature vectors of shape (d,) of classes that are numbered from 0, and says which one a vector is of."""
 
     def observe(self, place: int, row: FloatArray) -> None:
@@ -47,7 +56,7 @@ def lacking(package: str) -> str:
 
 
 class Ours:
-    """The statistics and the readout of a memory, fed feature vectors as the peers are (`Peer`).
+    """The statistics and the readout of a memory, fed feature vectors as the peers are (`VectorPeer`).
 
     dimension: d, of vectors in [-bound, bound]. λ is chosen again where there is a new class or the rows have grown
     by the share `refit`; in between the readout follows, as a learner's does.
@@ -210,9 +219,9 @@ class RecursiveFilters:
 
     def observe(self, place: int, row: FloatArray) -> None:
         """Adapt every filter."""
-        for at, one in enumerate(self.filters):
-            one.adapt(float(at == place), row)
+        for i, classifier in enumerate(self.filters):
+            classifier.adapt(float(i == place), row)
 
     def predict(self, row: FloatArray) -> int:
         """The filter with the highest output."""
-        return int(np.argmax([one.predict(row) for one in self.filters]))
+        return int(np.argmax([classifier.predict(row) for classifier in self.filters]))

@@ -183,8 +183,8 @@ def _predicting(scene: Scene, embedding: Vision) -> Iterator[Callable[[], object
         for name in scene.materials:
             for repetition in range(TOUCHES):
                 learner.observe(name, scene.touch(name, repetition))
-        asked = cycle([np.array(scene.touch(name, TOUCHES).readings) for name in scene.materials])
-        yield lambda: learner.predict(next(asked))
+        test = cycle([np.array(scene.touch(name, TOUCHES).readings) for name in scene.materials])
+        yield lambda: learner.predict(next(test))
 
 
 def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], note: Note) -> dict[str, float]:
@@ -198,8 +198,8 @@ def _accuracies(data: Path, state: dict[str, torch.Tensor], ways: list[_Way], no
         for material, stream, held_out in touches:
             if not held_out:
                 learner.observe(material, stream)
-        asked = [(material, stream) for material, stream, held_out in touches if held_out]
-        right = [learner.predict(stream).material == material for material, stream in asked]
+        test = [(material, stream) for material, stream, held_out in touches if held_out]
+        right = [learner.predict(stream).material == material for material, stream in test]
         shares[way.name] = sum(right) / len(right)
     return shares
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from examples.benchmarks.solvers.certified import FIRST_BITS
-from examples.benchmarks.solvers.exact import EMPTY, Exact, Exact20, Exact24, WideMoments
+from examples.benchmarks.solvers.exact import EMPTY, Exact, Exact20, Exact24, IntegerMoments
 from scroll_tactile.errors import InputError, MismatchError, SingularError
 
 doubles = st.floats(allow_nan=False, allow_infinity=False)
@@ -33,7 +33,7 @@ def tables(columns, values=codes | moderate, most=12):
 
 
 def moments(*parts, columns=3):
-    found = WideMoments(columns)
+    found = IntegerMoments(columns)
     for part in parts:
         found.add(part)
     return found

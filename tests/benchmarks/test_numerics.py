@@ -84,10 +84,10 @@ class TestCases:
             assert (np.abs(case.rows) <= case.sizes).all()
             assert (np.frexp(case.sizes)[0] == 0.5).all()
 
-    def test_decisions_are_asked_of_rows_of_their_own(self):
+    def test_decisions_are_judged_on_rows_of_their_own(self):
         for case in make_cases(0, 0.05):
-            if case.asked is not None:
-                assert case.asked.shape[1] == case.rows.shape[1]
+            if case.evaluated is not None:
+                assert case.evaluated.shape[1] == case.rows.shape[1]
                 assert len(np.unique(case.targets, axis=0)) > 1
 
 

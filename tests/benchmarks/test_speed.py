@@ -43,7 +43,7 @@ def test_circumstances_say_what_else_ran():
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(speed, "TAUGHT", 2)
+    monkeypatch.setattr(speed, "TRAIN_TOUCHES", 2)
     monkeypatch.setattr(speed, "FRESH", 2)
 
 

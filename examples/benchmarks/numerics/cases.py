@@ -1,6 +1,6 @@
 """Hard cases of ridge regression, by name and seeded: rows, targets, λ, and the true weights.
 
-Decisions are judged on rows of their own (`asked`). `size` scales them: 1 is the report, smaller is a quick look.
+Decisions are judged on rows of their own (`evaluated`). `size` scales them: 1 is the report, smaller is a quick look.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Case:
 
     name, family: what it is, and of which kind.
     rows: X, shape (n, d); targets: Y, shape (n, C); penalty: λ.
-    asked: rows whose decisions are compared, shape (m, d); None where there are no decisions to take.
+    evaluated: rows whose decisions are compared, shape (m, d); None where there are no decisions to take.
     certified: weights published elsewhere, shape (d,), None where there are none.
     """
 
@@ -36,7 +36,7 @@ class Case:
     rows: FloatArray
     targets: FloatArray
     penalty: float
-    asked: FloatArray | None = None
+    evaluated: FloatArray | None = None
     certified: FloatArray | None = None
 
     @cached_property
@@ -76,7 +76,7 @@ def _labels(rng: Rng, rows: FloatArray, classes: int) -> FloatArray:
 def _parted(
     rng: Rng, name: str, family: str, rows: FloatArray, penalties: list[float], classes: int = 4
 ) -> Iterator[Case]:
-    """A case for each λ of rows with decisions: four fifths to learn from, the rest to be asked about."""
+    """A case for each λ of rows with decisions: four fifths to learn from, the rest to be evaluated."""
     targets = _labels(rng, rows, classes)
     cut = len(rows) * 4 // 5
     for penalty in penalties:

@@ -29,7 +29,7 @@ def run_updates(seed: int, dimension: int, most: dict[str, int], note: Note) -> 
     rng = np.random.default_rng([seed, dimension, 3])
     rows, targets, penalty = updates(rng, dimension, DISTINCT)
     truths: dict[int, npt.NDArray[np.longdouble]] = {}
-    ones = [(rows[at : at + 1], targets[at : at + 1]) for at in range(len(rows))]
+    single_rows = [(rows[i : i + 1], targets[i : i + 1]) for i in range(len(rows))]
     sizes = np.ones(dimension)
     for method, last in most.items():
         solver = new_solver(method, sizes)
@@ -41,8 +41,8 @@ def run_updates(seed: int, dimension: int, most: dict[str, int], note: Note) -> 
                 note(f"{upto} one-row updates, {dimension} features: {method}")
                 begin = time.process_time()
                 for _ in range((upto - fed) // DISTINCT):
-                    for one in ones:
-                        solver.update(*one)
+                    for row, target in single_rows:
+                        solver.update(row, target)
                 solver.settle()
                 spent += time.process_time() - begin
                 fed = upto
@@ -127,11 +127,11 @@ def run_scatter(case: Case, note: Note) -> Iterator[Record]:
     sums, counts = rows.T @ targets, targets.sum(axis=0)
     plain = rows.T @ rows - (sums / counts) @ sums.T
     end = time.process_time()
-    ones = np.ones(rows.shape[1])
+    sizes = np.ones(rows.shape[1])
     for method, found, spent in (("exact", ours, between - begin), ("gram64", plain, end - between)):
         least = float(np.linalg.eigvalsh(found)[0])
         yield record(f"scatter within classes, {case.name}", case.family, method, len(rows), len(truth), 0.0) | {
-            "relative_error": error_of(found, truth, ones),
+            "relative_error": error_of(found, truth, sizes),
             "seconds_per_row": spent / len(rows),
             "diagnosis": "sound" if least > 0 else f"not positive definite: eigenvalue {least:.1e}",
         }

@@ -56,12 +56,12 @@ def measure(case: Case, method: str, seed: int) -> Record:
         for rows, targets in batches:
             solver.update(rows, targets)
         solver.settle()
-        taught = time.process_time()
+        summed = time.process_time()
         weights, diagnosis = solved(solver)
         done = time.process_time()
     base |= {
-        "seconds_per_row": (taught - begin) / len(case.rows),
-        "solve_seconds": done - taught,
+        "seconds_per_row": (summed - begin) / len(case.rows),
+        "solve_seconds": done - summed,
         "diagnosis": diagnosis,
     }
     if weights is None:
@@ -117,20 +117,20 @@ def error_of(weights: FloatArray, truth: npt.NDArray[np.longdouble], sizes: Floa
 
 
 def _flipped(case: Case, weights: FloatArray) -> int | None:
-    """How many of the rows asked about are given to another class than by the true weights."""
-    if case.asked is None or case.targets.shape[1] < 2:
+    """How many of the rows evaluated are given to another class than by the true weights."""
+    if case.evaluated is None or case.targets.shape[1] < 2:
         return None
-    asked = case.asked.astype(np.longdouble)
-    said = (asked @ weights.astype(np.longdouble)).argmax(axis=1)
-    return int(np.count_nonzero(said != (asked @ case.truth).argmax(axis=1)))
+    evaluated = case.evaluated.astype(np.longdouble)
+    said = (evaluated @ weights.astype(np.longdouble)).argmax(axis=1)
+    return int(np.count_nonzero(said != (evaluated @ case.truth).argmax(axis=1)))
 
 
 def bars(records: list[Record]) -> list[Record]:
     """For each case: the best method, the default's error, and whether that is within ten times, or was named."""
     found = []
-    for case in dict.fromkeys(one["case"] for one in records):
-        mine = {one["method"]: one for one in records if one["case"] == case}
-        errors = {name: one["relative_error"] for name, one in mine.items() if one["relative_error"] is not None}
+    for case in dict.fromkeys(entry["case"] for entry in records):
+        mine = {entry["method"]: entry for entry in records if entry["case"] == case}
+        errors = {name: entry["relative_error"] for name, entry in mine.items() if entry["relative_error"] is not None}
         if DEFAULT not in mine or not errors:
             continue
         best = min(errors, key=errors.__getitem__)

@@ -39,18 +39,20 @@ def points(records: Records) -> list[tuple[str, str, float, float]]:
     case, and records without a time, are left out.
     """
     found = []
-    for method in dict.fromkeys(one["method"] for one in records):
-        for family in dict.fromkeys(one["family"] for one in records):
+    for method in dict.fromkeys(record["method"] for record in records):
+        for family in dict.fromkeys(record["family"] for record in records):
             mine = [
-                one
-                for one in records
-                if (one["method"], one["family"]) == (method, family)
-                and one["seconds_per_row"] is not None
+                record
+                for record in records
+                if (record["method"], record["family"]) == (method, family)
+                and record["seconds_per_row"] is not None
                 and family != "schedules"
             ]
             if mine:
-                errors = [NO_ANSWER if one["relative_error"] is None else one["relative_error"] for one in mine]
-                seconds = float(np.median([one["seconds_per_row"] for one in mine]))
+                errors = [
+                    NO_ANSWER if record["relative_error"] is None else record["relative_error"] for record in mine
+                ]
+                seconds = float(np.median([record["seconds_per_row"] for record in mine]))
                 found.append((method, family, seconds, min(NO_ANSWER, max(LEAST, *errors))))
     return found
 
@@ -68,8 +70,8 @@ def draw_numerics(path: Path, records: Records, *, title: str) -> None:
     drawn = points(records)
     families = list(dict.fromkeys(family for _, family, _, _ in drawn))
     methods = list(dict.fromkeys(method for method, _, _, _ in drawn))
-    colours = {method: COLOURS.get(method, f"C{at % 10}") for at, method in enumerate(methods)}
-    markers = {family: LETTERS.get(family, MARKERS[at % len(MARKERS)]) for at, family in enumerate(families)}
+    colours = {method: COLOURS.get(method, f"C{i % 10}") for i, method in enumerate(methods)}
+    markers = {family: LETTERS.get(family, MARKERS[i % len(MARKERS)]) for i, family in enumerate(families)}
     figure = Figure(figsize=(13, 8), layout="constrained")
     FigureCanvasAgg(figure)
     panel = figure.add_subplot()

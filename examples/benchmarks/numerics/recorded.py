@@ -32,16 +32,20 @@ def nist_cases(path: Path) -> Iterator[Case]:
         sets = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DatasetError(f"expected NIST's regressions in {path}; it cannot be read: {error}") from error
-    for name, one in sets.items():
-        if not isinstance(one, dict):
+    for name, published in sets.items():
+        if not isinstance(published, dict):
             continue  # the note
-        if "degree" in one:
-            first = 1 if one.get("intercept") is False else 0
-            rows = [[float(Fraction(x) ** power) for power in range(first, one["degree"] + 1)] for x in one["x"]]
+        if "degree" in published:
+            first = 1 if published.get("intercept") is False else 0
+            rows = [
+                [float(Fraction(x) ** power) for power in range(first, published["degree"] + 1)] for x in published["x"]
+            ]
         else:
-            rows = [[1.0, *map(float, row)] for row in one["X"]]
-        targets = np.array([[float(y)] for y in one["y"]])
-        yield Case(name, "nist", np.array(rows), targets, 0.0, None, np.array([float(w) for w in one["certified"]]))
+            rows = [[1.0, *map(float, row)] for row in published["X"]]
+        targets = np.array([[float(y)] for y in published["y"]])
+        yield Case(
+            name, "nist", np.array(rows), targets, 0.0, None, np.array([float(w) for w in published["certified"]])
+        )
 
 
 def digits(weights: np.ndarray, certified: np.ndarray) -> float:
@@ -55,18 +59,18 @@ def digits(weights: np.ndarray, certified: np.ndarray) -> float:
 def real_case(
     name: Literal["biotac", "roboskin"], data: Path, seed: int, dimension: int, most: int | None = None
 ) -> Case:
-    """Codes of whole touches of "biotac" or "roboskin", as a memory has them; one fold is asked about.
+    """Codes of whole touches of "biotac" or "roboskin", as a memory has them; one fold is evaluated.
 
     Raises DatasetError for a folder that is not laid out as published.
     """
     recordings = load(data, name, seed)
     chosen = np.random.default_rng([seed, 7]).permutation(len(recordings))[:most]
     embedding = Kernels(dimension=dimension)
-    features = np.stack([embedding.embed(tactile_image(recordings.streams[at])) for at in chosen])
+    features = np.stack([embedding.embed(tactile_image(recordings.streams[i])) for i in chosen])
     rows = to_codes(features, embedding.bound) * 2.0**-BITS
     names = sorted(set(recordings.materials))
-    targets = np.eye(len(names))[[names.index(recordings.materials[at]) for at in chosen]]
-    taught = recordings.fold[chosen] != 0
+    targets = np.eye(len(names))[[names.index(recordings.materials[i]) for i in chosen]]
+    train = recordings.fold[chosen] != 0
     return Case(
-        f"{recordings.name}, {dimension} features", "real", rows[taught], targets[taught], REAL_PENALTY, rows[~taught]
+        f"{recordings.name}, {dimension} features", "real", rows[train], targets[train], REAL_PENALTY, rows[~train]
     )

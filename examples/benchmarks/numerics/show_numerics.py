@@ -19,13 +19,15 @@ WIDE = 140  # characters that the table takes
 def show_numerics(result: Mapping[str, Any]) -> None:
     """Show relative errors, case by method, the best in bold, and in brackets how many decisions flipped."""
     records, judged = result["records"], result["bars"]
-    best = {one["case"]: one["best"] for one in judged}
-    methods = list(dict.fromkeys(one["method"] for one in records))
+    best = {record["case"]: record["best"] for record in judged}
+    methods = list(dict.fromkeys(record["method"] for record in records))
     table = Table(title="relative error of the weights; in brackets decisions flipped", box=SIMPLE_HEAD)
     for name in ("case", *methods):
         table.add_column(name.replace("covariance", "cov").replace("symmetric", "sym"), no_wrap=True)
-    for case in dict.fromkeys(one["case"] for one in records):
-        mine = {one["method"]: one for one in records if one["case"] == case and one["family"] != "schedules"}
+    for case in dict.fromkeys(record["case"] for record in records):
+        mine = {
+            record["method"]: record for record in records if record["case"] == case and record["family"] != "schedules"
+        }
         cells = [_cell(mine.get(method), bold=best.get(case) == method) for method in methods]
         if mine:
             table.add_row(escape(case), *cells)
@@ -33,23 +35,23 @@ def show_numerics(result: Mapping[str, Any]) -> None:
     screen = console()
     screen.width = max(WIDE, screen.width)
     screen.print(table)
-    for one in records:
-        if one["family"] == "schedules":
-            say(f"{one['case']}: {one['method']}: {one['diagnosis']}")
-        if "digits" in one and one["method"] == "exact":
-            say(f"{escape(one['case'])}: {one['digits']:.1f} digits of the certified coefficients, exact")
+    for record in records:
+        if record["family"] == "schedules":
+            say(f"{record['case']}: {record['method']}: {record['diagnosis']}")
+        if "digits" in record and record["method"] == "exact":
+            say(f"{escape(record['case'])}: {record['digits']:.1f} digits of the certified coefficients, exact")
     for what, why in result["not_measured"].items():
         say(f"[yellow]not measured:[/] {escape(what)}: {escape(why)}")
-    missed = [one["case"] for one in judged if not one["met"]]
+    missed = [record["case"] for record in judged if not record["met"]]
     say(f"exact within 10 × of the best method, or named why not: {len(judged) - len(missed)} of {len(judged)} cases")
     for case in missed:
         say(f"[red]missed:[/] {escape(case)}")
 
 
-def _cell(one: Mapping[str, Any] | None, *, bold: bool) -> str:
-    if one is None:
+def _cell(record: Mapping[str, Any] | None, *, bold: bool) -> str:
+    if record is None:
         return ""
-    if one["relative_error"] is None:
+    if record["relative_error"] is None:
         return "–"
-    said = f"{one['relative_error']:.0e}" + (f" [{one['flipped']}]" if one["flipped"] else "")
+    said = f"{record['relative_error']:.0e}" + (f" [{record['flipped']}]" if record["flipped"] else "")
     return f"[bold]{said}[/]" if bold else said

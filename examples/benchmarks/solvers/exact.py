@@ -30,7 +30,7 @@ from examples.benchmarks.solvers.certified import (
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
 from scroll_tactile.errors import InputError, MismatchError
 
-__all__ = ["Exact", "Exact20", "Exact24", "WideMoments"]
+__all__ = ["Exact", "Exact20", "Exact24", "IntegerMoments"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -49,7 +49,7 @@ def _whole(values: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 @dataclass(eq=False)
-class WideMoments:
+class IntegerMoments:
     """A = Σ z zᵀ over rows z of doubles, shape (D, D), entry (i, j) in units of 2^(units[i] + units[j]).
 
     A column's unit is the lowest bit that is set in any of its values, EMPTY where all are zero.
@@ -100,12 +100,12 @@ class WideMoments:
         said = (self.rows, self.units.tolist(), [int(value) for value in self.sums.entries()])
         return hashlib.sha256(repr(said).encode()).hexdigest()
 
-    def __add__(self, other: WideMoments) -> WideMoments:
+    def __add__(self, other: IntegerMoments) -> IntegerMoments:
         if self.width != other.width:
             raise MismatchError(f"expected moments of {self.width} columns to be added; came {other.width}")
         self.settle()
         other.settle()
-        joint, rest = WideMoments(self.width), WideMoments(self.width)
+        joint, rest = IntegerMoments(self.width), IntegerMoments(self.width)
         for copy, part in ((joint, self), (rest, other)):
             copy.units, copy.sums = part.units, part.sums
             copy._lower(np.minimum(self.units, other.units))
@@ -137,13 +137,13 @@ class Exact(RidgeBase):
         self._bounds = bounds
         self._grid = np.zeros(0, dtype=np.int64)  # units of the codes, exponents of two, shape (d,)
         self._rounded = False
-        self._moments = WideMoments(1)
+        self._moments = IntegerMoments(1)
 
     def _begin(self) -> None:
         if self.bits is not None:
             self._grid = _grid(self._bounds, self.dimension) - self.bits
         self._rounded = False
-        self._moments = WideMoments(1 + self.dimension + self.outputs)
+        self._moments = IntegerMoments(1 + self.dimension + self.outputs)
 
     def _take(self, x: FloatArray, y: FloatArray) -> None:
         if self.bits is not None:

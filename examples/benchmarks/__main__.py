@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +14,6 @@ from rich.table import Table
 from examples.benchmarks.buffers import run_buffers
 from examples.benchmarks.frontier import measure_frontier
 from examples.benchmarks.interleaved import run_interleaved
-from examples.benchmarks.numerics.comparison import find_nist, run_numerics
-from examples.benchmarks.numerics.plots_numerics import draw_numerics
-from examples.benchmarks.numerics.show_numerics import show_numerics
 from examples.benchmarks.plots_frontier import draw_frontier
 from examples.benchmarks.show_speed import show_frontier, show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import run_speed
@@ -23,6 +21,7 @@ from examples.benchmarks.vision_speed import run_vision
 from examples.paper.commands.sets import Dataset, read, require_folders
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.embeddings import Kernels
+from scroll_tactile.errors import InputError
 
 __all__ = ["app"]
 
@@ -192,9 +191,15 @@ def numerics(
 ) -> None:
     """Compare exact sums with RLS, QR and plain ones on hard cases: errors in weights against the truth, and time.
 
-    The whole takes half an hour.
+    The whole takes ten minutes or so.
     """
     require_folders(json, plot)
+    if find_spec("flint") is None:
+        raise InputError('exact sums need python-flint: pip install "scroll-tactile[bench]"')
+    from examples.benchmarks.numerics.comparison import find_nist, run_numerics
+    from examples.benchmarks.numerics.plots_numerics import draw_numerics
+    from examples.benchmarks.numerics.show_numerics import show_numerics
+
     with progress_bar() as progress:
         result = run_numerics(seed=seed, quick=quick, data=data, nist=nist or find_nist(data), progress=progress)
     show_numerics(result)

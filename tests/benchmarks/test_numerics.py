@@ -232,6 +232,11 @@ def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path)
     assert "folder" in refused("bench", "numerics", "--quick", "--plot", tmp_path / "none" / "n.png")
 
 
+def test_a_library_that_is_not_there_is_named_with_what_installs_it(monkeypatch):
+    monkeypatch.setattr("examples.benchmarks.__main__.find_spec", lambda name: None)
+    assert 'pip install "scroll-tactile[bench]"' in refused("bench", "numerics", "--quick")
+
+
 def test_data_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("examples.benchmarks.numerics.comparison.make_cases", lambda *_: iter(()))
     monkeypatch.setattr("examples.benchmarks.numerics.comparison.run_updates", lambda *_: iter(()))

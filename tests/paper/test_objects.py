@@ -9,7 +9,6 @@ from commands import refused, run
 
 from examples.paper.studies.objects import Objects, most_often, object_groups, summary
 from examples.paper.studies.unseen import fit_heads
-from examples.paper.tables.tables_cameras import cameras
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
@@ -78,18 +77,6 @@ def test_an_interrupted_run_goes_on_and_another_is_refused(tmp_path, results):
     assert again == first  # its seconds too: it was read back
     with pytest.raises(InputError, match="seed 0 there, 1 here"):
         next(iter(Objects(recordings(), FINE, groups=2, seed=1, trees=0, folder=tmp_path / "run").run([0])))
-
-
-def test_the_table_of_the_readme_holds_the_figures(results):
-    means = summary(results)
-    record = {"means": means, "parts": results, "groups": 2}
-    table = cameras(lambda name: {"gelsight-objects": record}[name])
-    video = means["known, counts"]["video"]
-    assert f"| a video's frames together | {100 * video['mean']:.1f} ± {100 * video['sd']:.1f} | |" in table
-    assert "6 objects, 2 groups" in table
-    hardness = {"hardness": {"mean": 0.61, "sd": 0.1}, "hardness, always": {"mean": 0.4, "sd": 0.0}}
-    told = cameras(lambda name: record | {"means": {"never touched": hardness}})
-    assert "| hardness | 61.0 ± 10.0 | | | 40.0 ± 0.0 |" in told
 
 
 def test_settings_that_cannot_be_are_refused():

@@ -11,7 +11,6 @@ import torch
 from commands import refused, run
 
 from examples.paper.systems.system_protocol import silent
-from examples.paper.tables import tables_transfer
 from examples.paper.transfer import tasks as transfer
 from examples.paper.transfer.across_sensors import ALONE, WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
@@ -379,10 +378,6 @@ class TestCommands:
         assert written["command"].startswith("scroll-tactile transfer tasks --data DATA --weights random.pth")
         assert len(written["rows"]) == 6  # two sets asked about: kernels, vision, and vision tuned on one of them
         assert picture.stat().st_size > 1000
-        text = tables_transfer.tasks(lambda name: written)
-        assert text.count("| **") == 0
-        assert "patch" in text
-        assert "1 epoch" in text
 
     def test_sensors(self, tmp_path):
         out = tmp_path / "sensors.json"
@@ -392,7 +387,7 @@ class TestCommands:
         written = json.loads(out.read_text())
         assert written["chance"] == pytest.approx(1 / 3)
         assert {row["way"] for row in written["rows"]} == {"alone", "standardised", "ridge-map"}
-        assert "patch → strip" in tables_transfer.sensors(lambda name: written)
+        assert {row["direction"] for row in written["rows"]} == {"patch → strip", "strip → patch"}
 
     @pytest.mark.parametrize(
         ("more", "words"),

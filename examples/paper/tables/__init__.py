@@ -1,1 +1,0 @@
-"""The tables of RESULTS.md, made from the files of results."""

@@ -1,0 +1,222 @@
+"""The tables of the texts, made from the results: `python -m examples.tables`, and `--check`, which writes nothing.
+
+A text marks where a table stands: `<!-- table: NAME -->`, anything, `<!-- /table -->`. `tables.toml`, beside the
+results, says what the table NAME holds:
+
+- `head`: the headings.
+- `each`: a lookup of a list; it makes a row of each element, or of those with `where = "field=value"`.
+- `rows`: otherwise, the rows, each a list of words.
+- `cells`: what a row shows; without it a row's words are its cells. `$0`, `$1` … stand for the words of the row, or
+  `$name` for the element's fields.
+- `above`, `below`: further rows, of cells. `text`: a paragraph behind the table.
+- `commands = false`: leave out the commands that made the results.
+
+A cell is text with lookups in braces: `{STEM:KEY/KEY|STEP|STEP}` looks into STEM.json, `{./KEY}` into the element. A
+KEY is a name, a place in a list, or `field=value;field=value`, the first element of a list with these. STEPs are those
+of STEPS, `*N`, `/N`, or a format of Python's. A lookup that finds nothing is an error; `{?…}` then leaves its cell
+empty, or shows what stands behind `??` in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scroll_tactile.errors import InputError
+
+__all__ = ["ROOMS", "TEXTS", "filled", "made", "main", "read_tables"]
+
+HERE = Path(__file__).parent
+ROOMS = (HERE / "paper", HERE / "benchmarks")
+TEXTS = (HERE.parent / "README.md", *(room / "RESULTS.md" for room in ROOMS))
+
+MARK = re.compile(r"<!-- table: (\S+) -->\n(.*?)<!-- (/?)table", re.DOTALL)
+LOOKUP = re.compile(r"\{(\??)([^{}]*)\}")
+
+
+def _spread(found: Mapping[str, float], scale: float = 100.0, digits: int = 1) -> str:
+    """A mean, and behind ± its standard deviation, or error, where more than one fold was measured."""
+    mean = f"{scale * found['mean']:.{digits}f}"
+    spread = found["sd"] if "sd" in found else found["error"]
+    return mean if found.get("folds") == 1 else f"{mean} ± {scale * spread:.{digits}f}"
+
+
+STEPS: dict[str, Callable[[Any], Any]] = {
+    "%": lambda share: f"{100 * share:.1f}",
+    "±": _spread,
+    "±3": lambda found: _spread(found, 1.0, 3),
+    "len": len,
+    "max": max,
+    "sum": lambda found: sum(found.values() if isinstance(found, dict) else found),
+}
+
+
+class _Missing(Exception):
+    """A lookup found nothing."""
+
+
+class _Results:
+    """The results of some folders by the names of their files, each read once. used: in order of their first use."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._files = {file.stem: file for folder in folders for file in sorted(folder.glob("results/*.json"))}
+        self._read: dict[str, Any] = {}
+        self.used: list[str] = []
+
+    def of(self, stem: str) -> Any:
+        """What a file of results holds. Raises InputError where there is none of that name."""
+        if stem not in self._files:
+            raise InputError(f"expected a result {stem}.json; there are {', '.join(sorted(self._files))}")
+        if stem not in self._read:
+            self._read[stem] = json.loads(self._files[stem].read_text(encoding="utf-8"))
+        if stem not in self.used:
+            self.used.append(stem)
+        return self._read[stem]
+
+    def look_up(self, path: str, element: Any = None) -> Any:
+        """What a path leads to, `None` included. Raises _Missing where it leads nowhere."""
+        stem, _, keys = path.partition(":")
+        found, keys = (element, path[2:]) if path.startswith("./") else (self.of(stem), keys)
+        for key in keys.split("/"):
+            found = _step_into(found, key)
+        return found
+
+    def fill(self, template: str, element: Any = None) -> str:
+        """A template with its lookups done; empty where an optional one found nothing and offers nothing instead."""
+        parts: list[str] = []
+        end = 0
+        for match in LOOKUP.finditer(template):
+            asked, _, instead = match[2].partition("??")
+            path, *steps = asked.strip().split("|")
+            try:
+                found = self.look_up(path, element)
+                if found is None:
+                    raise _Missing(path)
+                for step in steps:
+                    found = _apply(step, found)
+            except _Missing:
+                if not match[1]:
+                    raise InputError(f"expected something at {match[0]}; the results have nothing there") from None
+                if "??" not in match[2]:
+                    return ""
+                found = instead.strip()
+            parts += [template[end : match.start()], str(found)]
+            end = match.end()
+        return "".join([*parts, template[end:]])
+
+
+def _step_into(found: Any, key: str) -> Any:
+    if isinstance(found, Mapping):
+        if key in found:
+            return found[key]
+    elif isinstance(found, list) and "=" in key:
+        if chosen := [element for element in found if _has(element, key)]:
+            return chosen[0]
+    elif isinstance(found, list) and key.isdigit() and int(key) < len(found):
+        return found[int(key)]
+    raise _Missing(key)
+
+
+def _has(element: Any, conditions: str) -> bool:
+    """Whether an element meets all of `field=value;field=value`."""
+    for condition in conditions.split(";"):
+        field, _, wanted = condition.partition("=")
+        value = _step_into(element, field)
+        if (value if isinstance(value, str) else json.dumps(value)) != wanted:
+            return False
+    return True
+
+
+def _apply(step: str, found: Any) -> Any:
+    if step in STEPS:
+        return STEPS[step](found)
+    if step[0] in "*/":
+        return found * float(step[1:]) if step[0] == "*" else found / float(step[1:])
+    return format(found, step)
+
+
+def _bound(template: str, words: Mapping[str, Any]) -> str:
+    return re.sub(r"\$(\w+)", lambda match: str(words[match[1]]), template)
+
+
+def made(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) -> str:
+    """The table of a name, in Markdown. Raises InputError where it, or what it looks up, is not there."""
+    if name not in tables:
+        raise InputError(f"expected a table out of {', '.join(sorted(tables))}; came {name!r}")
+    table, results = tables[name], _Results(folders)
+    try:
+        rows = [[results.fill(cell) for cell in row] for row in table.get("above", ())]
+        if "each" in table:
+            for element in results.look_up(table["each"]):
+                if "where" in table and not _has(element, table["where"]):
+                    continue
+                cells = (_bound(cell, element) for cell in table["cells"])
+                rows.append([results.fill(cell, element) for cell in cells])
+        for row in table.get("rows", ()):
+            words = {str(i): word for i, word in enumerate(row)}
+            rows.append([results.fill(_bound(cell, words)) for cell in table.get("cells", row)])
+        rows += [[results.fill(cell) for cell in row] for row in table.get("below", ())]
+        text = results.fill(table.get("text", "")).strip()
+    except (InputError, KeyError, TypeError, ValueError, _Missing) as error:
+        raise InputError(f"table {name!r}: {error}") from error
+    head = table["head"]
+    if wrong := next((row for row in rows if len(row) != len(head)), None):
+        raise InputError(f"table {name!r}: expected rows of {len(head)} cells; came {wrong}")
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *rows)]
+    lines.insert(1, "|---" * len(head) + "|")
+    parts = ["\n".join(line.replace("|  |", "| |").replace("|  |", "| |") for line in lines), text]
+    if table.get("commands", True):
+        commands = dict.fromkeys(f"{results.of(stem)['command']}" for stem in results.used)
+        parts.append("```sh\n" + "\n".join(commands) + "\n```")
+    return "\n\n".join(part for part in parts if part)
+
+
+def filled(text: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) -> str:
+    """A text with all its marked tables made. Raises InputError for a mark without an end, and what `made` raises."""
+
+    def put(match: re.Match[str]) -> str:
+        if not match[3]:
+            raise InputError(f"the table {match[1]!r} has no end: expected <!-- /table --> before the next")
+        return f"<!-- table: {match[1]} -->\n{made(match[1], tables, folders)}\n<!-- /table"
+
+    if text.count("<!-- table: ") != len(MARK.findall(text)):
+        raise InputError("expected <!-- /table --> behind every <!-- table: NAME -->; the last has none")
+    return MARK.sub(put, text)
+
+
+def read_tables(folders: Sequence[Path] = ROOMS) -> dict[str, Any]:
+    """Name → description, of every `tables.toml`. Raises InputError where two have one name."""
+    tables: dict[str, Any] = {}
+    for folder in folders:
+        described = tomllib.loads((folder / "tables.toml").read_text(encoding="utf-8"))
+        if twice := tables.keys() & described.keys():
+            raise InputError(f"expected tables of different names; {sorted(twice)} come twice")
+        tables |= described
+    return tables
+
+
+def main(words: Sequence[str] | None = None, texts: Sequence[Path] = TEXTS) -> None:
+    """Make the tables of all texts; with --check, exit 1 where one is not as the results say."""
+    parser = argparse.ArgumentParser(prog="python -m examples.tables", description="Make all tables from the results.")
+    parser.add_argument("--check", action="store_true", help="write nothing; fail where a table is not as it would be")
+    check = parser.parse_args(words).check
+    tables = read_tables()
+    for path in texts:
+        text = path.read_text(encoding="utf-8")
+        new = filled(text, tables)
+        if new == text:
+            print(f"{path.name}: as the results say")
+        elif check:
+            raise SystemExit(f"{path} is not as the results say: run python -m examples.tables")
+        else:
+            path.write_text(new, encoding="utf-8")
+            print(f"{path}: written")
+
+
+if __name__ == "__main__":
+    main()

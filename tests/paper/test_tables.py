@@ -1,0 +1,101 @@
+"""The tables of the texts are what the results say, and every result says what made it."""
+
+import json
+import re
+
+import pytest
+
+from examples.tables import ROOMS, TEXTS, filled, made, main, read_tables
+from scroll_tactile.errors import InputError
+
+TABLES = read_tables()
+RESULTS = sorted(file for room in ROOMS for file in room.glob("results/*"))
+
+
+def test_the_texts_are_what_the_results_say():
+    main(["--check"])
+
+
+def test_every_table_that_is_described_stands_in_a_text():
+    marked = re.findall(r"<!-- table: (\S+) -->", "".join(path.read_text() for path in TEXTS))
+    assert set(TABLES) - set(marked) <= {"summary"}
+    assert set(marked) <= set(TABLES)
+
+
+def test_a_wrong_figure_is_noticed_and_mended(tmp_path):
+    text = TEXTS[1].read_text()
+    copy = tmp_path / "RESULTS.md"
+    copy.write_text(text.replace("| 99.2 ± 0.7 |", "| 99.9 ± 0.7 |", 1))
+    with pytest.raises(SystemExit, match="is not as the results say"):
+        main(["--check"], [copy])
+    main([], [copy])
+    assert copy.read_text() == text
+
+
+@pytest.fixture
+def room(tmp_path):
+    (tmp_path / "results").mkdir()
+    shares = [{"name": "a, b", "mean": 0.5, "sd": 0.25, "none": None}, {"name": "c", "mean": 1, "sd": 0, "folds": 1}]
+    (tmp_path / "results" / "one.json").write_text(json.dumps({"command": "run one", "of": shares, "all": {"x": 1500}}))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("cell", "shown"),
+    [
+        ("{one:of/0/mean|%}", "50.0"),
+        ("{one:of/name=a, b|±}", "50.0 ± 25.0"),
+        ("{one:of/name=a, b;sd=0.25|±3}", "0.500 ± 0.250"),
+        ("{one:of/1|±}", "100.0"),
+        ("{one:of|len} of {one:all|sum|,}", "2 of 1,500"),
+        ("{one:all/x|/1000|.2f}", "1.50"),
+        ("{one:all/x|*2|.0f}", "3000"),
+        ("{?one:all/y}, never", ""),
+        ("{?one:of/0/none??–} / {one:of/0/sd}", "– / 0.25"),
+    ],
+)
+def test_cells_show_what_they_look_up(room, cell, shown):
+    table = {"head": ["x"], "rows": [[cell]], "commands": False}
+    assert made("t", {"t": table}, [room]).splitlines()[2:] == [f"| {shown} |".replace("|  |", "| |")]
+
+
+def test_a_row_of_each_element_and_the_commands_behind(room):
+    table = {"each": "one:of", "where": "name=c", "head": ["x", "y"], "cells": ["$name", "{./mean}"]}
+    table |= {"above": [["a", "b"]], "below": [["y", "z"]], "text": "{one:all/x} in all."}
+    lines = made("t", {"t": table}, [room]).splitlines()
+    assert lines[2:5] == ["| a | b |", "| c | 1 |", "| y | z |"]
+    assert lines[5:] == ["", "1500 in all.", "", "```sh", "run one", "```"]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"head": ["x"], "rows": [["{two:x}"]]}, "expected a result two.json; there are one"),
+        ({"head": ["x"], "rows": [["{one:all/y}"]]}, "expected something at {one:all/y}"),
+        ({"head": ["x"], "rows": [["{one:of/name=d}"]]}, "expected something at"),
+        ({"head": ["x"], "rows": [["a", "b"]]}, "expected rows of 1 cells"),
+        ({"head": ["x"], "rows": [["{one:all|%}"]]}, "table 't'"),
+    ],
+)
+def test_tables_that_cannot_be_made_are_named(room, table, said):
+    with pytest.raises(InputError, match=re.escape(said)):
+        made("t", {"t": table}, [room])
+
+
+@pytest.mark.parametrize("text", ["<!-- table: t -->\n", "<!-- table: t -->\n<!-- table: t -->\n<!-- /table -->"])
+def test_a_mark_without_an_end_is_named(room, text):
+    with pytest.raises(InputError, match="/table"):
+        filled(text, {"t": {"head": ["x"]}}, [room])
+
+
+@pytest.mark.parametrize("path", [path for path in RESULTS if path.suffix == ".json"], ids=lambda path: path.stem)
+def test_every_result_says_what_made_it_and_names_no_machine(path):
+    text = path.read_text()
+    made_by = json.loads(text)
+    assert {"command", "seed", "versions", "date"} <= made_by.keys()
+    assert made_by["command"].startswith(("python -m examples.", "python tests/faults/"))
+    assert not re.search(r"/(root|work|tmp|home)/", text)
+
+
+def test_the_results_are_small():
+    assert sum(path.stat().st_size for path in RESULTS) <= 800_000

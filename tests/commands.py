@@ -8,7 +8,8 @@ from examples.benchmarks.__main__ import app as benchmarks
 from examples.paper.__main__ import app as paper
 from scroll_tactile.cli import app
 
-PAPER = ("reproduce", "replay", "continual", "robustness", "schedules", "fabric", "transfer")
+PAPER = {command.name or command.callback.__name__ for command in paper.registered_commands}
+PAPER |= {group.name for group in paper.registered_groups}
 
 
 def run(*words: object) -> Any:
@@ -16,7 +17,7 @@ def run(*words: object) -> Any:
     if first == "bench":
         return CliRunner().invoke(benchmarks, rest)
     if first in PAPER:
-        return CliRunner().invoke(paper, rest if first == "reproduce" else [first, *rest])
+        return CliRunner().invoke(paper, [first, *rest])
     return CliRunner().invoke(app, [first, *rest])
 
 

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import typer
+
 from examples.paper.commands.continual_command import continual
 from examples.paper.commands.fabric_command import fabric
+from examples.paper.commands.paper_command import activation, efficiency, everything, table1
 from examples.paper.commands.replay_command import replay
-from examples.paper.commands.reproduce import reproduce as app
 from examples.paper.commands.robustness_command import robustness
 from examples.paper.commands.schedules_command import schedules
 from examples.paper.commands.transfer_command import transfer
+from scroll_tactile.cli.terminal import Commands
 
 __all__ = ["app"]
 
-for command in (replay, continual, robustness, schedules):
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    help="Measure what the paper measured, and ours beside it, on your copy of the data; figures: RESULTS.md.",
+)
+for command in (table1, efficiency, activation, robustness, replay, continual, schedules):
     app.command()(command)
 app.add_typer(fabric, name="fabric")
 app.add_typer(transfer, name="transfer")
+app.command(name="all")(everything)
 
 if __name__ == "__main__":
     app(prog_name="python -m examples.paper")

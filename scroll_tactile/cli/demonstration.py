@@ -10,7 +10,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from examples.paper.plots import drawing as plots
+from scroll_tactile.pipelines import drawing as plots
 from scroll_tactile.cli.terminal import confusion_text, console, percent, say, verdict
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.demo import Demo, Outcome
@@ -97,7 +97,7 @@ def _show_confusions(task: Demo, outcome: Outcome, plot: Path | None) -> None:
     if plot is not None and plots.available():
         curve = [(at + 1, step.all) for at, step in enumerate(outcome.steps)]
         title = f"Simulated {task.sensor.name}, not a result"
-        plots.draw(plot, names, counts, title=title, curves=[curve])
+        plots.draw(plot, names, counts, title=title, curve=curve)
         say(f"plot: {plot}")
     else:
         if plot is not None:

@@ -58,7 +58,7 @@ def score(
         "share_error": None,
         "constituents": {
             name: _of_one(there[known[:, at], at], said[known[:, at], at])
-            | {"unsaid": int((known[:, at] & ~told[:, at]).sum())}
+            | {"unanswered": int((known[:, at] & ~told[:, at]).sum())}
             for at, name in enumerate(names)
         },
     }

@@ -106,7 +106,7 @@ STUDIES = {
         Study("drift", drift, (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, 0.05), "share of the range, and of the gain"),
     )
 }
-"""The studies on folds as published; `robustness` adds "sitting", which perturbs nothing."""
+"""The studies on folds as published; `robustness` adds "session", which perturbs nothing."""
 
 
 def _drawn(

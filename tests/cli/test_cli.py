@@ -146,7 +146,7 @@ class TestDemo:
         assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG"
 
     def test_without_matplotlib_it_says_so_and_goes_on(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("examples.paper.plots.drawing.available", lambda: False)
+        monkeypatch.setattr("scroll_tactile.pipelines.drawing.available", lambda: False)
         result = run("demo", *SMALL, "--plot", tmp_path / "p.png")
         assert result.exit_code == 0, result.output
         assert 'pip install "scroll-tactile[plots]"' in result.stdout
@@ -202,12 +202,12 @@ def test_schedules_give_one_memory() -> None:
 
 class TestReplay:
     def test_a_fold_of_real_touches(self, real_data: Path, tmp_path: Path) -> None:
-        options = ["--data", real_data, "--folds", "0", "--materials", "4", "--memory", tmp_path / "kept"]
+        options = ["--data", real_data, "--folds", "0", "--materials", "4", "--run", tmp_path / "kept"]
         result = run("replay", "roboskin-20", *options, "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
         assert result.exit_code == 0, result.output
         assert "equals offline training: yes" in result.stdout
         found = json.loads((tmp_path / "r.json").read_text())
-        assert found["command"].startswith("scroll-tactile replay roboskin-20 --data")
+        assert found["command"].startswith("python -m examples.paper replay roboskin-20 --data")
         assert set(found["versions"]) >= {"scroll-tactile", "torch", "numpy", "python"}
         assert (found["sensor"]["name"], found["schedule"], found["seed"]) == ("roboskin", "class-by-class", 0)
         assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.9

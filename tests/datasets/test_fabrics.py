@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from examples.paper.contactile import fabrics_set as contactile
-from examples.paper.contactile.simulated import CONSTITUENTS, HAND, LIMITS, ROBOT, FabricScene
+from examples.paper.fabric import fabrics_set as contactile
+from examples.paper.fabric.simulated import CONSTITUENTS, HAND, LIMITS, ROBOT, FabricScene
 from scroll_tactile.errors import InputError, UnknownMaterialError
 
 SCENE = FabricScene(seed=0)

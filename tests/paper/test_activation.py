@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from examples.paper.plots.plots_activation import draw_activation
+from examples.paper.plots import draw_activation
 from examples.paper.studies.activation import cka, compare, first_block, maximise
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError

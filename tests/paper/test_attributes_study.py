@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from examples.paper.studies.attributes_study import Attributes, summary
+from examples.paper.fabric.attributes_study import Attributes, summary
 from scroll_tactile import Sensor
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.grades import read_grades
@@ -143,6 +143,6 @@ def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
     assert "shaking" in told.output
     found = json.loads((tmp_path / "out.json").read_text())
     assert set(found["sets"]) == {"roboskin-20"}
-    assert set(found["sets"]["roboskin-20"]["means"]["shaking"]) == {"ours", "untold", "trees", "always"}
-    assert found["command"].startswith("scroll-tactile fabric attributes --data")
+    assert set(found["sets"]["roboskin-20"]["means"]["shaking"]) == {"ours", "inferred", "trees", "always"}
+    assert found["command"].startswith("python -m examples.paper fabric attributes --data")
     assert "gelsight" in refused(*words, "--sets", "gelsight")

@@ -5,10 +5,10 @@ import logging
 import numpy as np
 import pytest
 
-from examples.paper.contactile import fabrics_set as contactile
-from examples.paper.contactile.compositions_table import read_compositions
-from examples.paper.contactile.fabrics_set import load
-from examples.paper.contactile.ratios import CONTACTILE_RATIOS, ratios
+from examples.paper.fabric import fabrics_set as contactile
+from examples.paper.fabric.compositions_table import read_compositions
+from examples.paper.fabric.fabrics_set import load
+from examples.paper.fabric.ratios import CONTACTILE_RATIOS, ratios
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import BIOTAC, CONTACTILE
 from scroll_tactile.signals.stream import validate

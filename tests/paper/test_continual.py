@@ -215,26 +215,28 @@ class TestCommand:
         return ["continual", "roboskin-20", "--data", "simulated", "--features", 64, "--sizes", "0,8", "--epochs", 1]
 
     def test_it_measures_writes_and_draws(self, simulated: list[object], tmp_path: Path) -> None:
-        files = ["--json", tmp_path / "r.json", "--plot", tmp_path / "p.png", "--memory", tmp_path / "kept"]
+        files = ["--json", tmp_path / "r.json", "--plot", tmp_path / "p.png", "--run", tmp_path / "kept"]
         result = run(*simulated, *files)
         assert result.exit_code == 0, result.output
         for words in ("streaming LDA", "f*", "ridge", "f equals offline training: yes", "another order: yes"):
             assert words in result.stdout
         found = json.loads((tmp_path / "r.json").read_text())
-        assert found["command"].startswith("scroll-tactile continual roboskin-20 --data simulated --embedding kernels")
+        assert found["command"].startswith(
+            "python -m examples.paper continual roboskin-20 --data DATA --embedding kernels"
+        )
         assert {"versions", "date", "machine", "seed", "sensor", "means"} <= set(found)
         assert found["embedding"]["dimension"] == 64
         assert len(found["folds"]) == 2
         pytest.importorskip("matplotlib")
         assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG"
-        again = run(*simulated, "--memory", tmp_path / "kept", "--no-peers", "--json", tmp_path / "again.json")
+        again = run(*simulated, "--run", tmp_path / "kept", "--no-peers", "--json", tmp_path / "again.json")
         assert again.exit_code == 0, again.output
         assert "streaming LDA" not in again.stdout
         kept = json.loads((tmp_path / "again.json").read_text())["folds"]
         assert [fold["tuned"] for fold in kept] == [fold["tuned"] for fold in found["folds"]]
 
     def test_without_matplotlib_it_says_so(self, simulated: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("examples.paper.plots.drawing.available", lambda: False)
+        monkeypatch.setattr("scroll_tactile.pipelines.drawing.available", lambda: False)
         result = run(*simulated, "--sizes", "0", "--no-peers", "--folds", "0", "--curve", 0, "--plot", "p.png")
         assert result.exit_code == 0, result.output
         assert 'pip install "scroll-tactile[plots]"' in result.stdout

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from examples.paper.studies.fabric_study import Letters, SlideTransfer, directions, summary
+from examples.paper.fabric.fabric_study import Letters, SlideTransfer, directions, summary
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.fabric_slide import CPM_FINGER, Slides
 from scroll_tactile.datasets.letter_spike import DOTS, GRID, NUSKIN, dots_of
@@ -31,7 +31,7 @@ class TestScore:
             "correct": 0.5,
             "precision": 0.0,
             "recall": None,
-            "unsaid": 0,
+            "unanswered": 0,
         }
         assert figures["share_error"] is None
 
@@ -51,7 +51,7 @@ class TestScore:
 
     def test_what_was_not_said_counts_as_not_there_and_is_counted(self):
         figures = score(["a", "b"], [[1, 0]] * 4, [[np.nan, 0.1]] * 4)
-        assert (figures["score"], figures["constituents"]["a"]["unsaid"]) == (0.5, 4)
+        assert (figures["score"], figures["constituents"]["a"]["unanswered"]) == (0.5, 4)
         assert figures["calibration_error"] == pytest.approx(0.1)
         assert score(["a"], [[1]], [[np.nan]])["calibration_error"] is None
 
@@ -154,7 +154,7 @@ def test_the_commands_tell_write_and_go_on(letters, slides, tmp_path, monkeypatc
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["means"]["known"]["score"]["mean"] > 0.7
     assert set(result["parts"][0]["constituents"]) == set(DOTS)
-    assert result["command"].startswith("scroll-tactile fabric letters --data")
+    assert result["command"].startswith("python -m examples.paper fabric letters --data")
     told = run("fabric", "slide", "--data", tmp_path, "--json", tmp_path / "slide.json")
     assert told.exit_code == 0, told.output
     assert "slow → fast" in told.output

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from examples.paper.studies.objects import Objects, most_often, object_groups, summary
-from examples.paper.studies.unseen import fit_heads
+from examples.paper.fabric.objects import Objects, most_often, object_groups, summary
+from examples.paper.fabric.unseen import fit_heads
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
@@ -152,7 +152,7 @@ class TestCommand:
         said = run(*words, "--json", tmp_path / "g.json").output
         assert all(name in said for name in physiclear.ATTRIBUTES)
         result = json.loads((tmp_path / "g.json").read_text())
-        assert result["command"].startswith("scroll-tactile fabric gelsight --data")
+        assert result["command"].startswith("python -m examples.paper fabric gelsight --data")
         assert result["attributes"].keys() == {"apple", "pen", "rug"}
         assert result["means"]["known, counts"]["video"]["mean"] == 1.0
         assert len(result["parts"]) == 4

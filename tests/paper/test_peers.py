@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from examples.paper.runs.cached import Cached
-from examples.paper.studies.peers import NearestMean, Peer, RanPAC, StreamingLDA, touch_features
+from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying, fit_softmax
 from scroll_tactile import Kernels, sensors
 from scroll_tactile.datasets.simulator import Scene
@@ -24,7 +24,7 @@ def blobs(count: int = 10, dimension: int = 6, seed: int = 0) -> tuple[np.ndarra
     return rows, [name for name in NAMES for _ in range(count)]
 
 
-def taught(peer: Peer, rows: np.ndarray, names: list[str]) -> Peer:
+def taught(peer: ContinualPeer, rows: np.ndarray, names: list[str]) -> ContinualPeer:
     for at, (row, name) in enumerate(zip(rows, names, strict=True)):
         peer.observe(row, name)
         if at + 1 == len(names) or names[at + 1] != name:

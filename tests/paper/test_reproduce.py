@@ -1,4 +1,4 @@
-"""Studies of systems, their resumption, and `scroll-tactile reproduce`, on a few simulated touches."""
+"""Studies of systems, their resumption, and `python -m examples.paper`, on a few simulated touches."""
 
 import errno
 import json
@@ -14,10 +14,10 @@ from commands import refused, run
 
 from examples.paper.commands.options import SETS
 from examples.paper.runs.cells import Cell, pooled, split, time_left
-from examples.paper.runs.study import Study
+from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.efficiency import Efficiency, curves, first_touches
 from examples.paper.studies.table1 import PAPER, Table1, blocked, rows
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
@@ -192,26 +192,26 @@ class TestTable1:
     )
     def test_studies_that_cannot_be_are_refused(self, recordings: Recordings, wrong: dict[str, Any], said: str):
         with pytest.raises(InputError, match=said):
-            Study([recordings], **wrong)
+            SystemStudy([recordings], **wrong)
         with pytest.raises(InputError, match="different names"):
-            Study([recordings, recordings], ("svm",))
+            SystemStudy([recordings, recordings], ("svm",))
 
     def test_weights_are_known_by_what_is_in_them(self, recordings: Recordings, tmp_path: Path):
         file = tmp_path / "weights.pth"
         with pytest.raises(WeightsError, match="there is no file"):
-            _ = Study([recordings], ("svm",), weights=str(file)).plan
+            _ = SystemStudy([recordings], ("svm",), weights=str(file)).plan
         file.write_bytes(b"one")
-        one = Study([recordings], ("svm",), weights=str(file)).plan
+        one = SystemStudy([recordings], ("svm",), weights=str(file)).plan
         file.write_bytes(b"other")
-        assert Study([recordings], ("svm",), weights=str(file)).plan != one
-        assert Study([recordings], ("svm",), weights="resnet18").plan["weights"] == "resnet18"
+        assert SystemStudy([recordings], ("svm",), weights=str(file)).plan != one
+        assert SystemStudy([recordings], ("svm",), weights="resnet18").plan["weights"] == "resnet18"
 
 
 def test_the_table_trains_a_whole_course_and_efficiency_the_papers_beginning(recordings: Recordings):
     cell = Cell("RoboSkin-20", 0, "conv-lstm")
     for study, patience in ((Table1, 2), (Efficiency, 10)):
         system = study([recordings], ("conv-lstm",), epochs=20)._system(cell)
-        assert isinstance(system, Trained)
+        assert isinstance(system, TrainedNetwork)
         assert (system.course.epochs, system.course.patience) == (20, patience)
 
 
@@ -242,13 +242,16 @@ def patched(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     for name, reader in sets.items():
         monkeypatch.setitem(SETS, name, reader)
+    monkeypatch.setattr(
+        "examples.paper.commands.robustness_command.read", lambda dataset, data, seed: sets[dataset.value](data, seed)
+    )
 
 
 @pytest.mark.usefixtures("patched")
 class TestCommand:
     def test_table1_quick(self, tmp_path: Path):
         file = tmp_path / "table1.json"
-        words = ("reproduce", "table1", "--data", tmp_path, "--systems", "svm,kernels-lda,conv-lstm", "--quick")
+        words = ("table1", "--data", tmp_path, "--systems", "svm,kernels-lda,conv-lstm", "--quick")
         result = run(*words, "--json", file, "--run", tmp_path / "run")
         assert result.exit_code == 0, result.output
         assert "94.2 %" in result.output and "50.5 %" in result.output and "BioTac-20 blocked" not in result.output
@@ -256,20 +259,20 @@ class TestCommand:
         kept = json.loads(file.read_text())
         assert {"command", "seed", "versions", "machine", "seconds", "device", "threads"} <= kept.keys()
         assert "snntorch" in kept["versions"]
-        assert kept["command"].startswith("scroll-tactile reproduce table1") and "--quick" in kept["command"]
+        assert kept["command"].startswith("python -m examples.paper table1") and "--quick" in kept["command"]
         assert len(kept["cells"]) == 6
         first = {row["key"]: row for row in kept["rows"]}["svm"]["sets"]["BioTac-20"]
         assert first["difference"] == pytest.approx(first["mean"] - 0.942)
         assert "epochs 6 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")
 
     def test_rows_that_need_weights_are_left_out_aloud(self, tmp_path: Path):
-        result = run("reproduce", "efficiency", "--data", tmp_path, "--quick", "--sets", "roboskin-20", "--epochs", 1)
+        result = run("efficiency", "--data", tmp_path, "--quick", "--sets", "roboskin-20", "--epochs", 1)
         assert result.exit_code == 0, result.output
         assert "Left out without --weights: resnet-pretrained, vision-lda, kernels+vision-lda" in result.output
 
     def test_efficiency_draws(self, tmp_path: Path):
         pytest.importorskip("matplotlib")
-        words = ("reproduce", "efficiency", "--data", tmp_path, "--systems", "conv-lstm,kernels-lda", "--folds", "0,1")
+        words = ("efficiency", "--data", tmp_path, "--systems", "conv-lstm,kernels-lda", "--folds", "0,1")
         plot, file = tmp_path / "curves.png", tmp_path / "curves.json"
         result = run(*words, "--epochs", 2, "--plot", plot, "--json", file)
         assert result.exit_code == 0, result.output
@@ -281,7 +284,7 @@ class TestCommand:
         safetensors = pytest.importorskip("safetensors.torch")
         weights, folder, plot = tmp_path / "w.safetensors", tmp_path / "run", tmp_path / "a.png"
         safetensors.save_file(ResNet.random(4).state_dict(), weights)
-        words = ("reproduce", "activation", "--data", tmp_path, "--quick", "--epochs", 1, "--run", folder)
+        words = ("activation", "--data", tmp_path, "--quick", "--epochs", 1, "--run", folder)
         assert "expected --weights" in refused(*words)
         files = [tmp_path / "one.json", tmp_path / "two.json"]
         for file, drawn in zip(files, (["--plot", plot], []), strict=True):
@@ -301,12 +304,12 @@ class TestCommand:
     def test_noise_is_asked_of_the_papers_systems_and_ours(self, tmp_path: Path):
         pytest.importorskip("matplotlib")
         file = tmp_path / "noise.json"
-        words = ("reproduce", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")
+        words = ("robustness", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")
         result = run(*words, "--systems", "svm,conv-lstm", "--json", file, "--plot", tmp_path / "noise.png")
         assert result.exit_code == 0, result.output
         assert "73.0 %" in result.output and "80.0 %" in result.output
         kept = json.loads(file.read_text())
-        assert kept["command"].startswith("scroll-tactile reproduce noise --data DATA --systems svm,conv-lstm")
+        assert kept["command"].startswith("python -m examples.paper robustness noise --data DATA --sets biotac-20,")
         means = {(one["dataset"], one["strength"], one["system"], one["augmented"]): one for one in kept["means"]}
         assert len(means) == 16
         assert means["RoboSkin-20", 0.0, "svm", False]["mean"] > 0.5  # of three materials
@@ -318,7 +321,7 @@ class TestCommand:
         assert "other settings of conv-lstm" in again and "'epochs': 2" in again
 
     def test_what_the_robustness_commands_cannot_do_is_refused(self, tmp_path: Path):
-        words = ("reproduce", "speed", "--data", tmp_path)
+        words = ("robustness", "speed", "--data", tmp_path)
         assert "ours, svm, svm-spikes, conv-lstm, snn, resnet" in refused(*words, "--systems", "least-squares")
         assert "give --weights" in refused(*words, "--systems", "resnet-pretrained")
         assert "out of [0, 1, 2]" in refused(*words, "--systems", "svm", "--sets", "roboskin-20", "--folds", "9")
@@ -326,12 +329,11 @@ class TestCommand:
     def test_all_writes_every_part_and_reads_finished_cells_back(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         pytest.importorskip("matplotlib")
         # The package's names are the commands; their modules lie behind them.
-        module = sys.modules["examples.paper.commands.reproduce"]
+        module = sys.modules["examples.paper.commands.paper_command"]
         monkeypatch.setattr(module, "SYSTEMS", {"svm-spikes": "SVM on spikes"})
         monkeypatch.setattr(module, "CURVES", ("kernels-lda",))
-        monkeypatch.setattr("examples.paper.commands.perturbed.CHOICES", ("svm-spikes",))
-        monkeypatch.setattr("examples.paper.commands.perturbed.BASELINES", ("svm-spikes",))
-        words = ("reproduce", "all", "--data", tmp_path, "--out", tmp_path, "--quick", "--run", tmp_path / "run")
+        monkeypatch.setattr("examples.paper.commands.robustness_command.CHOICES", ("svm-spikes",))
+        words = ("all", "--data", tmp_path, "--out", tmp_path, "--quick", "--run", tmp_path / "run")
         for _ in range(2):
             result = run(*words)
             assert result.exit_code == 0, result.output
@@ -342,7 +344,7 @@ class TestCommand:
         assert studies == {"length", "speed", "noise"}
 
     def test_what_is_not_there_is_named(self, tmp_path: Path):
-        words = ("reproduce", "table1", "--data", tmp_path)
+        words = ("table1", "--data", tmp_path)
         assert "biotac-20-blocked" in refused(*words, "--sets", "biotac-50", "--systems", "svm")
         assert "least-squares-random" in refused(*words, "--systems", "cnn")
         assert "out of [0, 1, 2]" in refused(*words, "--systems", "svm", "--sets", "roboskin-20", "--folds", "9")
@@ -350,7 +352,7 @@ class TestCommand:
 
 
 def test_a_missing_data_set_is_named_with_where_to_get_it(tmp_path: Path):
-    words = ("reproduce", "table1", "--data", tmp_path, "--systems", "svm")
+    words = ("table1", "--data", tmp_path, "--systems", "svm")
     assert "github.com/dexrob/biotac_slide_20_50" in refused(*words)
     assert "github.com/clear-nus/octopi" in refused(*words, "--sets", "gelsight")
     assert "--sets biotac-20" in refused(*words)

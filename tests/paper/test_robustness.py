@@ -7,14 +7,14 @@ import pytest
 from commands import refused, run
 from test_perturbations import PAD
 
-from examples.paper.plots import drawing as plots
-from examples.paper.plots.plots_robustness import curves, draw_robustness
+from examples.paper.plots import draw_robustness, robustness_curves
 from examples.paper.studies.robustness_study import Robustness, ours, summary, worst
 from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.embeddings import Robust
 from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.pipelines import drawing as plots
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import validate
 
@@ -55,7 +55,7 @@ def test_a_system_is_taught_once_a_fold_for_all_studies_and_once_for_another_sit
     task = study(augmented=(False,))
     (records,) = task.run([0])
     assert Loudest.made == 2
-    assert [one["study"] for one in records if one["strength"] == 0] == ["noise", "dead", "drift", "sitting"]
+    assert [one["study"] for one in records if one["strength"] == 0] == ["noise", "dead", "drift", "session"]
     assert {one["tested"] for one in records} == {30}
     assert all(0 <= one["accuracy"] <= 1 for one in records)
 
@@ -145,8 +145,8 @@ def test_means_over_folds_and_the_worst_of_a_stretch():
 
 def test_the_picture(tmp_path):
     rows = summary([record for fold in study().run([0, 1]) for record in fold])
-    lines = curves(rows)
-    assert list(lines) == ["length", "speed", "noise", "dead", "drift", "sitting"]
+    lines = robustness_curves(rows)
+    assert list(lines) == ["length", "speed", "noise", "dead", "drift", "session"]
     assert [strength for strength, *_ in lines["speed"]["loudest", True]] == [0.5, 1, 2]
     if plots.available():
         draw_robustness(tmp_path / "p.png", rows, title="made up")
@@ -156,11 +156,11 @@ def test_the_picture(tmp_path):
 
 
 def test_the_command_says_what_is_missing(tmp_path):
-    assert "biotac_slide_20_50" in refused("robustness", "noise", "biotac-20", "--data", tmp_path)
+    assert "biotac_slide_20_50" in refused("robustness", "noise", "--data", tmp_path)
 
 
 def test_the_command_on_real_touches(real_data, tmp_path):
-    words = ["robustness", "dead", "roboskin-20", "--data", real_data, "--quick", "--materials", 2]
+    words = ["robustness", "dead", "--sets", "roboskin-20", "--data", real_data, "--quick", "--materials", 2]
     result = run(*words, "--json", tmp_path / "r.json", "--plot", tmp_path / "r.png", "--run", tmp_path / "run")
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "r.json").read_text())

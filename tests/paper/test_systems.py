@@ -18,7 +18,7 @@ from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingN
 from examples.paper.systems.spikes import decode, encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System, silent, unwatched
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets.physiclear import HALF_SIZE
 from scroll_tactile.embeddings import Vision
 from scroll_tactile.embeddings.resnet import ResNet
@@ -204,14 +204,14 @@ def test_the_validation_chooses_and_is_learned_then():
     assert squares.penalty in PENALTIES
 
 
-def trained(seed: int = 0, **more: Any) -> Trained:
+def trained(seed: int = 0, **more: Any) -> TrainedNetwork:
     course = more.pop("course", Course(epochs=3, batch=8))
-    system = Trained("net", lambda shape, count, _: ConvLSTM(shape[0], count), course=course, **more)
+    system = TrainedNetwork("net", lambda shape, count, _: ConvLSTM(shape[0], count), course=course, **more)
     fit(system, seed)
     return system
 
 
-def state(system: Trained) -> list[bytes]:
+def state(system: TrainedNetwork) -> list[bytes]:
     assert system._net is not None
     return [tensor.numpy().tobytes() for tensor in system._net.state_dict().values()]
 
@@ -237,11 +237,13 @@ class TestTraining:
 
         before = torch.get_rng_state()
         with pytest.raises(KeyboardInterrupt):
-            fit(Trained("net", lambda shape, count, _: ConvLSTM(shape[0], count)), watch=interrupt)
+            fit(TrainedNetwork("net", lambda shape, count, _: ConvLSTM(shape[0], count)), watch=interrupt)
         assert torch.equal(before, torch.get_rng_state())
 
     def test_every_epoch_is_watched_and_noted(self):
-        system = Trained("net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=4, batch=8))
+        system = TrainedNetwork(
+            "net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=4, batch=8)
+        )
         shares: list[float] = []
         heard: list[tuple[int, int]] = []
         fit(
@@ -290,7 +292,9 @@ class TestTraining:
         assert not torch.equal(kept[0], kept[-1])
 
     def test_without_validation_the_training_loss_is_judged(self):
-        system = Trained("net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=2, batch=8))
+        system = TrainedNetwork(
+            "net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=2, batch=8)
+        )
         system.fit([stream for _, stream in TAUGHT], [name for name, _ in TAUGHT], [], 0)
         assert [epoch.validation_loss for epoch in system.epochs] == [None, None]
 

@@ -16,7 +16,7 @@ from examples.paper.transfer.across_sensors import ALONE, WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
 from examples.paper.transfer.few_touches import WidestFeatures, WidestReadout, draw_touches, feeler_maker, few_touches
-from examples.paper.transfer.shared_features import Shared
+from examples.paper.transfer.shared_features import SharedFeatures
 from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, some_frames
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.physiclear import HALF_SIZE
@@ -108,7 +108,7 @@ class TestFewTouches:
         assert found == {
             "tested": 6,
             "right": {"0": [2], "1": [2], "2": [2], "5": [2]},
-            "taught": {"0": 0, "1": 1, "2": 2, "5": 5},
+            "learned": {"0": 0, "1": 1, "2": 2, "5": 5},
         }
         assert len(told) == len(set(told)) == 15
         kept = {touches.streams[at].key for at in np.flatnonzero(touches.fold == 0)}
@@ -136,7 +136,7 @@ class TestTasks:
         for cell, figures in results:
             assert figures["tested"] == 6
             if cell.system == TRAINING:
-                assert (figures["taught"], figures["validation"]) == (21, 3)
+                assert (figures["learned"], figures["validation"]) == (21, 3)
                 assert len(figures["losses"]) == study.epochs
         kernels = [row["points"]["4"]["mean"] for row in rows(results) if row["system"] == "kernels"]
         assert min(kernels) > 0.9
@@ -310,7 +310,7 @@ def pair():
 
 class TestSensors:
     def test_features_that_do_not_know_the_sensor(self, pair):
-        shared = Shared((PATCH, STRIP))
+        shared = SharedFeatures((PATCH, STRIP))
         assert (shared.rate, shared.columns) == (50.0, 30)
         one, other = (shared.spectra(recordings.streams[0]) for recordings in pair)
         assert one.shape == other.shape
@@ -321,7 +321,7 @@ class TestSensors:
         assert np.isfinite(shared.spectra(short)).all()
         assert shared.resampled(Kernels(dimension=64))(pair[1].streams[0]).shape == (64,)
         with pytest.raises(InputError, match="sensors with channels"):
-            Shared((PATCH, HALF_SIZE))
+            SharedFeatures((PATCH, HALF_SIZE))
 
     def test_materials_that_feel_alike_to_both_are_known_without_a_touch(self, pair, tmp_path):
         study = SensorTransfer(pair, draws=1, counts=(0, 1, 2), folder=tmp_path / "run")
@@ -375,7 +375,7 @@ class TestCommands:
         assert "vision tuned on patch" in result.output.replace("\n", " ") or "tuned on" in result.output
         written = json.loads(out.read_text())
         assert written["precision"] == "bfloat16"
-        assert written["command"].startswith("scroll-tactile transfer tasks --data DATA --weights random.pth")
+        assert written["command"].startswith("python -m examples.paper transfer tasks --data DATA --folds 0 --weights random.pth")
         assert len(written["rows"]) == 6  # two sets asked about: kernels, vision, and vision tuned on one of them
         assert picture.stat().st_size > 1000
 

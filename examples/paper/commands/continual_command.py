@@ -1,8 +1,7 @@
-"""`scroll-tactile continual`."""
+"""`continual`: f and f* for every size of the exemplar buffer, beside other continual learners."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -12,8 +11,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from examples.paper.commands.sets import Dataset, draw_into, origin, parse_folds, read, require_folders
-from examples.paper.plots.plots_continual import draw_continual
+from examples.paper.commands.options import Data, Device, FewMaterials, Folds, Json, Plot, Run, Seed, Where
+from examples.paper.commands.sets import Dataset, command_line, draw_into, origin, parse_folds, read, require_folders
+from examples.paper.plots import draw_continual
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
@@ -40,24 +40,17 @@ class Order(StrEnum):
     SHUFFLED = "shuffled"
 
 
-class Device(StrEnum):
-    """Where a fine-tune runs."""
-
-    CPU = "cpu"
-    CUDA = "cuda"
-
-
 def continual(
     dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
-    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
+    data: Data,
     weights: Annotated[
         str | None, typer.Option(help="Of the vision embedding: a file, or a published name such as resnet18.")
     ] = None,
     embedding: Annotated[EmbeddingChoice, typer.Option(help="The frozen features.")] = EmbeddingChoice.KERNELS,
     schedule: Annotated[Order, typer.Option(help="The order in which touches are learned.")] = Order.CLASSES,
     sizes: Annotated[str, typer.Option(help="Exemplars in the buffer; all: every touch.")] = "0,20,50,100,200,400,all",
-    folds: Annotated[str, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')] = "all",
-    seed: Annotated[int, typer.Option(min=0, help="Draws the order, BioTac's folds, and what training draws.")] = 0,
+    folds: Folds = "all",
+    seed: Seed = 0,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Of a fine-tune; the learner's own choice unless given.")
     ] = None,
@@ -68,13 +61,11 @@ def continual(
         bool, typer.Option("--tuned-curve", help="Measure f* there too: a fine-tune at each. Slow.")
     ] = False,
     peers: Annotated[bool, typer.Option(help="Measure other methods on the same features.")] = True,
-    device: Annotated[Device, typer.Option(help="Where fine-tunes run.")] = Device.CPU,
-    memory: Annotated[
-        Path | None, typer.Option(help="Note finished parts in this folder; an interrupted run goes on from it.")
-    ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw accuracy by buffer size and by materials met.")] = None,
-    materials: Annotated[int, typer.Option(hidden=True, min=2)] = 20,
+    device: Where = Device.CPU,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+    materials: FewMaterials = 20,
     features: Annotated[
         int | None, typer.Option(min=64, help="Of the kernels: 1008 alone and 1260 beside vision, unless given.")
     ] = None,
@@ -86,7 +77,7 @@ def continual(
     """
     require_folders(json, plot)
     chosen_sizes = parse_sizes(sizes)
-    # Beside vision 1260 kernels tell RoboSkin apart in 98.7 %, 1008 in 98.6; BioTac in 99.5 with both.
+    # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 in 98.6; BioTac in 99.5 with both.
     usual = 1260 if embedding is EmbeddingChoice.BOTH else 1008
     frozen = _embedding(embedding, weights, features or usual)
     with progress_bar() as progress:
@@ -105,16 +96,21 @@ def continual(
             epochs=epochs,
             peers=peers,
             device=device.value,
-            folder=memory,
+            folder=run,
         )
-        chosen = parse_folds(folds, recordings)
+        chosen = parse_folds(folds or "all", recordings)
         results: list[dict[str, Any]] = []
         for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
             results.append(done)
     published = PUBLISHED.get(recordings.name) if materials == 20 else None
     _show(recordings, results, published)
     if json is not None:
-        command = _command(dataset, data, task, folds, embedding, weights, features or usual)
+        settings: dict[str, Any] = {"embedding": embedding.value, "weights": None if weights is None else Path(weights)}
+        settings |= {"features": None if embedding is EmbeddingChoice.VISION else features or usual}
+        settings |= {"schedule": schedule.value, "sizes": ",".join(map(str, chosen_sizes)), "folds": folds or "all"}
+        settings |= {"seed": seed, "curve": curve, "device": device.value, "epochs": epochs}
+        settings |= {"tuned_curve": tuned_curve, "no_peers": not peers, "run": None if run is None else "RUN"}
+        command = command_line("continual", dataset.value, data="DATA", **settings)
         rows = summary(results)
         write_json(json, origin(command, recordings) | task.plan | {"sizes": sizes, "means": rows, "folds": results})
         say(f"figures: {json}")
@@ -192,26 +188,6 @@ def _lines(published: tuple[float, float] | None) -> dict[str, float]:
         return {}
     ridge, tuned = published
     return {"published: ResNet fine-tuned offline": tuned, "published: ridge on a frozen vision model": ridge}
-
-
-def _command(
-    dataset: Dataset,
-    data: Path,
-    task: Continual,
-    folds: str,
-    embedding: EmbeddingChoice,
-    weights: str | None,
-    features: int,
-) -> str:
-    words = ["scroll-tactile", "continual", dataset.value, "--data", str(data), "--embedding", embedding.value]
-    words += ["--weights", weights] if weights is not None else []
-    words += ["--features", str(features)] if embedding is not EmbeddingChoice.VISION else []
-    words += ["--schedule", task.schedule, "--sizes", ",".join(map(str, task.sizes)), "--folds", folds]
-    words += ["--seed", str(task.seed), "--curve", str(task.curve), "--device", task.device]
-    words += ["--epochs", str(task.epochs)] if task.epochs is not None else []
-    words += ["--tuned-curve"] * task.tuned_curve + ["--no-peers"] * (not task.peers)
-    words += ["--memory", str(task.folder)] if task.folder is not None else []
-    return shlex.join(words)
 
 
 def _plot(plot: Path, title: str, results: Sequence[Mapping[str, Any]], published: tuple[float, float] | None) -> None:

@@ -1,8 +1,7 @@
-"""`scroll-tactile fabric`: letters, slides, attributes and objects here, `contactile` in a module of its own."""
+"""`fabric`: letters, slides, attributes and objects here, `contactile` in a module of its own."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,12 +9,13 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from examples.paper.commands.fabrics_command import contactile
-from examples.paper.commands.sets import Dataset, named, origin, parse_folds, read, require_folders
-from examples.paper.studies import objects
-from examples.paper.studies.attributes_study import Attributes
-from examples.paper.studies.attributes_study import summary as summary_of_attributes
-from examples.paper.studies.fabric_study import FIGURES, Letters, SlideTransfer, summary
+from examples.paper.commands.contactile_command import contactile
+from examples.paper.commands.options import Data, Folds, Json, Run, Seed, Weights
+from examples.paper.commands.sets import Dataset, command_line, named, origin, parse_folds, read, require_folders
+from examples.paper.fabric import objects
+from examples.paper.fabric.attributes_study import Attributes
+from examples.paper.fabric.attributes_study import summary as summary_of_attributes
+from examples.paper.fabric.fabric_study import FIGURES, Letters, SlideTransfer, summary
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.grades import read_grades
@@ -30,65 +30,59 @@ fabric = typer.Typer(
 )
 fabric.command()(contactile)
 
-RunFolder = Annotated[
-    Path | None,
-    typer.Option("--run", "--resume", help="Note finished parts in this folder; an interrupted run goes on from it."),
-]
-JsonFile = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
 
 _LABELS = {
     "score": "mean score per dot",
     "exact": "all six dots right",
     "accuracy": "letter right",
     "likeliest": "… of the likeliest letter's dots",
-    "untold": "… not told whether letters are new",
-    "always": "score of always saying what is more common",
+    "inferred": "… novelty inferred, not given",
+    "always": "score of always the more common",
     "calibration_error": "expected calibration error of the dots",
 }
 
 
-_WAYS = {"ours": "ours", "untold": "… not told that it is new", "trees": "trees", "always": "most common grade"}
+_WAYS = {"ours": "ours", "inferred": "… novelty inferred, not given", "trees": "trees", "always": "most common grade"}
 
 
 @fabric.command()
 def letters(
-    data: Annotated[Path, typer.Option(help="Folder of letter-spike, or the one it lies in.")],
-    folds: Annotated[str, typer.Option(help='Which folds of known letters: "all", or numbers such as 0,1.')] = "all",
-    groups: Annotated[int, typer.Option(min=2, max=27, help="The letters are left out in so many groups.")] = 9,
-    seed: Annotated[int, typer.Option(min=0, help="Deals presses into folds and letters into groups.")] = 0,
-    cosines: Annotated[int, typer.Option(min=64, help="Features that tell known letters apart.")] = 3000,
-    json: JsonFile = None,
-    run: RunFolder = None,
+    data: Data,
+    folds: Folds = "all",
+    groups: Annotated[int, typer.Option(min=2, max=27, help="The letters are held out in so many groups.")] = 9,
+    seed: Seed = 0,
+    cosines: Annotated[int, typer.Option(min=64, help="Features by which known letters are classified.")] = 3000,
+    json: Json = None,
+    run: Run = None,
 ) -> None:
-    """Tell Braille letters by their dots: letters that were touched, and letters never touched before."""
+    """Compose Braille letters of their dots: known letters, and letters held out."""
     require_folders(json)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = letter_spike.load(data, seed)
         task = Letters(recordings, groups, seed, cosines, run)
-        results = list(task.run(parse_folds(folds, recordings), progress))
+        results = list(task.run(parse_folds(folds or "all", recordings), progress))
     _show_letters(results)
     if json is not None:
-        words = ["fabric", "letters", "--data", data, "--folds", folds, "--groups", groups, "--seed", seed]
-        command = shlex.join(["scroll-tactile", *map(str, words), "--cosines", str(cosines)])
+        settings: dict[str, Any] = {"folds": folds or "all", "groups": groups, "seed": seed, "cosines": cosines}
+        command = command_line("fabric", "letters", data="DATA", **settings)
         write_json(json, origin(command, recordings) | task.plan | {"means": summary(results), "parts": results})
         say(f"figures: {json}")
 
 
 @fabric.command()
 def slide(
-    data: Annotated[Path, typer.Option(help="Folder of FabricSlide, or the one it lies in.")],
-    parts: Annotated[int, typer.Option(min=1, help="Of a slide, whose mean ratios are the features.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Deals slides into folds.")] = 0,
-    json: JsonFile = None,
-    run: RunFolder = None,
+    data: Data,
+    seed: Seed = 0,
+    json: Json = None,
+    run: Run = None,
 ) -> None:
-    """Learn four fabrics at one speed or force, and be asked about them at another."""
+    """Train on four fabrics at one speed or force, test at another."""
     require_folders(json)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         slides = fabric_slide.load(data, seed=seed)
-        task = SlideTransfer(slides, parts, run)
+        task = SlideTransfer(slides, folder=run)
         results = list(task.run(progress))
     table = Table("part", "learned", "tested", "right", "called unknown", title="FabricSlide, four balanced fabrics")
     for one in results:
@@ -96,24 +90,24 @@ def slide(
         table.add_row(one["part"], str(one["learned"]), str(one["tested"]), *shown)
     console().print(table)
     if json is not None:
-        words = ["scroll-tactile", "fabric", "slide", "--data", str(data), "--parts", str(parts), "--seed", str(seed)]
-        write_json(json, origin(shlex.join(words), slides.recordings) | task.plan | {"seed": seed, "parts": results})
+        command = command_line("fabric", "slide", data="DATA", seed=seed)
+        write_json(json, origin(command, slides.recordings) | task.plan | {"seed": seed, "parts": results})
         say(f"figures: {json}")
 
 
 @fabric.command()
 def attributes(
-    data: Annotated[Path, typer.Option(help="Folder of BioTac_slide_20_50, or the one it lies in.")],
+    data: Data,
     grades: Annotated[
         Path, typer.Option(help="A .csv file: material (mat1 to mat20), then a column of grades for each attribute.")
     ],
     sets: Annotated[str, typer.Option(help="Which sensors touch: biotac-20, roboskin-20.")] = "biotac-20,roboskin-20",
     dimension: Annotated[int, typer.Option(min=64, help="Of the kernels.")] = 504,
-    seed: Annotated[int, typer.Option(min=0, help="Of the trees.")] = 0,
-    json: JsonFile = None,
-    run: RunFolder = None,
+    seed: Seed = 0,
+    json: Json = None,
+    run: Run = None,
 ) -> None:
-    """Tell attributes, such as stiffness and roughness, of materials never touched before."""
+    """Grade attributes, such as stiffness and roughness, of materials held out."""
     require_folders(json)
     asked = named("--sets", sets, list(Dataset))
     found: dict[str, Any] = {}
@@ -124,51 +118,31 @@ def attributes(
             task = Attributes(recordings, listed, dimension, seed, run)
             results = list(task.run(progress))
             found[name] = task.plan | {"means": summary_of_attributes(results), "parts": results}
-    table = Table(
-        "set", "attribute", *_WAYS.values(), title="grades right, of materials never touched (standard error)"
-    )
+    table = Table("set", "attribute", *_WAYS.values(), title="grades right, of materials held out (standard error)")
     for name, one in found.items():
         for attribute, means in one["means"].items():
             cells = [f"{percent(means[way]['mean'])} ({percent(means[way]['error'])})" for way in _WAYS]
             table.add_row(name, attribute, *cells)
     console().print(table)
     if json is not None:
-        words = [
-            "fabric",
-            "attributes",
-            "--data",
-            data,
-            "--grades",
-            grades,
-            "--sets",
-            sets,
-            "--dimension",
-            dimension,
-            "--seed",
-            seed,
-        ]
-        command = shlex.join(["scroll-tactile", *map(str, words)])
+        settings: dict[str, Any] = {"grades": grades, "sets": sets, "dimension": dimension, "seed": seed}
+        command = command_line("fabric", "attributes", data="DATA", **settings)
         write_json(json, origin(command) | {"seed": seed, "sets": found})
         say(f"figures: {json}")
 
 
 @fabric.command()
 def gelsight(
-    data: Annotated[Path, typer.Option(help="Folder of physiclear, or the one it lies in.")],
-    weights: Annotated[
-        str | None,
-        typer.Option(
-            help="Of a trained ResNet: a file, or a published name such as resnet18. Without, only counts are read."
-        ),
-    ] = None,
-    folds: Annotated[str, typer.Option(help='Which folds of videos: "all", or numbers such as 0,1.')] = "all",
+    data: Data,
+    weights: Weights = None,
+    folds: Folds = "all",
     groups: Annotated[int, typer.Option(min=2, help="Objects are left out in so many groups.")] = 5,
-    seed: Annotated[int, typer.Option(min=0, help="Deals videos and objects, and grows the trees.")] = 0,
+    seed: Seed = 0,
     trees: Annotated[int, typer.Option(min=0, help="Of the baseline, scikit-learn's; 0: none.")] = objects.TREES,
-    json: JsonFile = None,
-    run: RunFolder = None,
+    json: Json = None,
+    run: Run = None,
 ) -> None:
-    """Tell everyday objects by a GelSight's videos, and how hard and rough those are that were never touched."""
+    """Classify everyday objects by a GelSight's videos, and grade how hard and rough held-out objects are."""
     require_folders(json)
     with progress_bar() as progress:
         progress("reading", 0, 1)
@@ -177,13 +151,13 @@ def gelsight(
         felt = set(recordings.materials)
         known = {name: values for name, values in attributes.items() if name in felt}
         task = objects.Objects(recordings, known, weights, groups, seed, trees, run)
-        results = list(task.run(parse_folds(folds, recordings), progress))
+        results = list(task.run(parse_folds(folds or "all", recordings), progress))
     means = objects.summary(results)
     _show_objects(means)
     if json is not None:
-        words = ["fabric", "gelsight", "--data", data, *(["--weights", weights] if weights else []), "--folds", folds]
-        words += ["--groups", groups, "--seed", seed, "--trees", trees]
-        command = shlex.join(["scroll-tactile", *map(str, words)])
+        settings: dict[str, Any] = {"weights": None if weights is None else Path(weights), "folds": folds or "all"}
+        settings |= {"groups": groups, "seed": seed, "trees": trees}
+        command = command_line("fabric", "gelsight", data="DATA", **settings)
         write_json(json, origin(command, recordings) | task.plan | {"means": means, "parts": results})
         say(f"figures: {json}")
 

@@ -1,9 +1,8 @@
-"""What the commands of `reproduce` share: their options, the sets that they read, and how they end."""
+"""The options that several commands share, and how the commands of the paper's systems begin and end."""
 
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from examples.paper.commands.sets import leave_out, named, origin, parse_folds
+from examples.paper.commands.sets import command_line, leave_out, named, origin, parse_folds
 from examples.paper.runs.cells import Cell, Figures
-from examples.paper.runs.study import Study
+from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import blocked
 from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
 from scroll_tactile.cli.terminal import say, write_json
@@ -31,6 +30,7 @@ __all__ = [
     "choose_folds",
     "choose_systems",
     "close",
+    "machine",
     "read_sets",
     "say_conditions",
 ]
@@ -59,14 +59,14 @@ SETS: dict[str, Callable[[Path, int], Recordings]] = {
 QUICK_SETS = ("biotac-20", "roboskin-20")
 QUICK_EPOCHS = 6
 
-Data = Annotated[Path, typer.Option(help="Folder with biotac_slide_20_50/ in it, and physiclear/ for gelsight.")]
+Data = Annotated[Path, typer.Option(help="The folder of the published set, or the one that the sets' folders lie in.")]
 Weights = Annotated[
     str | None,
     typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18. Without, rows are left out."),
 ]
 Sets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(SETS)}.")]
 Systems = Annotated[str | None, typer.Option(help=f"Which systems, of {', '.join(SYSTEMS)}.")]
-Folds = Annotated[str | None, typer.Option(help='"all", or numbers from 0, such as 0 or 0,1.')]
+Folds = Annotated[str | None, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Of the networks' training.")]
 Where = Annotated[Device, typer.Option(help="Where networks are trained.")]
 InPrecision = Annotated[
@@ -78,10 +78,11 @@ Quick = Annotated[
 ]
 Run = Annotated[
     Path | None,
-    typer.Option("--run", "--resume", help="Write finished cells into this folder; a killed run goes on from it."),
+    typer.Option("--run", help="Note finished parts in this folder; the same command goes on from them."),
 ]
 Json = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
-Plot = Annotated[Path | None, typer.Option(help="Draw the curves into this file.")]
+Plot = Annotated[Path | None, typer.Option(help="Draw the figure into this file.")]
+FewMaterials = Annotated[int, typer.Option("--materials", hidden=True, min=2)]
 
 
 def choose_systems(asked: str | None, usual: Sequence[str], weights: str | None) -> tuple[str, ...]:
@@ -110,10 +111,15 @@ def read_sets(asked: str | None, usual: Sequence[str], data: Path, seed: int, qu
 def choose_folds(asked: str | None, read: Sequence[Recordings], quick: bool) -> dict[str, list[int]]:
     """The folds of --folds for each set; without it all, or the first in a quick run."""
     wanted = asked if asked is not None else ("0" if quick else "all")
-    return {one.name: parse_folds(wanted, one) for one in read}
+    return {recordings.name: parse_folds(wanted, recordings) for recordings in read}
 
 
-def say_conditions(study: Study) -> None:
+def machine() -> dict[str, Any]:
+    """How many processors there are, and threads of torch."""
+    return {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
+
+
+def say_conditions(study: SystemStudy) -> None:
     """What the figures have to be read with."""
     if any(key in EPOCHAL for key in study.systems):
         short = "" if study.epochs >= 100 else " where the paper has 100"
@@ -122,49 +128,43 @@ def say_conditions(study: Study) -> None:
         say(f"networks: {how}; a tenth of what is learned is the validation")
     if study.quick:
         say(
-            "[yellow]quick:[/] learned from every second touch; the ResNets' images averaged to about 50 columns: "
+            "[yellow]quick:[/] trained on every second touch; the ResNets' images averaged to about 50 columns: "
             "for a look, not for a report"
         )
 
 
 def close(
-    study: Study,
+    study: SystemStudy,
     results: Sequence[tuple[Cell, Figures]],
     json: Path | None,
     found: Mapping[str, Any],
     sets: str | None,
     folds: str | None,
 ) -> None:
-    """Tell of folds of unequal size, and write the JSON."""
-    for one in study.sets:
-        sizes = {cell.fold: figures["tested"] for cell, figures in results if cell.dataset == one.name}
+    """Report folds of unequal size, and write the JSON."""
+    for recordings in study.sets:
+        sizes = {cell.fold: figures["tested"] for cell, figures in results if cell.dataset == recordings.name}
         if len(set(sizes.values())) > 1:
-            say(
-                f"{one.name}: folds of unequal size, {', '.join(map(str, sizes.values()))}: every touch counts the same"
-            )
+            listed = ", ".join(map(str, sizes.values()))
+            say(f"{recordings.name}: folds of unequal size, {listed}: every touch counts the same")
     if json is None:
         return
-    sensors = {one.name: one.sensor.model_dump(mode="json") for one in study.sets}
-    threads = {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
-    seconds = {"seconds": sum(figures["seconds"] for _, figures in results)}
-    cells = {cell.key: figures for cell, figures in results}
-    write_json(
-        json,
-        origin(_command(study, sets, folds))
-        | threads
-        | study.plan
-        | seconds
-        | {"sensors": sensors, **found, "cells": cells},
+    command = command_line(
+        study.name,
+        data="DATA",
+        systems=None if study.name == "activation" else ",".join(study.systems),  # it has no choice
+        sets=sets,
+        folds=folds,
+        weights=None if study.weights is None else Path(study.weights),
+        epochs=study.epochs,
+        device=study.device,
+        seed=study.seed,
+        precision=study.precision,
+        quick=study.quick,
+        run=None if study.folder is None else "RUN",
     )
+    about = machine() | study.plan | {"seconds": sum(figures["seconds"] for _, figures in results)}
+    sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
+    cells = {cell.key: figures for cell, figures in results}
+    write_json(json, origin(command) | about | {"sensors": sensors, **found, "cells": cells})
     say(f"figures: {json}")
-
-
-def _command(study: Study, sets: str | None, folds: str | None) -> str:
-    words = ["scroll-tactile", "reproduce", study.name, "--data", "DATA", "--systems", ",".join(study.systems)]
-    words += ["--sets", sets] if sets is not None else []
-    words += ["--folds", folds] if folds is not None else []
-    words += ["--weights", Path(study.weights).name] if study.weights is not None else []
-    words += ["--epochs", str(study.epochs), "--device", study.device, "--seed", str(study.seed)]
-    words += ["--precision", study.precision] if study.precision != "float32" else []
-    words += ["--quick"] * study.quick + (["--run", "RUN"] if study.folder is not None else [])
-    return shlex.join(words)

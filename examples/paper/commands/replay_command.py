@@ -1,8 +1,7 @@
-"""`scroll-tactile replay`."""
+"""`replay`: a recorded set learned in one pass, fold by fold."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from examples.paper.commands.sets import Dataset, draw_into, origin, parse_folds, read, require_folders
-from examples.paper.plots import drawing as plots
+from examples.paper.commands.options import Data, FewMaterials, Folds, Json, Plot, Run, Seed
+from examples.paper.commands.sets import Dataset, command_line, draw_into, origin, parse_folds, read, require_folders
 from examples.paper.studies.replay import FIGURES, PUBLISHED, Replay, subset, summary
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
+from scroll_tactile.pipelines import drawing as plots
 
 __all__ = ["replay"]
 
@@ -41,7 +41,7 @@ _LABELS = {
     "accuracy": "accuracy after the last material",
     "first": "… from the first 0.3 s",
     "half": "… from half streams",
-    "twice": "… learned from half streams",
+    "twice": "… trained on half streams",
     "calibration_error": "expected calibration error, 15 bins",
     "false_alarms": "known touches called unknown",
     "novelty_auroc": "novelty AUROC, 4 of 20 materials held out",
@@ -50,13 +50,10 @@ _LABELS = {
 
 def replay(
     dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
-    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
+    data: Data,
     schedule: Annotated[Schedule, typer.Option(help="The order in which touches are learned.")] = Schedule.CLASSES,
-    seed: Annotated[int, typer.Option(min=0, help="Draws the order, and BioTac's folds.")] = 0,
-    folds: Annotated[str, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')] = "all",
-    memory: Annotated[
-        Path | None, typer.Option(help="Keep each fold's memory here; an interrupted replay goes on from it.")
-    ] = None,
+    seed: Seed = 0,
+    folds: Folds = "all",
     readout: Annotated[ReadoutChoice, typer.Option(help="How materials are told apart.")] = ReadoutChoice.LDA,
     blocked: Annotated[
         bool, typer.Option("--blocked", help="Folds of successive repetitions (BioTac only): a harder test.")
@@ -64,12 +61,10 @@ def replay(
     novelty: Annotated[
         bool, typer.Option("--novelty", help="Also hold out 4 of 20 materials, five times over. Slower.")
     ] = False,
-    curve: Annotated[
-        int, typer.Option(min=0, max=20, help="Test after every so many twentieths of the pass; 0: only at its end.")
-    ] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw confusions, and the curve, into this PNG.")] = None,
-    materials: Annotated[int, typer.Option(hidden=True, min=2)] = 20,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+    materials: FewMaterials = 20,
 ) -> None:
     """Learn a recorded set in one pass, fold by fold, and test it on what was held out.
 
@@ -82,15 +77,22 @@ def replay(
         recordings = read(dataset, data, seed)
         if materials < 20:
             recordings = subset(recordings, materials)
-        task = Replay(recordings, schedule.value, seed, readout.value, blocked, curve, novelty, folder=memory)
-        chosen = parse_folds(folds, recordings)
+        task = Replay(recordings, schedule.value, seed, readout.value, blocked, novelty, folder=run)
+        chosen = parse_folds(folds or "all", recordings)
         results: list[dict[str, Any]] = []
         for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
             results.append(done)
     _show(recordings, results, compared=materials == 20)
     if json is not None:
-        command = _command(dataset, data, task, folds)
-        write_json(json, _result(command, task, results))
+        settings: dict[str, Any] = {
+            "schedule": schedule.value,
+            "seed": seed,
+            "folds": folds or "all",
+            "readout": readout.value,
+        }
+        settings |= {"blocked": blocked, "novelty": novelty, "run": None if run is None else "RUN"}
+        command = command_line("replay", dataset.value, data="DATA", **settings)
+        write_json(json, origin(command, recordings) | task.plan | {"means": summary(results), "folds": results})
         say(f"figures: {json}")
     if plot is not None:
         _plot(plot, recordings, results)
@@ -119,8 +121,6 @@ def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], *, compa
             f"{result['learned']}; equals offline training: {same}; digest {result['digest'][:16]}; "
             f"{result['seconds']:.1f} s"
         )
-        if result["curve"]:
-            say("  accuracy over materials met: " + ", ".join(f"{met}: {percent(a)}" for met, a in result["curve"]))
     worst = sorted(_confusions(results).items(), key=lambda entry: -entry[1])[:3]
     say("worst confusions: " + ("; ".join(f"{a} taken for {b} {n}×" for (a, b), n in worst) or "none"))
 
@@ -128,33 +128,14 @@ def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], *, compa
 def _confusions(results: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], int]:
     counts: dict[tuple[str, str], int] = {}
     for result in results:
-        for truth, said, count in result["confusions"]:
-            counts[truth, said] = counts.get((truth, said), 0) + count
+        for truth, predicted, count in result["confusions"]:
+            counts[truth, predicted] = counts.get((truth, predicted), 0) + count
     return counts
-
-
-def _command(dataset: Dataset, data: Path, task: Replay, folds: str) -> str:
-    words = ["scroll-tactile", "replay", dataset.value, "--data", str(data), "--schedule", task.schedule]
-    words += ["--seed", str(task.seed), "--folds", folds, "--readout", task.readout]
-    words += ["--blocked"] * task.blocked + ["--novelty"] * task.novelty
-    words += ["--curve", str(task.curve)] * bool(task.curve)
-    words += ["--memory", str(task.folder)] if task.folder is not None else []
-    return shlex.join(words)
-
-
-def _result(command: str, task: Replay, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    return {
-        **origin(command, task.recordings),
-        **task.plan,
-        "means": summary(results),
-        "folds": list(results),
-    }
 
 
 def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any]]) -> None:
     names = list(dict.fromkeys(recordings.materials))
-    confusions = [(truth, said, count) for (truth, said), count in _confusions(results).items()]
+    confusions = [(truth, predicted, count) for (truth, predicted), count in _confusions(results).items()]
     tested = [sum(result["tested_of"].get(name, 0) for result in results) for name in names]
     counts = plots.confusion_counts(names, tested, confusions)
-    curves = [result["curve"] for result in results]
-    draw_into(plot, lambda file: plots.draw(file, names, counts, title=recordings.name, curves=curves))
+    draw_into(plot, lambda file: plots.draw(file, names, counts, title=recordings.name))

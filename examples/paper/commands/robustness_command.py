@@ -1,12 +1,15 @@
-"""`scroll-tactile robustness`, and the paper's part of it: `reproduce length`, `speed` and `noise`."""
+"""`robustness`: systems trained on clean touches, tested on shorter, faster, noisier ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import Annotated
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
 from examples.paper.commands.options import (
     QUICK_EPOCHS,
@@ -14,6 +17,7 @@ from examples.paper.commands.options import (
     Data,
     Device,
     Epochs,
+    FewMaterials,
     Folds,
     InPrecision,
     Json,
@@ -23,131 +27,197 @@ from examples.paper.commands.options import (
     Seed,
     Weights,
     Where,
-    read_sets,
 )
-from examples.paper.commands.perturbed import CHOICES, OURS, Asked, choose, measure, tell
-from examples.paper.commands.sets import Dataset, read, require_folders
+from examples.paper.commands.sets import (
+    Dataset,
+    command_line,
+    draw_into,
+    leave_out,
+    named,
+    origin,
+    parse_folds,
+    read,
+    require_folders,
+)
+from examples.paper.plots import draw_robustness
+from examples.paper.runs.study import columns_averaged, weights_digest
+from examples.paper.studies.baselines import BASELINES, baseline
 from examples.paper.studies.replay import subset
-from scroll_tactile.cli.terminal import progress_bar
+from examples.paper.studies.robustness_study import NAMES, PAPER, SESSION, Make, Robustness, ours, summary
+from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, Catalogue
+from examples.paper.systems.descent import Course
+from examples.paper.systems.trained import require_device
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
+from scroll_tactile.datasets import Recordings
+from scroll_tactile.errors import InputError
 
-__all__ = ["IN_THE_PAPER", "robustness", "study_command"]
+__all__ = ["IN_THE_PAPER", "robustness"]
 
-IN_THE_PAPER = {
-    "length": "Accuracy against the length of the touch, from 0.1 s on; the paper says that 0.3 s suffices.",
-    "speed": "Accuracy against speed, a quarter to four times that learned from.",
-    "noise": "Accuracy against uniform noise, up to the whole range.",
-}
-"""Study → what its command says of itself."""
+IN_THE_PAPER = ("length", "speed", "noise")
+"""The studies that the paper has a figure of."""
+
+OURS = "ours"
+CHOICES = (OURS, *BASELINES)
 
 
 class StudyChoice(StrEnum):
-    """The studies, and all of them."""
+    """The studies, those of the paper, and all of them."""
 
     LENGTH = "length"
     SPEED = "speed"
     NOISE = "noise"
     DEAD = "dead"
     DRIFT = "drift"
-    SITTING = "sitting"
+    SESSION = "session"
+    PAPER = "paper"
     ALL = "all"
 
 
-QuickStudy = Annotated[
-    bool,
-    typer.Option("--quick", help="The first of these folds, few strengths, networks of 6 epochs on small images."),
-]
-SensorSets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(QUICK_SETS)}.")]
-Systems = Annotated[
-    str | None, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; without and with augmentation.")
-]
-
-
 def robustness(
-    study: Annotated[StudyChoice, typer.Argument(help="What is done to the test touches.", show_default=False)],
-    dataset: Annotated[Dataset, typer.Argument(help="Which recordings.", show_default=False)],
+    study: Annotated[
+        StudyChoice, typer.Argument(help="How test touches differ; paper: length, speed, noise.", show_default=False)
+    ],
     data: Data,
-    systems: Systems = OURS,
+    sets: Annotated[
+        str, typer.Option(help=f"Which data sets, of {', '.join(Dataset)}; a picture for each.")
+    ] = ",".join(QUICK_SETS),
+    systems: Annotated[str, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; or all.")] = OURS,
     weights: Weights = None,
     folds: Folds = "all",
     epochs: Epochs = None,
     device: Where = Device.CPU,
     precision: InPrecision = PrecisionChoice.FLOAT32,
-    quick: QuickStudy = False,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="The first of these folds, few strengths, 6 epochs of networks on small images."),
+    ] = False,
     seed: Seed = 0,
     run: Run = None,
     json: Json = None,
     plot: Plot = None,
-    materials: Annotated[int, typer.Option(hidden=True, min=2)] = 20,
+    materials: FewMaterials = 20,
 ) -> None:
-    """Learn from clean touches, and ask about shorter, faster, noisier ones; with augmented observation and without.
+    """Train on clean touches, test on shorter, faster, noisier ones; each system with augmentation and without.
 
-    Each system learns a fold once, with one setting, for all studies; only another sitting has lessons of its own.
+    A system learns a fold once, with one setting, for all studies; only another recording session has folds of its own.
     """
     require_folders(json, plot)
-    asked = Asked(
-        ["scroll-tactile", "robustness", study.value, dataset.value],
-        choose(systems, weights),
-        weights,
-        epochs or (QUICK_EPOCHS if quick else 100),
-        device.value,
-        precision.value,
-        folds or "all",
-        seed,
-        quick,
-        run,
-        json,
-        plot,
-    )
+    require_device(device.value)
+    keys = _choose(systems, weights)
+    passes = epochs or (QUICK_EPOCHS if quick else 100)
+    course = Course.in_proportion(passes, precision.value)
+    kept: dict[str, Any] = {}
+    means: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     with progress_bar() as progress:
-        progress("reading", 0, 1)
-        recordings = read(dataset, data, seed)
-        if materials < 20:
-            recordings = subset(recordings, materials)
-        found = measure(asked, [recordings], [study.value], progress)
-    tell(asked, found)
-
-
-def study_command(study: str) -> Callable[..., None]:
-    """The command of `reproduce` for a study of IN_THE_PAPER, on both sensors, ours beside the paper's systems.
-
-    "all" is the three of them: each system learns a fold once for all.
-    """
-
-    def command(
-        data: Data,
-        weights: Weights = None,
-        sets: SensorSets = None,
-        systems: Systems = None,
-        folds: Folds = None,
-        epochs: Epochs = None,
-        device: Where = Device.CPU,
-        precision: InPrecision = PrecisionChoice.FLOAT32,
-        seed: Seed = 0,
-        quick: QuickStudy = False,
-        run: Run = None,
-        json: Json = None,
-        plot: Plot = None,
-    ) -> None:
-        require_folders(json, plot)
-        asked = Asked(
-            ["scroll-tactile", "reproduce", study, *(["--sets", sets] if sets is not None else [])],
-            choose(systems, weights),
-            weights,
-            epochs or (QUICK_EPOCHS if quick else 100),
-            device.value,
-            precision.value,
-            folds or "all",
-            seed,
-            quick,
-            run,
-            json,
-            plot,
-        )
-        studies = list(IN_THE_PAPER) if study == StudyChoice.ALL else [study]
-        with progress_bar() as progress:
+        for name in named("--sets", sets, list(Dataset)):
             progress("reading", 0, 1)
-            found = measure(asked, read_sets(sets, QUICK_SETS, data, seed, quick), studies, progress)
-        tell(asked, found)
+            recordings = read(Dataset(name), data, seed)
+            if materials < 20:
+                recordings = subset(recordings, materials)
+            every = columns_averaged(recordings.sensor) if quick else 1
+            makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
+            folder = None if run is None else run / recordings.name
+            task = Robustness(
+                recordings, makes, settings, _studies(study, recordings), seed=seed, quick=quick, folder=folder
+            )
+            chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
+            about = {"dataset": recordings.name}
+            found = [about | record for fold in task.run(chosen, progress) for record in fold]
+            sensor = recordings.sensor.model_dump(mode="json")
+            kept[recordings.name] = {**task.plan, "settings": settings, "sensor": sensor}
+            records += found
+            means += [about | row for row in summary(found)]
+    for name in kept:
+        _show(name, [row for row in means if row["dataset"] == name])
+    trained = any(key in EPOCHAL for key in keys)
+    if trained:
+        say(f"networks: {passes} epochs, on {device.value}, ResNets in {precision.value}")
+    if quick:
+        say("[yellow]quick:[/] one fold, few strengths; the ResNets' images averaged to about 50 columns")
+    if json is not None:
+        options: dict[str, Any] = {"data": "DATA", "sets": sets, "systems": ",".join(keys), "folds": folds or "all"}
+        options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
+        if trained:
+            options |= {"epochs": passes, "device": device.value, "precision": precision.value}
+        measured = {"seed": seed, "quick": quick, "sets": kept, "means": means, "records": records}
+        write_json(json, origin(command_line("robustness", study.value, **options)) | measured)
+        say(f"figures: {json}")
+    _draw(plot, list(kept), means)
 
-    command.__doc__ = f"{IN_THE_PAPER.get(study, '')} Each system with augmentation and without."
-    return command
+
+def _choose(systems: str, weights: str | None) -> tuple[str, ...]:
+    """The systems of --systems; of "all" those that can be made, and a word on the others.
+
+    Raises InputError for systems that there are not, and those that need weights which are not given.
+    """
+    if systems == "all":
+        return CHOICES if weights is not None else leave_out(CHOICES, NEED_WEIGHTS, "--weights")
+    keys = named("--systems", systems, CHOICES)
+    if weights is None and (lacking := [key for key in keys if key in NEED_WEIGHTS]):
+        raise InputError(f"{', '.join(lacking)} need the weights of a trained ResNet: give --weights")
+    return keys
+
+
+def _systems(
+    keys: Sequence[str], catalogue: Catalogue, recordings: Recordings, seed: int
+) -> tuple[dict[str, Make], dict[str, Any]]:
+    """The systems by name, and what each depends on."""
+    needed = {} if catalogue.weights is None else {"weights": weights_digest(str(catalogue.weights))}
+    makes: dict[str, Make] = {}
+    settings: dict[str, Any] = {}
+    for key in keys:
+        makes[key], given = ours(recordings.sensor) if key == OURS else baseline(key, catalogue, seed)
+        settings[key] = given | (needed if key in NEED_WEIGHTS else {})
+    return makes, settings
+
+
+def _studies(study: StudyChoice, recordings: Recordings) -> list[str]:
+    if study is StudyChoice.PAPER:
+        return list(IN_THE_PAPER)
+    if study is not StudyChoice.ALL:
+        return [study.value]
+    if not recordings.ordered:
+        say(f"[yellow]not measured:[/] {SESSION}: {recordings.name} is published without its order of recording")
+    return [name for name in NAMES if name != SESSION or recordings.ordered]
+
+
+def _draw(plot: Path | None, sets: Sequence[str], means: Sequence[Mapping[str, Any]]) -> None:
+    if plot is None:
+        return
+    for name in sets:
+        # One picture a set: lines of two sensors in one panel cannot be told apart.
+        file = plot if len(sets) == 1 else plot.with_stem(f"{plot.stem}-{name.lower()}")
+        rows = [row for row in means if row["dataset"] == name]
+        if not draw_into(file, partial(draw_robustness, rows=rows, title=f"{name}, trained on clean touches")):
+            return
+
+
+def _show(dataset: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    systems = list(dict.fromkeys((row["system"], row["augmented"]) for row in rows))
+    folds = max(row["folds"] for row in rows)
+    heads = [f"{system}, augmented" if augmented else system for system, augmented in systems]
+    title = f"{dataset}, trained on clean touches, {folds} fold{'s' * (folds > 1)}"
+    quoted = any((row["study"], row["strength"]) in PAPER for row in rows)
+    table = Table("study", "strength", *heads, *(["paper", "ours − paper"] if quoted else []), title=title)
+    cells = {(row["study"], row["strength"], row["system"], row["augmented"]): row for row in rows}
+    for study in dict.fromkeys(row["study"] for row in rows):
+        for strength in dict.fromkeys(row["strength"] for row in rows if row["study"] == study):
+            own = [cells[study, strength, *system] for system in systems]
+            shown = [percent(row["mean"]) + (f" ± {100 * row['sd']:.1f}" if row["folds"] > 1 else "") for row in own]
+            mine = cells.get((study, strength, OURS, True))
+            shown += _beside(dataset, PAPER.get((study, strength), {}), mine) if quoted else []
+            table.add_row(study, "" if study == SESSION else f"{strength:g}", *shown)
+        table.add_section()
+    console().print(table)
+
+
+def _beside(dataset: str, paper: Mapping[str, float], mine: Mapping[str, Any] | None) -> list[str]:
+    """The paper's figure, of this set or, named, of another of the sensor; and the difference where it is this one."""
+    sensor = dataset.partition("-")[0]
+    for name, share in paper.items():
+        if name == dataset:
+            return [percent(share), "" if mine is None else f"{100 * (mine['mean'] - share):+.1f}"]
+        if name.partition("-")[0] == sensor:
+            return [f"{percent(share)} ({name})", ""]
+    return ["", ""]

@@ -1,4 +1,4 @@
-"""`scroll-tactile schedules`."""
+"""`schedules`: no order of learning makes a difference."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from examples.paper.commands.options import Seed
 from examples.paper.studies.schedules import Trial, try_schedules
 from scroll_tactile.cli.terminal import console, progress_bar, say
 from scroll_tactile.datasets.biotac_slide import load
@@ -29,38 +30,38 @@ def schedules(
         "biotac"
     ),
     count: Annotated[int, typer.Option(min=1, help="How many schedules to try.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the schedules and of the simulated touches.")] = 0,
+    seed: Seed = 0,
     touches: Annotated[int, typer.Option(min=1, help="Touches of each material.")] = 6,
     materials: Annotated[int, typer.Option(min=2, max=20, help="How many of the twenty materials.")] = 20,
     features: Annotated[int, typer.Option(hidden=True, min=64)] = 1008,
 ) -> None:
-    """Show that no schedule matters: the same touches give the same memory, to the bit.
+    """Prove that no schedule matters: the same touches give the same memory, to the bit.
 
     Tries random orders, cut into batches, with the memory closed and opened again here and there, and split over two
     learners whose statistics are added. All must have one digest and give the same predictions.
     """
     chosen = read_sensor(sensor)
-    lessons, probes = _touches(data, chosen, touches, materials, seed)
+    train, test = _touches(data, chosen, touches, materials, seed)
     done: list[Trial] = []
     with progress_bar() as progress:
 
-        def tell(trial: Trial) -> None:
+        def report(trial: Trial) -> None:
             done.append(trial)
             progress("schedules", len(done), count)
 
-        trials = try_schedules(chosen, lessons, probes, count=count, seed=seed, features=features, tell=tell)
-    _show(trials, len(lessons), len(probes), "simulated" if data is None else "real")
+        trials = try_schedules(chosen, train, test, count=count, seed=seed, features=features, report=report)
+    _show(trials, len(train), len(test), "simulated" if data is None else "real")
 
 
 def _touches(
     data: Path | None, sensor: Sensor, touches: int, materials: int, seed: int
 ) -> tuple[list[Labelled], list[Labelled]]:
-    """What is learned, and one touch of each material that is only asked about."""
+    """What is learned, and one touch of each material to be tested."""
     if data is None:
         scene = Scene(sensor, seed)
         names = scene.materials[:materials]
-        lessons = [(name, scene.touch(name, at)) for name in names for at in range(touches)]
-        return lessons, [(name, scene.touch(name, touches)) for name in names]
+        train = [(name, scene.touch(name, i)) for name in names for i in range(touches)]
+        return train, [(name, scene.touch(name, touches)) for name in names]
     name = sensor.name
     if name not in ("biotac", "roboskin"):
         raise InputError(f"expected --sensor biotac or roboskin for the data in {data}; came {name!r}")
@@ -74,11 +75,11 @@ def _touches(
     return [touch for group in groups for touch in group[:touches]], [group[touches] for group in groups]
 
 
-def _show(trials: Sequence[Trial], touches: int, probes: int, kind: str) -> None:
+def _show(trials: Sequence[Trial], touches: int, tested: int, kind: str) -> None:
     table = Table("schedule", "batches", "reopened", "second learner", "digest", "predictions")
-    for at, trial in enumerate(trials):
+    for i, trial in enumerate(trials):
         table.add_row(
-            "plain" if at == 0 else str(at),
+            "plain" if i == 0 else str(i),
             str(trial.batches),
             str(trial.reopened),
             str(trial.split),
@@ -90,7 +91,7 @@ def _show(trials: Sequence[Trial], touches: int, probes: int, kind: str) -> None
     same = all(trial.same_predictions for trial in trials)
     say(
         f"{len(trials)} schedules of {touches} {kind} touches: {len(digests)} digest{'s' * (len(digests) > 1)}, "
-        f"predictions for {probes} others {'the same to the bit' if same else 'differ'}"
+        f"predictions for {tested} others {'the same to the bit' if same else 'differ'}"
     )
     if len(digests) > 1 or not same:
         raise InputError("schedules made a difference: please report this as a bug, with the seed")

@@ -1,8 +1,9 @@
-"""What the commands that measure share: the recorded sets, which folds, and what a result says of its making."""
+"""What the commands share: the recorded sets, which folds, the noted command, and what a result says of its making."""
 
 from __future__ import annotations
 
 import platform
+import shlex
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -11,13 +12,23 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from examples.paper.plots import drawing as plots
 from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines import drawing
 
-__all__ = ["Dataset", "draw_into", "leave_out", "named", "origin", "parse_folds", "read", "require_folders"]
+__all__ = [
+    "Dataset",
+    "command_line",
+    "draw_into",
+    "leave_out",
+    "named",
+    "origin",
+    "parse_folds",
+    "read",
+    "require_folders",
+]
 
 
 _OPTIONAL = {"scikit-learn": "sklearn", "snntorch": "snntorch"}  # what made some results; distribution → module
@@ -62,11 +73,31 @@ def leave_out(keys: Sequence[str], needing: Collection[str], option: str) -> tup
     return tuple(key for key in keys if key not in out)
 
 
+def command_line(*words: str, **options: Any) -> str:
+    """The command to be noted in a result: `python -m examples.paper`, words and options, without a machine's paths.
+
+    options: `biotac_epochs=4` is --biotac-epochs 4, True a flag; None and False are left out. Of a file its name is
+    kept; a folder is to be given as a word in capitals.
+
+    >>> command_line("table1", data="DATA", weights=Path("/home/me/resnet.pth"), quick=True, folds=None)
+    'python -m examples.paper table1 --data DATA --weights resnet.pth --quick'
+    """
+    spelled = ["python", "-m", "examples.paper", *words]
+    for name, value in options.items():
+        if value is None or value is False:
+            continue
+        option = f"--{name.replace('_', '-')}"
+        text = value.name if isinstance(value, Path) else str(value)
+        # What begins with a dash would be read as an option.
+        spelled += [option] if value is True else [f"{option}={text}"] if text.startswith("-") else [option, text]
+    return shlex.join(spelled)
+
+
 def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:
     """Draw a picture into the file that was asked for, and say so; whether it could be: not without matplotlib."""
     if plot is None:
         return True
-    if not plots.available():
+    if not drawing.available():
         say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
         return False
     draw(plot)

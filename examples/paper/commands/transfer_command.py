@@ -1,15 +1,12 @@
-"""`scroll-tactile transfer`: what is learned with one task or sensor, and used with another."""
+"""`transfer`: what is learned with one task or sensor, and used with another."""
 
 from __future__ import annotations
 
-import os
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 from rich.table import Table
 
@@ -24,9 +21,10 @@ from examples.paper.commands.options import (
     Run,
     Seed,
     Where,
+    machine,
 )
-from examples.paper.commands.sets import draw_into, named, origin, parse_folds, require_folders
-from examples.paper.plots.plots_transfer import draw_transfer
+from examples.paper.commands.sets import command_line, draw_into, named, origin, parse_folds, require_folders
+from examples.paper.plots import draw_transfer
 from examples.paper.runs.cells import Cell, Figures
 from examples.paper.transfer.across_sensors import WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
@@ -110,13 +108,9 @@ def tasks(
     found = rows(results)
     _show_tasks(study, results, found)
     if json is not None:
-        words = ["scroll-tactile", "transfer", "tasks", "--data", "DATA", "--weights", Path(weights).name]
-        words += ["--sets", sets] if sets is not None else []
-        words += ["--sources", sources] if sources is not None else []
-        words += ["--folds", ",".join(map(str, study.folds)), "--counts", counts, "--draws", str(study.draws)]
-        words += ["--frames", str(frames), "--epochs", str(study.epochs), "--device", study.device]
-        words += ["--precision", study.precision, "--seed", str(seed)] + ["--quick"] * quick
-        _write(json, words, study, results, {"frames": frames, "rows": found})
+        options = {"weights": Path(weights), "sets": sets, "sources": sources, "counts": counts, "draws": study.draws}
+        options |= {"frames": frames, "epochs": study.epochs, "device": study.device, "precision": study.precision}
+        _write(json, "tasks", study, results, options | {"quick": quick}, {"frames": frames, "rows": found})
     draw_into(plot, lambda file: draw_transfer(file, found))
 
 
@@ -152,11 +146,9 @@ def sensors(
     found = sensor_rows(results)
     _show_sensors(study, found, agreement)
     if json is not None:
-        words = ["scroll-tactile", "transfer", "sensors", "--data", "DATA"]
-        words += ["--folds", ",".join(map(str, study.folds)), "--ways", ",".join(study.ways), "--counts", counts]
-        words += ["--draws", str(study.draws), "--seed", str(seed)]
+        options = {"ways": ",".join(study.ways), "counts": counts, "draws": study.draws}
         measured = {"folds": study.folds, "chance": study.chance, "agreement": agreement, "rows": found}
-        _write(json, words, study, results, measured)
+        _write(json, "sensors", study, results, options, measured)
 
 
 def _counts(asked: str) -> tuple[int, ...]:
@@ -221,14 +213,15 @@ def _cell(point: Mapping[str, float]) -> str:
 
 def _write(
     path: Path,
-    words: Sequence[str],
+    part: str,
     study: TaskTransfer | SensorTransfer,
     results: Sequence[tuple[Cell, Figures]],
+    options: Mapping[str, Any],
     measured: Mapping[str, Any],
 ) -> None:
-    command = shlex.join([*words, *(["--run", "RUN"] if study.folder is not None else [])])
-    threads = {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
-    sensors = {one.name: one.sensor.model_dump(mode="json") for one in study.sets}
+    folds, run = ",".join(map(str, study.folds)), None if study.folder is None else "RUN"
+    command = command_line("transfer", part, data="DATA", folds=folds, **options, seed=study.seed, run=run)
+    sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
     cells = {cell.key: figures for cell, figures in results}
-    write_json(path, origin(command) | threads | study.plan | {"sensors": sensors, **measured, "cells": cells})
+    write_json(path, origin(command) | machine() | study.plan | {"sensors": sensors, **measured, "cells": cells})
     say(f"figures: {path}")

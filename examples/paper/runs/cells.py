@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.runfile import RunFile
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Cell", "Split", "data_digest", "held_back", "pooled", "require_data", "run_cells", "split", "time_left"]

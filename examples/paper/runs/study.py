@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
-from examples.paper.runs.runfile import RunFile
 from examples.paper.systems.catalogue import NEED_WEIGHTS, SYSTEMS, Catalogue
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.system_protocol import System
@@ -19,9 +18,10 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["NOT_OF_FRAMES", "Study", "columns_averaged", "weights_digest"]
+__all__ = ["NOT_OF_FRAMES", "SystemStudy", "columns_averaged", "weights_digest"]
 
 NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda")
 """What is not run on a camera's frames: systems of streams, for which the paper has no figure there, and ours of two
@@ -32,7 +32,7 @@ QUICK_EVERY = 2  # of the recordings that are learned in a quick run
 
 
 @dataclass(frozen=True)
-class Study:
+class SystemStudy:
     """A study: what is to be measured; a subclass has a name, and measures a cell.
 
     sets: of different names. systems: keys of SYSTEMS. weights: of a trained ResNet, for those in NEED_WEIGHTS.

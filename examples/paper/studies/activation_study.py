@@ -13,10 +13,10 @@ import numpy.typing as npt
 import torch
 
 from examples.paper.runs.cells import Cell, Figures
-from examples.paper.runs.study import Study
+from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.activation import SIZE, STEPS, compare, maximise
 from examples.paper.systems.networks import ResNetClassifier
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
@@ -31,7 +31,7 @@ COMPARED = 10  # touches of each set on which first blocks are compared
 
 
 @dataclass(frozen=True)
-class ActivationStudy(Study):
+class ActivationStudy(SystemStudy):
     """Fine-tune on each set, all folds but those asked for; then `looks` and `likeness` of what came of it.
 
     tuned: set → the first layers of the network that was fine-tuned on it; they are kept beside the run's notes, too,
@@ -56,7 +56,7 @@ class ActivationStudy(Study):
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         part = self._split(cell)
         system = self._system(cell)
-        assert isinstance(system, Trained)
+        assert isinstance(system, TrainedNetwork)
         system.fit(part.streams, part.materials, part.validation, self.seed, progress)
         network = system.network
         assert isinstance(network, ResNetClassifier)

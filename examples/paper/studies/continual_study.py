@@ -16,17 +16,25 @@ from typing import Any, Literal
 import numpy as np
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.runfile import RunFile
-from examples.paper.studies.peers import NearestMean, Peer, RanPAC, StreamingLDA, touch_features
+from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
-from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.continual import Points, accuracy_of, curve, forgetting_of, part_ends, tally
+from scroll_tactile.pipelines.continual import (
+    Points,
+    ScheduleName,
+    accuracy_of,
+    arrange,
+    curve,
+    forgetting_of,
+    part_ends,
+    tally,
+)
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 
 __all__ = ["SIZES", "Continual", "Size"]
@@ -100,10 +108,10 @@ class Continual:
         notes = RunFile(None if self.folder is None else self.folder / "continual.json", self.plan)
         embedding = Cached(self.embedding)
         for fold in folds:
-            yield _Fold(self, embedding, fold, notes, progress).run()
+            yield _ContinualFold(self, embedding, fold, notes, progress).run()
 
 
-class _Fold:
+class _ContinualFold:
     """One fold: what is learned, what is tested, and the parts whose figures are noted one by one."""
 
     def __init__(self, task: Continual, embedding: Embedding, number: int, notes: RunFile, progress: Progress) -> None:
@@ -242,7 +250,7 @@ class _Fold:
         taught = touch_features(self.embedding, [stream for _, stream in self.lessons])
         return taught, touch_features(self.embedding, [stream for _, stream in self.exam])
 
-    def _peers(self) -> Iterator[tuple[str, Size | None, Callable[[], Peer]]]:
+    def _peers(self) -> Iterator[tuple[str, Size | None, Callable[[], ContinualPeer]]]:
         seed = self.task.seed
         yield "nearest mean", None, NearestMean
         yield "streaming LDA", None, StreamingLDA
@@ -256,7 +264,7 @@ class _Fold:
     def _capacity(self, size: Size) -> int:
         return self.total if size == "all" else size
 
-    def _peer(self, name: str, size: Size | None, make: Callable[[], Peer]) -> dict[str, Any]:
+    def _peer(self, name: str, size: Size | None, make: Callable[[], ContinualPeer]) -> dict[str, Any]:
         peer = make()
         taught, tested = self._vectors
         truth = [material for material, _ in self.exam]

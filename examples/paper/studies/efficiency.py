@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from examples.paper.runs.cells import Cell, Figures, Split
-from examples.paper.runs.study import Study
+from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import EPOCHAL, SYSTEMS
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
@@ -22,7 +22,7 @@ STREAMS = (1, 2, 5, 10, 20, 40)
 
 
 @dataclass(frozen=True)
-class Efficiency(Study):
+class Efficiency(SystemStudy):
     """Networks: the test after every epoch. All others: the test after so many streams of each material, STREAMS.
 
     Networks have seen every touch but the validation's once after the first epoch.

@@ -19,7 +19,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import extent, scales
 
-__all__ = ["NearestMean", "Peer", "RanPAC", "StreamingLDA", "touch_features"]
+__all__ = ["ContinualPeer", "NearestMean", "RanPAC", "StreamingLDA", "touch_features"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def touch_features(embedding: Embedding, streams: Sequence[Stream]) -> FloatArra
     return np.stack(rows)
 
 
-class Peer(ABC):
+class ContinualPeer(ABC):
     """A learner of feature vectors in one pass, which is told of new materials by meeting them.
 
     materials: those met, in the order of meeting.
@@ -70,7 +70,7 @@ class Peer(ABC):
         return self.materials.index(material)
 
 
-class NearestMean(Peer):
+class NearestMean(ContinualPeer):
     """The nearest class mean of features of unit length, iCaRL's classifier (Rebuffi et al. 2017, arXiv 1611.07725)."""
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class NearestMean(Peer):
         return nearness
 
 
-class StreamingLDA(Peer):
+class StreamingLDA(ContinualPeer):
     """Deep SLDA (Hayes and Kanan 2020, arXiv 1909.01520) on features as they are, without its initial batch.
 
     Σ_{k+1} = (k Σ_k + k/(k+1) · r rᵀ) / (k+1), r = x − μ_y before the update; scores xᵀΛμ_y − μ_yᵀΛμ_y / 2 with
@@ -148,7 +148,7 @@ class StreamingLDA(Peer):
         return discriminants
 
 
-class RanPAC(Peer):
+class RanPAC(ContinualPeer):
     """Ridge on a random projection with RanPAC's rule for λ (McDonnell et al. 2023, arXiv 2307.02251).
 
     φ(x) = relu(xW), W normal; G = Σ φφᵀ, Q = Σ φyᵀ, W_o = (G + λI)⁻¹Q over all tasks. λ, of 10⁻⁸ … 10⁸, has the least

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
 
-from examples.paper.studies.peers import Peer
+from examples.paper.studies.peers import ContinualPeer
 from scroll_tactile.errors import InputError
 
 __all__ = ["GDumb", "Replaying", "fit_softmax"]
@@ -15,7 +15,7 @@ __all__ = ["GDumb", "Replaying", "fit_softmax"]
 FloatArray = npt.NDArray[np.float64]
 
 
-class GDumb(Peer):
+class GDumb(ContinualPeer):
     """A greedily balanced buffer, and a linear softmax trained from scratch on it alone (Prabhu et al. 2020, ECCV).
 
     Features are standardised by the buffer; the softmax is fitted to convergence with a penalty of |W|²/2 beside the
@@ -58,7 +58,7 @@ class GDumb(Peer):
         return logits
 
 
-class Replaying(Peer):
+class Replaying(ContinualPeer):
     """A linear softmax by gradient descent in the order of the stream, replaying from a reservoir.
 
     Experience replay (Chaudhry et al. 2019, arXiv 1902.10486); with capacity 0, naive fine-tuning. One step for

@@ -6,19 +6,20 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.runfile import RunFile
-from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Answers, Labelled, ask, missing
+from scroll_tactile.pipelines.classification import Answers, Labelled, ask, hold_out, observe_all
+from scroll_tactile.pipelines.continual import ScheduleName, arrange
 from scroll_tactile.pipelines.metrics import auroc, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 
 __all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "subset", "summary"]
@@ -44,12 +45,11 @@ class Replay:
 
     recordings: the streams. schedule, seed: see `arrange`; the seed draws the order. readout: "lda" or "ridge".
     blocked: folds of successive repetitions, instead of the published or drawn ones.
-    curve: measure the accuracy over the materials met so far after every so many twentieths of the pass; 0: never.
     novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
     features: of the embedding.
     folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
 
-    Raises InputError for a negative curve, and DatasetError where there are no blocked folds.
+    Raises DatasetError where there are no blocked folds.
     """
 
     recordings: Recordings
@@ -57,19 +57,14 @@ class Replay:
     seed: int = 0
     readout: ReadoutName = "lda"
     blocked: bool = False
-    curve: int = 0
     novelty: bool = False
     features: int = 1008
     folder: Path | None = None
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.curve <= 20:
-            raise InputError(f"expected a curve measured after every 1 to 20 twentieths, or 0; came {self.curve}")
-
     @property
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
-        options = ("schedule", "seed", "readout", "blocked", "curve", "novelty", "features")
+        options = ("schedule", "seed", "readout", "blocked", "novelty", "features")
         size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
         return {"run": "replay", "dataset": self.recordings.name, **size} | {
             name: getattr(self, name) for name in options
@@ -88,11 +83,11 @@ class Replay:
         for fold in folds:
             name = f"fold-{fold}"
             if "digest" not in notes.notes.get(name, {}):
-                notes.note(name, _Fold(self, fold, places == fold, progress).run(notes))
+                notes.note(name, _ReplayFold(self, fold, places == fold, progress).run())
             yield notes.notes[name]
 
 
-class _Fold:
+class _ReplayFold:
     """One fold: what is learned, what is tested, and the figures that come of it."""
 
     def __init__(self, replay: Replay, number: int, tested: np.ndarray, progress: Progress) -> None:
@@ -100,17 +95,16 @@ class _Fold:
         self.number = number
         self.progress = progress
         recordings = replay.recordings
-        touches: list[Labelled] = list(zip(recordings.materials, recordings.streams, strict=True))
-        taught = [touch for touch, held in zip(touches, tested, strict=True) if not held]
-        self.exam = [touch for touch, held in zip(touches, tested, strict=True) if held]
+        taught, self.exam = hold_out(recordings, tested)
         order = arrange(replay.schedule, [name for name, _ in taught], replay.seed)
         self.lessons = [taught[at] for at in order]
 
-    def run(self, notes: RunFile) -> dict[str, Any]:
+    def run(self) -> dict[str, Any]:
         begun = time.perf_counter()
         folder = self.replay.folder
         with self._learner(None if folder is None else folder / f"fold-{self.number}") as learner:
-            curve = self._learn(learner, notes)
+            done = count(1)
+            observe_all(learner, self.lessons, lambda: self.progress("learning", next(done), len(self.lessons)))
             figures = self._figures(learner)
             digest = learner.digest()
         figures["twice"] = self._twice()
@@ -121,7 +115,6 @@ class _Fold:
             "tested": len(self.exam),
             "tested_of": dict(Counter(name for name, _ in self.exam)),
             **{name: figures[name] for name in (*FIGURES, "confusions")},
-            "curve": curve,
             "equals_offline": self._offline() == digest,
             "digest": digest,
             "seconds": time.perf_counter() - begun,
@@ -133,25 +126,6 @@ class _Fold:
         if path is None:
             return TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
         return TactileLearner.open(path, sensor=sensor, embedding=embedding, readout=readout)
-
-    def _learn(self, learner: TactileLearner, notes: RunFile) -> list[list[float]]:
-        """Teach what is missing; returns (materials met, accuracy over them) at each point of the curve."""
-        name, every = f"curve-{self.number}", self.replay.curve
-        points: dict[str, list[float]] = dict(notes.notes.get(name, {}))
-        total = len(self.lessons)
-        # After which observation a point is measured: every twentieth is one of twenty materials, class by class.
-        stops = {round(total * part / 20) for part in range(every, 21, every)} if every else set()
-        remaining = missing(self.lessons, learner.materials)
-        for done in range(total - len(remaining), total + 1):
-            if done in stops and str(done) not in points:
-                met = learner.materials
-                asked = [touch for touch in self.exam if touch[0] in met]
-                points[str(done)] = [len(met), ask(learner, asked).accuracy]
-                notes.note(name, points)
-            if done < total:
-                learner.observe(*self.lessons[done])
-            self.progress("learning", done, total)
-        return [points[key] for key in sorted(points, key=int)]
 
     def _figures(self, learner: TactileLearner) -> dict[str, Any]:
         self.progress("testing", 0, 3)

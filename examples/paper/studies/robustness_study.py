@@ -1,7 +1,7 @@
 """Robustness: systems that learned from clean touches, asked about touches that were made or felt otherwise.
 
 A study is a grid of strengths, systems, with and without augmentation, and folds. A system learns a fold once, for
-all of its studies; only "sitting" (folds of successive repetitions: tomorrow's touches) has lessons of its own. Each
+all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has lessons of its own. Each
 cell is written down when it is finished, and an interrupted run goes on with the next.
 """
 
@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cells import require_data
-from examples.paper.runs.runfile import RunFile
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Robust
 from scroll_tactile.errors import InputError
@@ -26,14 +25,15 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.robustness import STUDIES
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["NAMES", "PAPER", "SITTING", "Learned", "Make", "Robustness", "System", "ours", "summary", "worst"]
+__all__ = ["NAMES", "PAPER", "SESSION", "Learned", "Make", "Robustness", "TestedSystem", "ours", "summary", "worst"]
 
-SITTING = "sitting"
-NAMES = (*STUDIES, SITTING)
+SESSION = "session"
+NAMES = (*STUDIES, SESSION)
 """The names of the studies."""
 
 PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
@@ -46,7 +46,7 @@ AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
 Progress = Callable[[str, int, int], object]
 
 
-class System(Protocol):
+class TestedSystem(Protocol):
     """Whatever names the materials of touches."""
 
     def predict(self, streams: Sequence[Stream]) -> Sequence[str | None]:
@@ -54,7 +54,7 @@ class System(Protocol):
         ...
 
 
-Make = Callable[[Sequence[Labelled], bool, Progress], System]
+Make = Callable[[Sequence[Labelled], bool, Progress], TestedSystem]
 """Makes a system that has learned these touches, with its augmentation (True) or without; told how far it is."""
 
 
@@ -78,7 +78,7 @@ def ours(
     """
     robust = Robust() if embedding is None else embedding
 
-    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
+    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> TestedSystem:
         if augmented:
             learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
         else:
@@ -99,7 +99,7 @@ class Robustness:
     studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
     quick: fewer strengths. folder: where finished cells are kept, or None.
 
-    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "sitting" where the
+    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "session" where the
     order of recording is not known.
     """
 
@@ -118,7 +118,7 @@ class Robustness:
             raise InputError(f"expected studies out of {', '.join(NAMES)}; came {strange or 'none'}")
         if self.seed < 0:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
-        if SITTING in self.studies:
+        if SESSION in self.studies:
             self.recordings.blocked()
         if self.recordings.sensor.camera:
             raise InputError(
@@ -164,7 +164,7 @@ class Robustness:
         return [
             (study, strength, fold)
             for study in self.studies
-            for strength in ((0.0,) if study == SITTING else STUDIES[study].of(sensor, quick=self.quick))
+            for strength in ((0.0,) if study == SESSION else STUDIES[study].of(sensor, quick=self.quick))
         ]
 
     def _require_settings(self, notes: RunFile, name: str) -> None:
@@ -184,23 +184,23 @@ class Robustness:
         notes: RunFile,
         progress: Progress,
     ) -> Iterator[dict[str, Any]]:
-        systems: dict[bool, System] = {}  # by whether it has learned for "sitting"
+        systems: dict[bool, TestedSystem] = {}  # by whether it has learned for "session"
         what = f"{name}{', augmented' if augmented else ''}"
         for done, (study, strength, fold) in enumerate(cells):
             where = f"fold {fold}: {what}: {study} {strength:g}"
             progress(where, done, len(cells))
             key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
             if key not in notes.notes:
-                sitting = study == SITTING
-                lessons, exam = self._split(fold, sitting)
-                if sitting not in systems:
+                session = study == SESSION
+                lessons, exam = self._split(fold, session)
+                if session not in systems:
 
                     def told(step: str, at: int, of: int, where: str = where) -> None:
                         progress(f"{where}: {step}", at, of)
 
-                    systems[sitting] = self.systems[name](lessons, augmented, told)
-                asked = exam if sitting else self._perturbed(exam, study, strength)
-                said = systems[sitting].predict([stream for _, stream in asked])
+                    systems[session] = self.systems[name](lessons, augmented, told)
+                asked = exam if session else self._perturbed(exam, study, strength)
+                said = systems[session].predict([stream for _, stream in asked])
                 share = accuracy([material for material, _ in asked], list(said))
                 notes.note(key, {"accuracy": share, "tested": len(asked)})
             about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
@@ -210,8 +210,8 @@ class Robustness:
         perturb = STUDIES[study].perturb
         return [(material, perturb(stream, strength, self.seed)) for material, stream in exam]
 
-    def _split(self, fold: int, sitting: bool) -> tuple[list[Labelled], list[Labelled]]:
-        places: npt.NDArray[np.int64] = self.recordings.blocked() if sitting else self.recordings.fold
+    def _split(self, fold: int, session: bool) -> tuple[list[Labelled], list[Labelled]]:
+        places: npt.NDArray[np.int64] = self.recordings.blocked() if session else self.recordings.fold
         return hold_out(self.recordings, places == fold)
 
 

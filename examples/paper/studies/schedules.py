@@ -1,4 +1,4 @@
-"""Schedules: in what order touches are learned; and the proof that it makes no difference, to the bit."""
+"""The proof that the order in which touches are learned makes no difference, to the bit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -18,44 +17,7 @@ from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["SCHEDULES", "ScheduleName", "Trial", "arrange", "try_schedules"]
-
-ScheduleName = Literal["class-by-class", "reversed", "shuffled", "batches", "interleaved"]
-SCHEDULES: tuple[ScheduleName, ...] = get_args(ScheduleName)
-
-_BATCH = 4  # materials in a batch: five batches of twenty, the usual split of continual learning
-
-
-def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list[int]:
-    """The order in which N touches are learned: a permutation of 0 … N − 1.
-
-    materials: of each touch, N names. seed: 0 or more.
-    "class-by-class": all touches of one material, then of the next, materials in a drawn order; "reversed": the
-    same backwards; "shuffled": at random; "batches": four materials at a time, shuffled among themselves;
-    "interleaved": one touch of every material, then the next of every one.
-
-    Raises InputError for another schedule.
-    """
-    if schedule not in SCHEDULES:
-        raise InputError(f"expected a schedule, one of {', '.join(SCHEDULES)}; came {schedule!r}")
-    random = np.random.default_rng(seed)
-    names = sorted(set(materials))
-    turn = {names[place]: at for at, place in enumerate(random.permutation(len(names)))}
-    draw = random.permutation(len(materials))
-    seen: dict[str, int] = {}
-    repetition = []
-    for name in materials:
-        repetition.append(seen.get(name, 0))
-        seen[name] = repetition[-1] + 1
-    places = range(len(materials))
-    if schedule == "shuffled":
-        return [int(at) for at in draw]
-    if schedule == "batches":
-        return sorted(places, key=lambda at: (turn[materials[at]] // _BATCH, draw[at]))
-    if schedule == "interleaved":
-        return sorted(places, key=lambda at: (repetition[at], turn[materials[at]]))
-    order = sorted(places, key=lambda at: (turn[materials[at]], repetition[at]))
-    return order[::-1] if schedule == "reversed" else order
+__all__ = ["Trial", "try_schedules"]
 
 
 @dataclass(frozen=True)
@@ -81,13 +43,13 @@ def try_schedules(
     count: int = 20,
     seed: int = 0,
     features: int = 1008,
-    tell: Callable[[Trial], object] = lambda trial: None,
+    report: Callable[[Trial], object] = lambda trial: None,
 ) -> list[Trial]:
     """Learn the same touches by `count` random schedules, on disk; the first is the plain one, in memory.
 
     Each draws an order, a batching, where the memory is closed and opened again, and, every other time, which
     touches a second learner feels, whose statistics are added in the end. All should have one digest, and give the
-    probes' predictions of the first, to the bit. `tell` hears of each trial when it is done. features: of the
+    probes' predictions of the first, to the bit. `report` gets each trial when it is done. features: of the
     embedding.
 
     Raises InputError for a count below 1 or no touches.
@@ -102,14 +64,14 @@ def try_schedules(
         plain.observe(name, stream)
     expected = _predictions(plain, probes)
     trials = [Trial(1, 0, 0, plain.digest(), True)]
-    tell(trials[0])
+    report(trials[0])
     for number in range(1, count):
         random = np.random.default_rng([seed, number])
         with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
             trials.append(
                 _try(sensor, embedding, touches, probes, expected, random, Path(folder), split=number % 2 == 0)
             )
-        tell(trials[-1])
+        report(trials[-1])
     return trials
 
 

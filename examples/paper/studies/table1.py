@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 from examples.paper.runs.cells import Cell, Figures, pooled
-from examples.paper.runs.study import Study
+from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import SYSTEMS
 from examples.paper.systems.descent import Course
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import accuracy
@@ -29,7 +29,7 @@ PAPER: dict[str, dict[str, float]] = {
 """Key of a system → data set → accuracy in the paper. GelSight-45 is not public: nothing of ours stands beside it."""
 
 
-class Table1(Study):
+class Table1(SystemStudy):
     """The paper's Table I: each cell a fit and a test."""
 
     name = "table1"
@@ -53,13 +53,13 @@ class Table1(Study):
         )
         said = system.predict(exam)
         figures = {
-            "taught": len(touches.streams),
+            "learned": len(touches.streams),
             "validation": len(touches.validation),
             "tested": len(truth),
             "right": sum(one == other for one, other in zip(truth, said, strict=True)),
             **_votes(truth, said, touches.touch),
         }
-        if isinstance(system, Trained):
+        if isinstance(system, TrainedNetwork):
             figures["epochs"] = [
                 {"accuracy": share, "loss": e.loss, "validation_loss": e.validation_loss, "rate": e.rate}
                 for share, e in zip(curve, system.epochs, strict=True)

@@ -18,7 +18,7 @@ from examples.paper.systems.one_pass import OnePass
 from examples.paper.systems.spikes import encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System
-from examples.paper.systems.trained import Make, Trained
+from examples.paper.systems.trained import Make, TrainedNetwork
 from scroll_tactile.embeddings import Embedding, Frames, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
@@ -101,12 +101,12 @@ class Catalogue:
         }
         return makers[key]()
 
-    def _trained(self, key: str, make: Make, read: Callable[[Image], Image] = lambda image: image) -> Trained:
+    def _trained(self, key: str, make: Make, read: Callable[[Image], Image] = lambda image: image) -> TrainedNetwork:
         course = replace(self.course, precision="float32")
-        return Trained(SYSTEMS[key], make, read, course, self.device, self.augmentation)
+        return TrainedNetwork(SYSTEMS[key], make, read, course, self.device, self.augmentation)
 
-    def _residual(self, key: str, make: Make) -> Trained:
-        return Trained(SYSTEMS[key], make, self._thinned, self.course, self.device, self.augmentation)
+    def _residual(self, key: str, make: Make) -> TrainedNetwork:
+        return TrainedNetwork(SYSTEMS[key], make, self._thinned, self.course, self.device, self.augmentation)
 
     def _thinned(self, image: Image) -> Image:
         return average_columns(image, self.every)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from examples.paper.systems.constituents import Shares, Told
+from examples.paper.systems.constituent_squares import Shares, Told
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import InputError

@@ -11,11 +11,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from examples.paper.systems.constituents import Heads, Shares, Told
+from examples.paper.systems.constituent_squares import Heads, Shares, Told
 from examples.paper.systems.descent import Loss
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.system_protocol import Watch, silent, unwatched
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
@@ -34,10 +34,10 @@ def presence_loss(logits: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     return (each * known).sum() / known.sum().clamp(min=1)
 
 
-class ConstituentNet(Trained):
+class ConstituentNet(TrainedNetwork):
     """A residual network with one head for each constituent, which tells its presence: a logistic unit.
 
-    Trained as `Trained` is. Shares, which the paper does not have its heads tell, are by ridge regression on the
+    Trained as `TrainedNetwork` is. Shares, which the paper's heads do not report, are by ridge regression on the
     features below them, of the touches that the network learned.
     """
 
@@ -57,7 +57,7 @@ class ConstituentNet(Trained):
         progress: Progress = silent,
         watch: Watch = unwatched,
     ) -> None:
-        """See `Trained.fit`."""
+        """See `TrainedNetwork.fit`."""
         self._heads = None
         super().fit(streams, materials, validation, seed, progress, watch)
         features, held = self._features(streams), self._features([stream for _, stream in validation])

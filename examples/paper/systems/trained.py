@@ -20,13 +20,13 @@ from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Make", "Trained", "require_device"]
+__all__ = ["Make", "TrainedNetwork", "require_device"]
 
 Make = Callable[[tuple[int, ...], int, int], nn.Module]
 """(shape of an input, outputs, seed) → a new network, which may draw from torch's generator."""
 
 
-class Trained:
+class TrainedNetwork:
     """A network trained as `descend` does, on images of one width; it is asked about images of any.
 
     make: a new network for each fit. read: from an image to what the network reads, both (…, T). course: of the

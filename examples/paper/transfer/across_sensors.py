@@ -16,17 +16,17 @@ import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
-from examples.paper.runs.runfile import RunFile
 from examples.paper.studies.peers import touch_features
 from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
 from examples.paper.transfer.few_touches import Feeler, draw_touches, feeler_maker, few_touches
-from examples.paper.transfer.shared_features import Features, Shared
+from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["ALONE", "COUNTS", "WAYS", "SensorTransfer", "rows"]
@@ -93,7 +93,7 @@ class SensorTransfer:
                 "expected one fold or more, counts of 0 touches or more, 1 draw or more and a seed of 0 or more; came "
                 f"folds {self.folds}, counts {self.counts}, draws {self.draws}, seed {self.seed}"
             )
-        Shared((one.sensor, other.sensor))
+        SharedFeatures((one.sensor, other.sensor))
 
     @property
     def plan(self) -> dict[str, Any]:
@@ -193,7 +193,7 @@ class SensorTransfer:
 
     @cached_property
     def _features(self) -> dict[str, Features]:
-        shared = Shared((self.sets[0].sensor, self.sets[1].sensor))
+        shared = SharedFeatures((self.sets[0].sensor, self.sets[1].sensor))
         made: dict[str, Features] = {
             "spectra": shared.spectra,
             "resampled": shared.resampled(Kernels()),

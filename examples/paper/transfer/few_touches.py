@@ -99,7 +99,7 @@ class WidestReadout:
         return self._selection.names[int(readout.scores(readout.project(mean), "lda").argmax())]
 
 
-class _Learner:
+class _LearnerFeeler:
     """A `TactileLearner` as a Feeler."""
 
     def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
@@ -115,7 +115,7 @@ def feeler_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], Feeler]:
     if window_plan(sensor, embedding).judged == "widest":
         features = WidestFeatures(sensor, embedding)
         return lambda: WidestReadout(features)
-    return lambda: _Learner(sensor, embedding)
+    return lambda: _LearnerFeeler(sensor, embedding)
 
 
 def draw_touches(recordings: Recordings, fold: int, seed: int, draw: int) -> dict[str, list[list[int]]]:
@@ -176,4 +176,4 @@ def few_touches(
                 progress(what, len(lessons) + done + 1, total)
             right[str(stop)].append(hits)
             begun = stop
-    return {"tested": len(exam), "right": right, "taught": taught}
+    return {"tested": len(exam), "right": right, "learned": taught}

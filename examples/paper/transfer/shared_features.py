@@ -16,7 +16,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Features", "Shared"]
+__all__ = ["Features", "SharedFeatures"]
 
 FloatArray = npt.NDArray[np.float64]
 Features = Callable[[Stream], FloatArray]
@@ -32,14 +32,14 @@ _CHANNELS = 10  # that a touch is resampled to
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedFeatures:
     """What two sensors or more can be asked alike: the lowest rate, and windows as long as the shortest usual touch.
 
     sensors: with channels, no cameras. Raises InputError for a camera.
 
     >>> from scroll_tactile.datasets.simulator import Scene
     >>> from scroll_tactile.sensors import BIOTAC, ROBOSKIN
-    >>> shared = Shared((BIOTAC, ROBOSKIN))
+    >>> shared = SharedFeatures((BIOTAC, ROBOSKIN))
     >>> [shared.spectra(Scene(sensor).touch("felt", 0)).shape for sensor in (BIOTAC, ROBOSKIN)]
     [(140,), (140,)]
     """

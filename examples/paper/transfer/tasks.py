@@ -17,11 +17,10 @@ import torch
 
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, require_data, run_cells, split
-from examples.paper.runs.runfile import RunFile
 from examples.paper.runs.study import weights_digest
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.networks import ResNetClassifier
-from examples.paper.systems.trained import Trained, require_device
+from examples.paper.systems.trained import TrainedNetwork, require_device
 from examples.paper.transfer.few_touches import COUNTS, feeler_maker, few_touches
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Kernels, Vision
@@ -29,6 +28,7 @@ from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.image import tactile_image
 
 __all__ = ["TRAINING", "TUNED", "TaskTransfer", "rows", "some_frames"]
@@ -144,7 +144,7 @@ class TaskTransfer:
     def _train(self, recordings: Recordings, fold: int, progress: Progress) -> Figures:
         """Fine-tune the whole network on all but a fold, a tenth of which chooses the epoch; how right it is then."""
         touches = split(recordings, fold, self.seed, every=self.every)
-        trained = Trained(TRAINING, self._network, course=self.course, device=self.device, view=tactile_image)
+        trained = TrainedNetwork(TRAINING, self._network, course=self.course, device=self.device, view=tactile_image)
         trained.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
         said = trained.predict(touches.asked)
         assert isinstance(trained.network, ResNetClassifier)
@@ -152,7 +152,7 @@ class TaskTransfer:
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
         self._keep(recordings.name, fold, tensors)
         return {
-            "taught": len(touches.streams),
+            "learned": len(touches.streams),
             "validation": len(touches.validation),
             "tested": len(said),
             "right": sum(one == other for one, other in zip(touches.truth, said, strict=True)),

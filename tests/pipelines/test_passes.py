@@ -1,24 +1,20 @@
-"""Metrics, passes, notes of runs, stream files, the demonstration and replays, on simulated touches."""
+"""Metrics, passes, notes of runs and the demonstration, on simulated touches."""
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from examples.paper.plots.drawing import confusion_counts
-from examples.paper.runs.runfile import RunFile
-from examples.paper.studies.replay import Replay, subset, summary
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.errors import DatasetError, InputError
+from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
+from scroll_tactile.pipelines.drawing import confusion_counts
 from scroll_tactile.pipelines.memories import open_memory
 from scroll_tactile.pipelines.metrics import accuracy, auroc, calibration_error, mean_and_spread
-from scroll_tactile.recordings.arrays import read_sensor, read_stream
+from scroll_tactile.pipelines.runfile import RunFile
 
 
 class TestMetrics:
@@ -101,49 +97,6 @@ class TestRunFile:
             RunFile(tmp_path / "notes.json", {})
 
 
-class TestFiles:
-    def test_a_table_with_and_without_a_header(self, tmp_path: Path) -> None:
-        for name, text in (("plain", "1,2\n3,4\n"), ("head", "\ufeffa;b\n1;2\n\n3;4\n"), ("tabs", "x\ty\n1\t2\n3\t4")):
-            (tmp_path / f"{name}.csv").write_text(text, encoding="utf-8")
-            np.testing.assert_array_equal(read_stream(tmp_path / f"{name}.csv"), [[1, 2], [3, 4]])
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("a,b\n1,2\n3,x\n", r"row 3, column 2: expected a number; came 'x'"),
-            ("1,\n", r"row 1, column 2: expected a number; came ''"),
-            ("1,2\n\n3\n", r"row 3: expected 2 cells"),
-            ("a,b\n", "there are none"),
-            ("", "there are none"),
-        ],
-    )
-    def test_a_bad_cell_is_named_by_row_and_column(self, tmp_path: Path, text: str, message: str) -> None:
-        (tmp_path / "t.csv").write_text(text)
-        with pytest.raises(InputError, match=message):
-            read_stream(tmp_path / "t.csv")
-
-    def test_files_that_are_no_streams(self, tmp_path: Path) -> None:
-        (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
-        (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00")
-        (tmp_path / "t.txt").write_text("1")
-        np.savez(tmp_path / "z.npz", a=np.zeros(3))
-        (tmp_path / "z.npz").rename(tmp_path / "z.npy")
-        np.save(tmp_path / "o.npy", np.array([{}], dtype=object), allow_pickle=True)
-        for name in ("bad.npy", "b.csv", "t.txt", "z.npy", "o.npy", "none.npy", ""):
-            with pytest.raises(InputError):
-                read_stream(tmp_path / name)
-
-    def test_a_sensor_by_name_or_file(self, tmp_path: Path) -> None:
-        assert read_sensor("roboskin") == sensors.ROBOSKIN
-        (tmp_path / "s.json").write_text(sensors.CONTACTILE.model_dump_json())
-        assert read_sensor(str(tmp_path / "s.json")) == sensors.CONTACTILE
-        (tmp_path / "s.json").write_text('{"name": "x", "channels": 0}')
-        with pytest.raises(InputError, match="channels"):
-            read_sensor(str(tmp_path / "s.json"))
-        with pytest.raises(InputError, match="one of biotac"):
-            read_sensor("biotacc")
-
-
 SMALL = {"materials": 4, "touches": 3, "held_out": 2, "features": 64}
 
 
@@ -181,75 +134,6 @@ class TestDemo:
         Demo(sensors.BIOTAC, **small, folder=tmp_path / "kept").run()
         with pytest.raises(InputError, match="seed 0 there, 1 here"):
             Demo(sensors.BIOTAC, seed=1, **small, folder=tmp_path / "kept").run()
-
-
-@pytest.fixture(scope="module")
-def recordings() -> Recordings:
-    """Five materials under a simulated RoboSkin, ten touches each, in two folds."""
-    scene = Scene(sensors.ROBOSKIN)
-    names = scene.materials[:5]
-    return Recordings(
-        name="simulated",
-        sensor=scene.sensor,
-        streams=[scene.touch(name, at) for name in names for at in range(10)],
-        materials=[name for name in names for _ in range(10)],
-        repetition=np.tile(np.arange(10), 5),
-        fold=np.tile(np.arange(10) % 2, 5),
-        ordered=False,
-    )
-
-
-class TestReplay:
-    def test_a_fold_has_all_figures(self, recordings: Recordings) -> None:
-        (fold,) = Replay(recordings, curve=4, novelty=True, features=128).run([1])
-        assert (fold["fold"], fold["learned"], fold["tested"]) == (1, 25, 25)
-        assert fold["equals_offline"]
-        assert sum(fold["tested_of"].values()) == 25
-        assert [met for met, _ in fold["curve"]] == [1, 2, 3, 4, 5]
-        assert fold["curve"][-1][1] == fold["accuracy"] > 0.9
-        assert 0 <= fold["calibration_error"] <= 1
-        assert 0.5 < fold["novelty_auroc"] <= 1
-        assert json.loads(json.dumps(fold)) is not None
-
-    def test_an_interrupted_replay_goes_on(self, recordings: Recordings, tmp_path: Path) -> None:
-        whole = list(Replay(recordings, "shuffled", readout="ridge", curve=10, features=128).run([0, 1]))
-        task = Replay(recordings, "shuffled", readout="ridge", curve=10, features=128, folder=tmp_path / "kept")
-
-        def stop(what: str, done: int, of: int) -> None:
-            if what == "learning" and done == 15 and (tmp_path / "kept" / "fold-1").exists():
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            list(task.run([0, 1], stop))
-        with open_memory(tmp_path / "kept" / "fold-1", mode="read") as learner:
-            assert sum(learner.materials.values()) == 16
-        resumed = list(task.run([0, 1]))
-        for one, other in zip(whole, resumed, strict=True):
-            # Figures that were read back have lists where tuples were.
-            assert json.loads(json.dumps(one | {"seconds": 0})) == json.loads(json.dumps(other | {"seconds": 0}))
-
-    def test_no_schedule_makes_a_difference(self, recordings: Recordings) -> None:
-        digests = {
-            next(Replay(recordings, schedule, features=64).run([0]))["digest"]
-            for schedule in ("reversed", "interleaved")
-        }
-        assert len(digests) == 1
-
-    def test_what_cannot_be_is_refused(self, recordings: Recordings) -> None:
-        with pytest.raises(InputError, match="folds out of"):
-            list(Replay(recordings).run([2]))
-        with pytest.raises(DatasetError, match="blocked"):
-            list(Replay(recordings, blocked=True).run([0]))
-        with pytest.raises(InputError, match="curve"):
-            Replay(recordings, curve=-1)
-        with pytest.raises(InputError, match="materials"):
-            subset(recordings, 6)
-
-    def test_a_summary_leaves_out_what_was_not_measured(self) -> None:
-        folds = [{"accuracy": 0.5, "first": None}, {"accuracy": 1.0, "first": 0.2}]
-        names = ("half", "twice", "calibration_error", "false_alarms", "novelty_auroc")
-        means = summary([fold | dict.fromkeys(names) for fold in folds])
-        assert means == {"accuracy": {"mean": 0.75, "sd": pytest.approx(math.sqrt(0.125))}}
 
 
 def test_confusion_counts() -> None:

@@ -4,7 +4,7 @@ It is no model of any real fabric: the constituents' figures are made up, in the
 them, and the weaves are drawn. Nothing measured on it says how real fabrics would be told. What it keeps of them is the
 task: a constituent shows only through the yarn that it is a part of, under two protocols of touching.
 
->>> from examples.paper.contactile.simulated import FabricScene
+>>> from examples.paper.fabric.simulated import FabricScene
 >>> scene = FabricScene(seed=0, count=4)
 >>> scene.compositions["fabric03"]
 {'cotton': 0.25, 'polyester': 0.75}

@@ -1,23 +1,20 @@
-"""`scroll-tactile fabric contactile`: the paper's third task, on a published set of fabrics or on simulated ones."""
+"""`fabric contactile`: the paper's third task, on a published set of fabrics or on simulated ones."""
 
 from __future__ import annotations
 
-import os
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 from rich.table import Table
 
-from examples.paper.commands.options import Device, Json, Run, Seed, Where
-from examples.paper.commands.sets import leave_out, named, origin, require_folders
-from examples.paper.contactile import fabrics_set as published
-from examples.paper.contactile.contactile_rows import EPOCHAL, NEED_BIOTAC, NEED_WEIGHTS, PAPER_EPOCHS, ROWS
-from examples.paper.contactile.contactile_study import HAND, PARTS, Contactile, rows, simulated
-from examples.paper.contactile.fabrics_set import Fabrics
+from examples.paper.commands.options import Device, Json, Run, Seed, Where, machine
+from examples.paper.commands.sets import command_line, leave_out, named, origin, require_folders
+from examples.paper.fabric import fabrics_set as published
+from examples.paper.fabric.contactile_rows import EPOCHAL, NEED_BIOTAC, NEED_WEIGHTS, PAPER_EPOCHS, ROWS
+from examples.paper.fabric.contactile_study import HAND, PARTS, Contactile, rows, simulated
+from examples.paper.fabric.fabrics_set import Fabrics
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import InputError
@@ -39,9 +36,7 @@ Weights = Annotated[
     str | None, typer.Option(help="Of a trained ResNet: a file, or resnet18. Without, rows are left out.")
 ]
 Rows = Annotated[str | None, typer.Option("--rows", help=f"Which rows, of {', '.join(ROWS)}.")]
-Parts = Annotated[
-    str | None, typer.Option(help=f"What is asked about, of {', '.join(PARTS)}; both, where it is not said.")
-]
+Parts = Annotated[str | None, typer.Option(help=f"What is tested, of {', '.join(PARTS)}; both, where it is not said.")]
 Epochs = Annotated[int | None, typer.Option(min=1, help=f"Of the networks on fabrics; the paper has {PAPER_EPOCHS}.")]
 BioTacEpochs = Annotated[int | None, typer.Option(min=1, help="Of the network on BioTac.")]
 Every = Annotated[
@@ -74,7 +69,7 @@ def contactile(
     run: Run = None,
     json: Json = None,
 ) -> None:
-    """Learn fabrics as a robot touches them, and tell what they are made of when a hand does: the paper's Table III.
+    """Learn fabrics as a robot touches them, and compose what they are made of when a hand does: the paper's Table III.
 
     50 epochs for each network: hours on a GPU, days without. --rows takes parts of it, --run adds them up.
     """
@@ -98,9 +93,9 @@ def contactile(
             touched = biotac_slide.load(biotac, "biotac", seed)
         study = Contactile(fabrics, wanted, weights, touched, device=device.value, seed=seed, folder=run, **settings)
         results = list(study.run(asked, progress))
-    reading = {"--limits": limits, "--pattern": pattern, "--constituents": constituents}
-    source = ["--simulated", "--size", size] if data is None else ["--data", str(data)]
-    source += [f"{option}={value}" for option, value in reading.items() if data is not None and value is not None]
+    source: dict[str, Any] = {"simulated": True, "size": size}
+    if data is not None:
+        source = {"data": data.name, "limits": limits, "pattern": pattern, "constituents": constituents}
     _close(study, results, json, source)
 
 
@@ -136,22 +131,22 @@ def _limits(limits: str | None) -> tuple[float, float] | None:
 
 
 def _close(
-    study: Contactile, results: Sequence[tuple[Any, Mapping[str, Any]]], json: Path | None, source: Sequence[str]
+    study: Contactile, results: Sequence[tuple[Any, Mapping[str, Any]]], json: Path | None, source: Mapping[str, Any]
 ) -> None:
-    found, made_up = rows(results), source[0] == "--simulated"
+    found, made_up = rows(results), "simulated" in source
     _show(found, study, made_up)
     if json is None:
         return
-    options = {name: getattr(study, name) for name in ("epochs", "biotac_epochs", "every", "take", "device", "seed")}
+    settings = {name: getattr(study, name) for name in ("epochs", "biotac_epochs", "every", "take", "device", "seed")}
     there = {cell.dataset for cell, _ in results}
-    words = ["scroll-tactile", "fabric", "contactile", "--rows", ",".join(study.rows)]
-    words += ["--parts", ",".join(key for key, part in PARTS.items() if part in there)]
-    words += source
-    words += ["--weights", Path(study.weights).name] if study.weights is not None else []
-    words += ["--biotac", "BIOTAC"] if study.biotac is not None else []
-    words += [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    made = origin(shlex.join(words), study.fabrics.recordings) | study.plan | options
-    made |= {"simulated": made_up, "processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    options: dict[str, Any] = {
+        "rows": ",".join(study.rows),
+        "parts": ",".join(key for key, part in PARTS.items() if part in there),
+    }
+    options |= {**source, "weights": None if study.weights is None else Path(study.weights)}
+    options |= {"biotac": None if study.biotac is None else "BIOTAC", **settings}
+    made = origin(command_line("fabric", "contactile", **options), study.fabrics.recordings) | study.plan | settings
+    made |= {"simulated": made_up} | machine()
     made |= {"seconds": sum(figures["seconds"] for _, figures in results)}
     made |= {"not scored": [name for name in study.shares.names if name not in study.scored]}
     write_json(json, made | {"rows": found, "cells": {cell.key: figures for cell, figures in results}})
@@ -164,7 +159,7 @@ def _show(found: Sequence[Mapping[str, Any]], study: Contactile, made_up: bool) 
     if any(row["key"] in EPOCHAL for row in found):
         say(
             f"networks: {study.epochs} epochs (the paper has {PAPER_EPOCHS}), on {study.device}, images averaged over "
-            f"{study.every} columns; learned was one touch of {study.take}"
+            f"{study.every} columns; trained on one touch of {study.take}"
         )
     if made_up:
         say(
@@ -190,5 +185,5 @@ def _show_part(part: str, name: str, found: Sequence[Mapping[str, Any]]) -> None
             "" if off is None else percent(off),
             "" if error is None else f"{error:.3f}",
         )
-    table.add_row("saying always what is more common", *([""] * 2 if of_paper else []), percent(figures["always"]))
+    table.add_row("always the more common", *([""] * 2 if of_paper else []), percent(figures["always"]))
     console().print(table)

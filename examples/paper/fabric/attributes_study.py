@@ -20,18 +20,18 @@ import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import require_data
-from examples.paper.runs.runfile import RunFile
 from examples.paper.studies.replay import Progress
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
 
 __all__ = ["FIGURES", "Attributes", "summary"]
 
-FIGURES = ("ours", "untold", "trees", "always")
+FIGURES = ("ours", "inferred", "trees", "always")
 """Shares of touches whose grade is right: ours, told that the material is new; ours, not told; of trees on simple
 features; and of always saying the grade that most of the materials learned have."""
 
@@ -110,7 +110,7 @@ class Attributes:
             # Ties go to the lower grade.
             always = min(usual, key=lambda grade: (-usual[grade], grade))
             trees = _forest(plain[lessons], [of[names[at]] for at in lessons], plain[exam], self.seed)
-            said = {"ours": self._said(attribute, told), "untold": self._said(attribute, untold), "trees": trees}
+            said = {"ours": self._said(attribute, told), "inferred": self._said(attribute, untold), "trees": trees}
             right = {way: float(np.mean(np.asarray(grades) == of[out])) for way, grades in said.items()}
             figures[attribute] = {**right, "always": float(always == of[out])}
         return {

@@ -16,22 +16,22 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.contactile.contactile_rows import NEED_BIOTAC, NEED_WEIGHTS, PAPER, PAPER_EPOCHS, ROWS, RowMaker
-from examples.paper.contactile.fabrics_set import Fabrics, load
-from examples.paper.contactile.pretraining import Pretraining
-from examples.paper.contactile.simulated import LIMITS, FabricScene
+from examples.paper.fabric.contactile_rows import NEED_BIOTAC, NEED_WEIGHTS, PAPER, PAPER_EPOCHS, ROWS, RowMaker
+from examples.paper.fabric.fabrics_set import Fabrics, load
+from examples.paper.fabric.pretraining import Pretraining
+from examples.paper.fabric.simulated import LIMITS, FabricScene
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
-from examples.paper.runs.runfile import RunFile
 from examples.paper.runs.study import weights_digest
 from examples.paper.systems.constituent_memory import ConstituentMemory, told_of
 from examples.paper.systems.constituent_nets import ConstituentNet
-from examples.paper.systems.constituents import ConstituentSquares, Shares
+from examples.paper.systems.constituent_squares import ConstituentSquares, Shares
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.fabric import score
+from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["HAND", "HELD_OUT", "PARTS", "Contactile", "rows", "simulated"]
 
@@ -188,7 +188,7 @@ class Contactile:
         system.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
         truth, masses = self._truth(touches.truth), self.shares.masses(touches.truth)[:, self._columns]
         told = system.tell(touches.asked, progress)
-        figures: Figures = {"taught": len(touches.streams), "validation": len(touches.validation)}
+        figures: Figures = {"learned": len(touches.streams), "validation": len(touches.validation)}
         figures |= score(self.scored, truth, told.presence[:, self._columns], (masses, told.share[:, self._columns]))
         if isinstance(system, ConstituentMemory):
             figures |= self._otherwise(system, touches, truth, progress)
@@ -203,7 +203,7 @@ class Contactile:
     def _otherwise(self, system: ConstituentMemory, touches: Split, truth: Any, progress: Progress) -> Figures:
         """Ours, not told that every fabric was touched; told that none was, so by heads alone; and fabrics."""
         found: Figures = {}
-        for name, unfamiliar in (("untold", 0.5), ("heads", 1.0)):
+        for name, unfamiliar in (("inferred", 0.5), ("heads", 1.0)):
             said = system.compositions(touches.asked, unfamiliar, progress)
             found[name] = score(self.scored, truth, told_of(self.scored, said).presence)["score"]
         fabrics = [one.prediction.material for one in said]
@@ -214,7 +214,7 @@ class Contactile:
 def rows(results: Sequence[tuple[Cell, Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """One row for each system: part → its figures, and of the paper's part the paper's score and the difference."""
     found: list[dict[str, Any]] = []
-    wanted = ("score", "exact", "share_error", "calibration_error", "always", "untold", "heads", "fabric")
+    wanted = ("score", "exact", "share_error", "calibration_error", "always", "inferred", "heads", "fabric")
     for key, name in ROWS.items():
         parts = {
             cell.dataset: {what: figures.get(what) for what in wanted}

@@ -1,4 +1,4 @@
-"""`scroll-tactile reproduce`: the paper's tables and figures, from one's own copy of the data."""
+"""`table1`, `efficiency`, `activation`, and `all`: the paper's own systems, and ours beside them."""
 
 from __future__ import annotations
 
@@ -35,31 +35,24 @@ from examples.paper.commands.options import (
     read_sets,
     say_conditions,
 )
-from examples.paper.commands.robustness_command import IN_THE_PAPER, study_command
+from examples.paper.commands.robustness_command import StudyChoice, robustness
 from examples.paper.commands.sets import draw_into, require_folders
-from examples.paper.plots.plots_activation import draw_activation
-from examples.paper.plots.plots_efficiency import draw_efficiency
-from examples.paper.runs.study import Study
+from examples.paper.plots import draw_activation, draw_efficiency
+from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.activation_study import ActivationStudy
 from examples.paper.studies.efficiency import Efficiency, curves
 from examples.paper.studies.table1 import PAPER, Table1, rows
 from examples.paper.systems.catalogue import SYSTEMS
-from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
 
-__all__ = ["reproduce"]
+__all__ = ["activation", "efficiency", "everything", "table1"]
 
-reproduce = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    help="Measure what the paper measured, and ours beside it, on one's own copy of the data.",
-)
 
 CURVES = ("resnet", "resnet-pretrained", "kernels-lda", "vision-lda", "kernels+vision-lda")
 EPOCH_COLUMNS = (1, 2, 5, 10, 20)  # of the table of efficiency
 
 
-@reproduce.command()
 def table1(
     data: Data,
     weights: Weights = None,
@@ -108,7 +101,6 @@ def table1(
     close(study, results, json, {"rows": found}, sets, folds)
 
 
-@reproduce.command()
 def efficiency(
     data: Data,
     weights: Weights = None,
@@ -146,7 +138,6 @@ def efficiency(
     draw_into(plot, lambda file: draw_efficiency(file, found))
 
 
-@reproduce.command()
 def activation(
     data: Data,
     weights: Weights = None,
@@ -185,17 +176,12 @@ def activation(
         table.add_row(pair["one"], pair["two"], *figures)
     console().print(table)
     say_conditions(study)
-    close(study, results, json, {"likeness": likeness}, sets, "0")
+    close(study, results, json, {"likeness": likeness}, sets, None)
     if plot is not None:
         draw_activation(plot, images)
         say(f"plot: {plot}")
 
 
-for name in IN_THE_PAPER:
-    reproduce.command(name)(study_command(name))
-
-
-@reproduce.command(name="all")
 def everything(
     data: Data,
     out: Annotated[Path, typer.Option(help="An existing folder: every part's figures and pictures go there.")],
@@ -208,10 +194,7 @@ def everything(
     quick: Quick = False,
     run: Run = None,
 ) -> None:
-    """All of it, one after the other: table1, efficiency, length, speed and noise, and with weights activation.
-
-    Length, speed and noise are asked of the same systems, so that each is taught once; their figures are one file.
-    """
+    """All of it, one after the other: table1, efficiency, robustness paper, and with weights activation."""
     require_folders(out / "table1.json")
     shared: dict[str, Any] = {"data": data, "weights": weights, "epochs": epochs, "device": device, "seed": seed}
     shared |= {"precision": precision, "quick": quick}
@@ -222,12 +205,12 @@ def everything(
 
     table1(**shared, folds=folds, **files("table1", picture=False))
     efficiency(**shared, folds=folds, **files("efficiency"))
-    study_command("all")(**shared, folds=folds, **files("robustness"))
+    robustness(StudyChoice.PAPER, systems="all", **shared, folds=folds, **files("robustness"))
     if weights is not None:
         activation(**shared, **files("activation"))
 
 
-def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: Study) -> None:
+def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: SystemStudy) -> None:
     table = Table("system", "paper", "here", "difference", "folds", "seconds", title=dataset)
     for row in found:
         figures = row["sets"].get(dataset)

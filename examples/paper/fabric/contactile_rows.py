@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from examples.paper.contactile.pretraining import Pretraining
-from examples.paper.contactile.ratios import ratios
+from examples.paper.fabric.pretraining import Pretraining
+from examples.paper.fabric.ratios import ratios
 from examples.paper.runs.cached import Cached
 from examples.paper.systems.constituent_memory import ConstituentMemory
 from examples.paper.systems.constituent_nets import ConstituentNet
-from examples.paper.systems.constituents import ConstituentSquares, Shares, Teller
+from examples.paper.systems.constituent_squares import ConstituentSquares, Shares, Teller
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares

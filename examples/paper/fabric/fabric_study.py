@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.runfile import RunFile
 from examples.paper.studies.replay import Progress
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.fabric_slide import CPM_RATIOS, Slides, ratios
@@ -27,10 +26,11 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.fabric import score, score_compositions
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["FIGURES", "Letters", "SlideTransfer", "directions", "summary"]
 
-FIGURES = ("score", "exact", "accuracy", "likeliest", "untold", "always", "calibration_error")
+FIGURES = ("score", "exact", "accuracy", "likeliest", "inferred", "always", "calibration_error")
 """Of each fold: mean score per constituent, exact matches, materials told; the score of saying the dots of the
 likeliest letter (all right wherever the letter is), that where it is not said beforehand whether the touches are of
 letters never touched, and that of always saying what is more common among the letters learned; and expected calibration
@@ -121,7 +121,7 @@ class Letters:
             **figures,
             "likeliest": score(DOTS, there, [[one[dot] for dot in DOTS] for one in likeliest])["score"],
             "always": score(DOTS, there, np.tile(often, (len(exam), 1)))["score"],
-            "untold": score_compositions(DOTS, dots, untold)["score"],
+            "inferred": score_compositions(DOTS, dots, untold)["score"],
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
         }

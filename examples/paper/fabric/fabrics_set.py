@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from examples.paper.contactile.compositions_table import read_compositions
+from examples.paper.fabric.compositions_table import read_compositions
 from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import CONTACTILE, Sensor
@@ -130,7 +130,7 @@ def load(
 
 _WANTED = (
     "Wanted is a folder with compositions.csv and, for example, protocol1/FABRIC/00.npy; "
-    "examples.paper.contactile.fabrics_set says what else is taken"
+    "examples.paper.fabric.fabrics_set says what else is taken"
 )
 
 

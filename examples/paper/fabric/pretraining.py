@@ -14,7 +14,7 @@ from examples.paper.runs.cells import split
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import average_columns
 from examples.paper.systems.networks import ResNetClassifier
-from examples.paper.systems.trained import Trained
+from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
@@ -55,7 +55,7 @@ class Pretraining:
             return ResNetClassifier(load_network(self.weights), outputs, trained=True)
 
         name = f"fine-tuned on {self.recordings.name}"
-        system = Trained(name, make, lambda image: average_columns(image, self.every), self.course, self.device)
+        system = TrainedNetwork(name, make, lambda image: average_columns(image, self.every), self.course, self.device)
         told = f"{name}: "
         system.fit(
             part.streams,

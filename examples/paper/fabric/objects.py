@@ -18,17 +18,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.fabric.unseen import fit_heads
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import data_digest
-from examples.paper.runs.runfile import RunFile
 from examples.paper.runs.study import weights_digest
 from examples.paper.studies.replay import Progress
-from examples.paper.studies.unseen import fit_heads
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings import Embedding, Frames, embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.stream import Stream

@@ -1,0 +1,83 @@
+"""Pictures, for those who have matplotlib (the extra `plots`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scroll_tactile.errors import InputError
+
+__all__ = ["available", "confusion_counts", "draw", "picture"]
+
+
+def available() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float, dots: int = 120) -> Iterator[Any]:
+    """Yield a matplotlib figure of so many inches, and write it, with `dots` an inch, when the block ends.
+
+    Raises InputError where matplotlib is missing or the file cannot be written.
+    """
+    if not available():
+        raise InputError('pictures need matplotlib: pip install "scroll-tactile[plots]"')
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    yield figure
+    try:
+        figure.savefig(path, dpi=dots)
+    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
+        raise InputError(f"the plot cannot be written to {path}: {error}") from error
+
+
+def confusion_counts(
+    names: Sequence[str], tested: Sequence[int], confusions: Sequence[tuple[str, str, int]]
+) -> np.ndarray:
+    """Counts of (truth, predicted), shape (C, C), from the wrong answers.
+
+    names: C materials. tested: touches of each. confusions: (truth, predicted, count) with predicted ≠ truth.
+    """
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.diag(np.asarray(tested, dtype=np.int64))
+    for truth, predicted, count in confusions:
+        counts[place[truth], place[predicted]] += count
+        counts[place[truth], place[truth]] -= count
+    return counts
+
+
+def draw(
+    path: Path,
+    names: Sequence[str],
+    counts: np.ndarray,
+    *,
+    title: str,
+    curve: Sequence[Sequence[float]] = (),
+) -> None:
+    """Draw counts of (truth, predicted), shape (C, C), into a picture, and a curve of (materials, accuracy) beside.
+
+    Raises InputError where matplotlib is missing or the file cannot be written.
+    """
+    with picture(path, 13 if len(curve) else 7.5, 6.5) as figure:
+        panel = figure.add_subplot(1, 2 if len(curve) else 1, 1)
+        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        image = panel.imshow(shares, cmap="viridis", vmin=0, vmax=1)
+        panel.set_xticks(range(len(names)), names, rotation=90)
+        panel.set_yticks(range(len(names)), names)
+        panel.set(xlabel="predicted", ylabel="touched", title=title)
+        figure.colorbar(image, ax=panel, label="share of the touches of a material", shrink=0.8)
+        if len(curve):
+            side = figure.add_subplot(1, 2, 2)
+            points = np.asarray(curve)
+            side.plot(points[:, 0], 100 * points[:, 1], marker="o")
+            side.set(xlabel="materials observed so far", ylabel="accuracy over them, %", title="Learning one by one")
+            side.grid(alpha=0.3)

@@ -49,17 +49,7 @@ class TactileLearner:
     True
 
     sensor: whose streams it reads. embedding: the frozen features; unless given `Kernels()`, and `Frames()` for a
-    camera, of whose frames those count in which the gel is pressed (see `scroll_tactile.signals.contact`).
-    readout: "lda" or "ridge" (the paper's); computed from the statistics, so it can differ at every opening.
-    false_alarms: the share of touches of known materials that may be called unknown.
-    refit: the share by which the memory may grow before λ and the calibration are chosen again. 0: they are at each
-    change, and every answer is a function of the memory alone. With 0.1, say, a `predict` just after an `observe` is a
-    hundred times as fast: the readouts are of all that was felt, λ and the calibration of a little less.
-    solver: how the readouts follow between two such fits. "exact": against a factor of the exact statistics, equal to a
-    fresh solve to rounding. "recursive": the paper's recursive least squares, whose rounding errors add up until the
-    next fit; it is there to be compared with, and what the memory keeps is exact all the same.
-    exemplars: streams in the buffer that `fine_tune` trains on, 400 unless given; three times as many are kept raw, to
-    choose from. 0: none are; so it is for a camera, whose frames are large (480 × 640: 4 MB), unless it is given.
+    camera, of whose frames those count in which the gel is pressed (see `signals.contact`).
     augmentation: the copies that each touch is observed with, see `Augmented`; none unless given. A touch and its
     copies are one observation: it is retracted with them, and is as exact. Each copy costs as much time and space as
     the touch does, when it is observed; `predict` reads what it is given and nothing else.
@@ -77,26 +67,33 @@ class TactileLearner:
         *,
         sensor: Sensor,
         embedding: Embedding | None = None,
-        readout: ReadoutName = "lda",
-        false_alarms: float = 0.05,
-        refit: float = 0.0,
-        solver: SolverName = "exact",
-        exemplars: int | None = None,
         augmentation: Augmented | None = None,
         **settings: Any,
     ) -> None:
-        require_settings(readout, false_alarms, refit, solver)
-        self.sensor = sensor
-        self.embedding: Embedding = _usual(sensor) if embedding is None else embedding
-        self.readout: ReadoutName = readout
-        self.false_alarms = false_alarms
-        self.refit = refit
-        self.augmentation = require_augmentable(sensor, augmentation)
-        self.solver: SolverName = solver
-        self._reading = window_plan(sensor, self.embedding)
-        self._perception = Perception(sensor, self.embedding, self._reading, self.augmentation)
-        self._capacity = capacity_of(exemplars, camera=sensor.camera)
-        self._ledger = Ledger(lambda: Memory(self.embedding.dimension, self._reading, self._capacity))
+        _require_augmentable(sensor, augmentation)
+        chosen = usual_embedding(sensor) if embedding is None else embedding
+        given = Settings(**settings)
+        exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
+        self._set_up(sensor, chosen, augmentation, given, exemplars)
+        self._ledger = Ledger(self._empty_memory)
+
+    def _set_up(
+        self,
+        sensor: Sensor,
+        embedding: Embedding,
+        augmentation: Augmented | None,
+        settings: Settings,
+        exemplars: int,
+    ) -> None:
+        self._sensor = sensor
+        self._embedding = embedding
+        self._augmentation = augmentation
+        self._settings = settings.model_copy(update={"exemplars": exemplars})
+        self._plan = window_plan(sensor, embedding)
+        self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
+        self._unverified: Identity | None = None
+        self._snapshot_of: str | None = None
+        self._current = CurrentModel(self._settings, sensor.channels, embedding.bound)
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self) -> Memory:
@@ -109,11 +106,6 @@ class TactileLearner:
         *,
         sensor: Sensor | None = None,
         embedding: Embedding | None = None,
-        readout: ReadoutName = "lda",
-        false_alarms: float = 0.05,
-        refit: float = 0.0,
-        solver: SolverName = "exact",
-        exemplars: int | None = None,
         augmentation: Augmented | None = None,
         mode: Literal["write", "read"] = "write",
         **settings: Any,
@@ -131,28 +123,19 @@ class TactileLearner:
         chosen = Settings(**settings)
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        asked = capacity_of(exemplars, camera=sensor is not None and sensor.camera)
-        identity = None if sensor is None else identity_of(sensor, embedding or _usual(sensor), asked, augmentation)
-        store = Store.open(path, identity=identity, mode=mode)
+        store = _opened(path, sensor, embedding, augmentation, chosen.exemplars, mode)
         try:
-            if "sensor" not in store.identity:
-                raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
-            kept = Sensor.model_validate(store.identity["sensor"])
-            chosen: Embedding = _usual(kept) if embedding is None else embedding
-            require_same(store, kept, sensor, chosen)
-            capacity = kept_capacity(store, asked, given=exemplars is not None)
-            learner = cls(
-                sensor=kept,
-                embedding=chosen,
-                readout=readout,
-                false_alarms=false_alarms,
-                refit=refit,
-                solver=solver,
-                exemplars=capacity.streams,
-                augmentation=kept_augmentation(store, augmentation),
-            )
-            reading = learner._reading
-            learner._ledger = Ledger(lambda: Memory.load(store, chosen.dimension, reading, capacity), store)
+            identity = Identity.read(store)
+            identity.require(store.path, sensor, augmentation)
+            if embedding is not None:
+                identity.require_embedding(store.path, embedding)
+            learner = cls.__new__(cls)
+            found = identity.own_embedding(store.path) if embedding is None else embedding
+            exemplars = identity.exemplar_count(store, chosen.exemplars)
+            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
+            learner._unverified = identity if embedding is None else None
+            plan, most = learner._plan, learner._settings.exemplars or 0
+            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, most), store)
         except BaseException:
             store.close()
             raise
@@ -472,8 +455,8 @@ class TactileLearner:
         if without and ranked:
             raise InputError(
                 f"expected an exemplar of every material; the buffer has none of {without[:10]} (it was made with "
-                f"exemplars={self._capacity.streams}). Make a new memory with "
-                f"room for {len(model.names)} or more, or touch again what was felt before exemplars were kept"
+                f"exemplars={self._settings.exemplars}). Make a new memory with room for {len(model.names)} or more, "
+                "or touch again what was observed before exemplars were kept"
             )
         tuned, report = fine_tune(
             self._embedding,

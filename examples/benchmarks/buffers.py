@@ -193,8 +193,8 @@ def run_buffers(
     note("learning")
     for touch in train:
         learner.observe(*touch)
-    assert learner._memory.exemplars is not None
-    kept = list(learner._memory.exemplars)
+    assert learner.memory.exemplars is not None
+    kept = list(learner.memory.exemplars)
     codes, keys = np.stack([exemplar.code for exemplar in kept]), [exemplar.key for exemplar in kept]
     f = float(np.mean([learner.predict(stream).material == name for name, stream in test]))
     records = []
@@ -222,7 +222,7 @@ def _tuned(
     of = {exemplar.key: exemplar for exemplar in kept}
     exemplars = {name: [of[key] for key in chosen] for name, chosen in buffer.items()}
     tuned, _ = fine_tune(learner.embedding, learner.model(), exemplars, learner.sensor, seed=seed)
-    reader = TunedReader(learner.embedding, learner._reading, tuned)
+    reader = TunedReader(learner.embedding, learner.plan, tuned)
     right = []
     for name, stream in test:
         logits = reader.logits(tactile_image(stream))

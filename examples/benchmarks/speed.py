@@ -275,7 +275,7 @@ def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLe
     rng = np.random.default_rng([seed, observations])
     widths = scales(scene.sensor)
     of_touch = extent(widths[-1], widths)
-    store, memory = learner._ledger.store, learner._memory
+    store, memory = learner._ledger.store, learner.memory
     assert store is not None
     for i in range(observations):
         codes = {

@@ -1,4 +1,4 @@
-"""The pictures of the studies. All need matplotlib; they raise InputError without it, or where a file cannot be made."""
+"""The figures of the studies, drawn from their results; matplotlib is imported where it is used."""
 
 from __future__ import annotations
 

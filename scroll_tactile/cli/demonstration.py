@@ -10,9 +10,9 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.pipelines import drawing as plots
 from scroll_tactile.cli.terminal import confusion_text, console, percent, say, verdict
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines import drawing as plots
 from scroll_tactile.pipelines.demo import Demo, Outcome
 from scroll_tactile.recordings.arrays import read_sensor
 

@@ -73,7 +73,7 @@ def fine_tune(
     begun = time.perf_counter()
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars)
-    touches = TouchFeatures(embedding, model.reading)
+    touches = TouchFeatures(embedding, model.plan)
     samples = list(_samples(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
     names = sorted({sample.material for sample in samples})
     if len(names) < 2:

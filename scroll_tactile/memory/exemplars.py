@@ -255,3 +255,13 @@ def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray],
     codes, keys = np.stack([exemplar.code for exemplar in wide]), [exemplar.key for exemplar in wide]
     order = herd(codes, keys, means(candidates[0].material, widest), count)
     return ([wide[place] for place in order] + brief)[:count]
+
+
+def ranked_exemplars(sample: ExemplarSample, statistics: Statistics) -> dict[str, list[Exemplar]]:
+    """The buffer, as `rank`, against the exact means of all that was observed."""
+
+    def mean(material: str, scale: Scale) -> IntArray:
+        total = statistics.sums(scale, [material]).sum(axis=(0, 1))
+        return mean_code(total, int(statistics.counts(scale, [material]).sum()))
+
+    return rank(sample, mean)

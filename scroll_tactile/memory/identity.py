@@ -25,33 +25,30 @@ USUAL_EXEMPLARS = 400  # streams
 ROBUST = "robust kernels"
 
 
-def capacity_of(streams: int | None, *, camera: bool = False) -> Capacity:
-    """The size of the buffer that was asked for; a camera has none unless asked. Raises InputError for one below 0."""
-    if streams is None:
-        return Capacity(0) if camera else Capacity()
-    if isinstance(streams, bool) or not isinstance(streams, int) or streams < 0:
-        raise InputError(f"expected exemplars as a whole number of 0 or more; came {streams!r}")
-    return Capacity(streams)
+class _Kept(BaseModel):
+    """A part of an identity, as JSON keeps it; what a later version adds is passed over."""
+
+    model_config = ConfigDict(frozen=True)
 
 
-def kept_capacity(store: Store, asked: Capacity, *, given: bool) -> Capacity:
-    """The size of the buffer that a memory was made with. Raises MismatchError where another one was asked for.
+class EmbeddingIdentity(_Kept):
+    """An embedding as a memory names it; its configuration, from which it can be made again, None for a user's own."""
 
-    Version 0.1 knew a limit in bytes beside it, or in place of it: such a memory has the usual size, and what it kept
-    within that size stays.
-    """
-    told = store.identity.get("exemplars")
-    if told is None:  # made before there were any: those felt since it was first opened with some are kept
-        generation = store.latest()
-        told = None if generation is None else generation.attributes.get("capacity")
-    if told is None:
-        return asked
-    streams, _ = cast(list[int | None], told)
-    kept = Capacity() if streams is None else Capacity(streams)
-    if given and kept != asked:
-        raise MismatchError(
-            f"{store.path} was made with exemplars={kept.streams}; it was opened with {asked.streams}. What was not "
-            "kept cannot be had back: leave it out"
+    name: str
+    dimension: int
+    bound: float
+    fingerprint: str
+    configuration: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, embedding: Embedding) -> Self:
+        """The identity of an embedding."""
+        return cls(
+            name=embedding.name,
+            dimension=embedding.dimension,
+            bound=embedding.bound,
+            fingerprint=embedding.fingerprint,
+            configuration=configuration_of(embedding),
         )
 
     def __str__(self) -> str:
@@ -233,26 +230,7 @@ def usual_embedding(sensor: Sensor) -> Embedding:
     """The embedding of a memory that asks for none."""
     from scroll_tactile.embeddings.frames import Frames
 
-    Raises InputError for an embedding that cannot read the sensor: before anything is written.
-    """
-    require_rest(embedding, sensor)
-    reading = window_plan(sensor, embedding)
-    # Memories of cameras that lack it had windows across two frames: another grid, and refused.
-    frames = {"frames": True} if reading.frames else {}
-    # Left out where there is none: such a memory can be opened by the versions before it.
-    copies = {} if augmentation is None else {"augmentation": augmentation.to_json()}
-    return copies | {
-        "exemplars": [capacity.streams, None],
-        "reading": [reading.partial, reading.judged],
-        "sensor": sensor.model_dump(mode="json"),
-        "embedding": {
-            "name": embedding.name,
-            "dimension": embedding.dimension,
-            "bound": embedding.bound,
-            "fingerprint": embedding.fingerprint,
-        },
-        "grid": {"bits": BITS, "folds": FOLDS, "scales": list(reading.widths)} | frames,
-    }
+    return Frames() if sensor.camera else Kernels()
 
 
 def usual_exemplars(sensor: Sensor) -> int:

@@ -46,17 +46,6 @@ READINGS = "readings"  # the array of a row that keeps a stream raw
 ATTEMPTS = 20  # of a reader to read what a writer goes on changing
 
 
-@dataclass(frozen=True)
-class Capacity:
-    """Of the exemplar buffer, in streams; 0: nothing is kept raw."""
-
-    streams: int = 400
-
-    def pool(self) -> ExemplarSample | None:
-        """An empty pool of this capacity; None where nothing is to be kept."""
-        return None if self.streams == 0 else ExemplarSample(self.streams)
-
-
 class Memory:
     """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
 
@@ -102,8 +91,8 @@ class Memory:
         Raises CapacityError before anything is added.
         """
         self.statistics.add(material, fold_of(key), codes, columns)
-        if self.pool.wants(material, key):
-            self.pool.add(material, key, self._touch(columns, codes))
+        if self.sample.wants(material, key):
+            self.sample.add(material, key, self._touch(columns, codes))
         if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key):
             self.exemplars.add(Exemplar.of(material, key, readings, codes))
         self.sequence = sequence
@@ -147,9 +136,9 @@ class Memory:
         """Take an observation out of the sums; `refill` then mends the pools."""
         material, key = record.label, record.key
         self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
-        self.withdrawn.add(record.sequence)
-        self.taken_back += 1
-        if self.pool.holds(material, key) or (self.exemplars and self.exemplars.holds(material, key)):
+        self.retracted.add(record.sequence)
+        self.retractions += 1
+        if self.sample.holds(material, key) or (self.exemplars and self.exemplars.holds(material, key)):
             self._stale = True
         if record.sequence <= self.tuned_upto:
             self.tuned = None
@@ -178,7 +167,7 @@ class Memory:
             record = store.record(head.sequence)
             fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
         heads = [one for one in self.retractable(store) if one.sequence <= self.sequence]
-        felt = [(head.label, head.key, head.sequence) for head in heads]
+        streams = [(head.label, head.key, head.sequence) for head in heads]
 
         def touch(material: str, key: bytes, sequence: int) -> WindowSums:
             if (there := touches.get((material, key))) is not None:
@@ -189,7 +178,7 @@ class Memory:
         def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
             return kept.get((material, key)) or _exemplar(store.record(sequence))
 
-        fresh.sample.refill(felt, touch)
+        fresh.sample.refill(streams, touch)
         self.sample = fresh.sample
         if fresh.exemplars is not None:
             raw = [(head.label, head.key, head.sequence) for head in heads if head.attributes.get("nbytes")]
@@ -219,7 +208,7 @@ class Memory:
             compacted = {
                 (one.label, one.key) for one in store.heads() if one.sequence <= self.base and one.kind in kinds
             }
-            fresh.pool.update((name, key, touch) for name, key, touch in self.pool if (name, key) in compacted)
+            fresh.sample.update((name, key, touch) for name, key, touch in self.sample if (name, key) in compacted)
             if fresh.exemplars is not None:
                 for one in self.exemplars or ():
                     if (one.material, one.key) in compacted:
@@ -241,7 +230,7 @@ class Memory:
         other = self._empty()
         other._take(arrays, attributes)
         self.statistics = self.statistics + other.statistics
-        self.pool.update(other.pool)
+        self.sample.update(other.sample)
         if self.exemplars is not None and other.exemplars is not None:
             self.exemplars.update(other.exemplars)
 
@@ -254,7 +243,7 @@ class Memory:
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "pool": materials,
-            "capacity": [self.capacity.streams, None],  # version 0.1 had a limit in bytes beside it
+            "capacity": [self.capacity, None],  # version 0.1 had a limit in bytes beside it
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
@@ -339,8 +328,8 @@ class Memory:
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         self.sample = TouchSample.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity.streams)
-        self.withdrawn, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
+            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity)
+        self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
         self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
         if "tuned" in attributes:
             self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]

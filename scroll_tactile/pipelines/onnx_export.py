@@ -50,7 +50,7 @@ def export_onnx(learner: TactileLearner, path: str | os.PathLike[str]) -> None:
         )
     if not learner.materials:
         raise InputError("expected a memory that has observed something; this one is empty, and would have no scores")
-    model, longest = learner.model(), learner._memory.statistics.longest
+    model = learner.model()
     channels, columns = _shape(learner.sensor)
     read = min(columns, model.longest) if not learner.sensor.camera else columns  # no further than was learned
     graph = Graph()

@@ -12,6 +12,7 @@ from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import TouchFeatures, TrainingSample, TunedReader, adapted
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale

@@ -1,7 +1,5 @@
 """Readouts that follow the statistics equal those that are solved anew, however long they have followed."""
 
-import copy
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

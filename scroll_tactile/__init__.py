@@ -5,26 +5,29 @@ learner.observe("felt", stream)          # stream: (T, n) readings
 learner.predict(stream).material         # "felt"; or known=False: never felt this
 """
 
-from scroll_tactile import errors, sensors
-from scroll_tactile.embeddings import (
-    Embedding,
-    Frames,
-    Joined,
-    Kernels,
-    Maps,
-    ModuleEmbedding,
-    Robust,
-    Vision,
-)
-from scroll_tactile.learner import TactileLearner
-from scroll_tactile.results import Composition, Constituent, Prediction, Receipt
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
-from scroll_tactile.signals.stream import Stream
-from scroll_tactile.testing import check_embedding
+import importlib
+import typing
+
+if typing.TYPE_CHECKING:
+    from scroll_tactile import errors, sensors
+    from scroll_tactile.embeddings.frames import Frames
+    from scroll_tactile.embeddings.joined import Joined
+    from scroll_tactile.embeddings.kernels import Kernels
+    from scroll_tactile.embeddings.maps import Maps
+    from scroll_tactile.embeddings.modules import ModuleEmbedding
+    from scroll_tactile.embeddings.protocol import Capabilities, Embedding
+    from scroll_tactile.embeddings.robust import Robust
+    from scroll_tactile.embeddings.vision import Vision
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.results import Composition, Constituent, Observation, Prediction, Receipt
+    from scroll_tactile.sensors import Sensor
+    from scroll_tactile.settings import Settings
+    from scroll_tactile.signals.copies import Augmented
+    from scroll_tactile.signals.stream import Stream
 
 __all__ = [
     "Augmented",
+    "Capabilities",
     "Composition",
     "Constituent",
     "Embedding",
@@ -33,14 +36,53 @@ __all__ = [
     "Kernels",
     "Maps",
     "ModuleEmbedding",
+    "Observation",
     "Prediction",
     "Receipt",
     "Robust",
     "Sensor",
+    "Settings",
     "Stream",
     "TactileLearner",
     "Vision",
-    "check_embedding",
+    "__version__",
     "errors",
     "sensors",
 ]
+
+__version__ = "0.2.0"
+
+# Imported when asked for, so that whoever needs a sensor's name does not wait for the libraries behind a learner.
+_MODULES = {
+    "Augmented": "signals.copies",
+    "Capabilities": "embeddings.protocol",
+    "Composition": "results",
+    "Constituent": "results",
+    "Embedding": "embeddings.protocol",
+    "Frames": "embeddings.frames",
+    "Joined": "embeddings.joined",
+    "Kernels": "embeddings.kernels",
+    "Maps": "embeddings.maps",
+    "ModuleEmbedding": "embeddings.modules",
+    "Observation": "results",
+    "Prediction": "results",
+    "Receipt": "results",
+    "Robust": "embeddings.robust",
+    "Sensor": "sensors",
+    "Settings": "settings",
+    "Stream": "signals.stream",
+    "TactileLearner": "learner",
+    "Vision": "embeddings.vision",
+}
+
+
+def __getattr__(name: str) -> typing.Any:
+    if name in ("errors", "sensors"):
+        return importlib.import_module(f"{__name__}.{name}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -19,8 +19,8 @@ from examples.benchmarks.show_speed import show_frontier, show_interleaved, show
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.vision_speed import run_vision
 from examples.paper.commands.sets import Dataset, read, require_folders
+from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 
 __all__ = ["app"]

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.benchmarks.timing import circumstances
+from scroll_tactile import Embedding
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner

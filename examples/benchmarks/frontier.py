@@ -31,8 +31,8 @@ from examples.benchmarks.vector_peers import (
     lacking,
 )
 from examples.paper.studies.peers import touch_features
+from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
 from scroll_tactile.readouts.readout import ReadoutName

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from examples.benchmarks.timing import Timing, circumstances
 from examples.benchmarks.vector_peers import GradientSteps, Ours, PseudoInverse, Refitted, VectorPeer, lacking
-from scroll_tactile.embeddings import Capabilities
+from scroll_tactile import Capabilities
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import Readout, fit_readout
 from scroll_tactile.readouts.recursive import RecursiveLeastSquares, WoodburyReadout

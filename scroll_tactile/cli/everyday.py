@@ -10,9 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scroll_tactile.cli.terminal import console, percent, say, verdict
-from scroll_tactile.pipelines.memories import open_memory
-from scroll_tactile.recordings.arrays import read_sensor, read_stream
+from scroll_tactile.cli.terminal import console, opened, opened_for_upkeep, percent, say, verdict
 
 __all__ = ["inspect", "observe", "predict"]
 
@@ -35,14 +33,16 @@ def observe(
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
+    from scroll_tactile.recordings.arrays import read_sensor, read_stream
+
     readings = read_stream(file)  # before a memory is made for a file that cannot be read
     chosen = None if sensor is None else read_sensor(sensor)
-    with open_memory(memory, sensor=chosen) as learner:
+    with opened(memory, sensor=chosen) as learner:
         receipt = learner.observe(material, readings)
-        felt = learner.materials[material]
+        count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     say(f"{escape(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
-    say(f"it has now been felt {felt} time{'s' * (felt > 1)}")
+    say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 
 def predict(
@@ -55,8 +55,10 @@ def predict(
 ) -> None:
     """Say what a touch in a file feels like; the memory stays as it is."""
     candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
+    from scroll_tactile.recordings.arrays import read_stream
+
     readings = read_stream(file)
-    with open_memory(memory, mode="read") as learner:
+    with opened(memory, mode="read") as learner:
         prediction = learner.predict(readings, scene=candidates)
     if as_json:
         infinite = prediction.novelty == float("inf")  # JSON has no infinity
@@ -77,7 +79,7 @@ def predict(
 
 def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Show what a memory holds: materials with their counts, sensor, embedding, digest and size on disk."""
-    with open_memory(memory, mode="read") as learner:
+    with opened_for_upkeep(memory, mode="read") as learner:
         materials, digest, sensor, embedding = learner.materials, learner.digest(), learner.sensor, learner.embedding
     size = sum(file.stat().st_size for file in memory.rglob("*") if file.is_file())
     if as_json:
@@ -102,7 +104,7 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
     say(f"[bold]observations:[/] {sum(materials.values())} of {len(materials)} materials")
     say(f"[bold]sensor:[/] {escape(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
     say(
-        f"[bold]embedding:[/] {embedding.name}, {embedding.dimension} features, "
+        f"[bold]embedding:[/] {escape(embedding.name)}, {embedding.dimension} features, "
         f"fingerprint {embedding.fingerprint[:12]}"
     )
     say(f"[bold]digest:[/] {digest}")

@@ -10,10 +10,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from scroll_tactile.cli.everyday import MemoryFolder, StreamFile
-from scroll_tactile.cli.terminal import console, percent, say
+from scroll_tactile.cli.terminal import console, opened, percent, say
 from scroll_tactile.errors import DescriptionError
-from scroll_tactile.pipelines.memories import open_memory
-from scroll_tactile.recordings.arrays import read_stream
 
 __all__ = ["compose", "describe"]
 
@@ -22,23 +20,23 @@ WORDS = {"yes": True, "no": False, "unknown": None}
 
 def describe(
     memory: MemoryFolder,
-    material: Annotated[str, typer.Argument(help="A material, felt or not yet.", show_default=False)],
+    material: Annotated[str, typer.Argument(help="A material, observed or not yet.", show_default=False)],
     constituents: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown. None: what was said "
-            "before is taken back.",
+            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown. None: its "
+            "description is removed.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
     """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
-    told = dict(_constituent(one) for one in constituents or [])
-    with open_memory(memory) as learner:
-        learner.describe(material, told or None)
-        felt = learner.materials.get(material, 0)
-    said = "what it is made of is taken back" if not told else f"made of {', '.join(map(escape, told))}"
-    say(f"{escape(material)}: {said}; felt {felt} time{'s' * (felt != 1)}")
+    shares = dict(_constituent(text) for text in constituents or [])
+    with opened(memory) as learner:
+        learner.describe(material, shares or None)
+        count = learner.materials.get(material, 0)
+    now = "its description is removed" if not shares else f"made of {', '.join(map(escape, shares))}"
+    say(f"{escape(material)}: {now}; observed {count} time{'s' * (count != 1)}")
 
 
 def _constituent(text: str) -> tuple[str, float | bool | None]:
@@ -59,27 +57,31 @@ def compose(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
+    from scroll_tactile.recordings.arrays import read_stream
+
     readings = read_stream(file)
-    with open_memory(memory, mode="read") as learner:
+    with opened(memory, mode="read") as learner:
         made_of = learner.compose(readings)
     if as_json:
         found = [
             {
-                "constituent": one.name,
-                "presence": one.presence,
-                "share": one.share,
-                "evidence": one.evidence,
-                "unlearned": one.unlearned,
+                "constituent": constituent.name,
+                "presence": constituent.presence,
+                "share": constituent.share,
+                "evidence": constituent.evidence,
+                "unlearned": constituent.unlearned,
             }
-            for one in made_of.constituents
+            for constituent in made_of.constituents
         ]
         answer = {"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material}
         typer.echo(json.dumps(answer, ensure_ascii=False))
         return
     table = Table("constituent", "there with", "share", "feels most like")
-    for one in made_of.constituents:
-        there = escape(one.unlearned) if one.presence is None else percent(one.presence)
-        share = "" if one.share is None else percent(one.share)
-        table.add_row(escape(one.name), there, share, escape(one.evidence[0][0]) if one.evidence else "")
+    for constituent in made_of.constituents:
+        there = escape(constituent.unlearned) if constituent.presence is None else percent(constituent.presence)
+        share = "" if constituent.share is None else percent(constituent.share)
+        table.add_row(
+            escape(constituent.name), there, share, escape(constituent.evidence[0][0]) if constituent.evidence else ""
+        )
     console().print(table)
     say(f"a material never felt: {percent(made_of.unfamiliar)}")

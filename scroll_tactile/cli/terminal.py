@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import typer
@@ -18,9 +18,24 @@ from typer.core import TyperGroup
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.results import Prediction
-from store import StoreError
+from store import NotAStoreError, Store, StoreError
 
-__all__ = ["Commands", "confusion_text", "console", "percent", "progress_bar", "say", "verdict", "write_json"]
+if TYPE_CHECKING:
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.sensors import Sensor
+
+__all__ = [
+    "Commands",
+    "confusion_text",
+    "console",
+    "opened",
+    "opened_for_upkeep",
+    "percent",
+    "progress_bar",
+    "say",
+    "verdict",
+    "write_json",
+]
 
 INTERRUPTED = 130  # what a shell reports for a command ended by ctrl-C: 128 + SIGINT
 
@@ -54,6 +69,28 @@ class Commands(TyperGroup):
                 "[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on."
             )
             raise typer.Exit(INTERRUPTED) from None
+
+
+def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "read"] = "write") -> TactileLearner:
+    """A memory, or a new one where there is nothing and a sensor is given. Raises what `TactileLearner.open` raises."""
+    from scroll_tactile.learner import TactileLearner
+
+    try:
+        return TactileLearner.open(path, sensor=sensor, mode=mode)
+    except NotAStoreError as error:
+        if path.is_file() or mode == "read":
+            raise
+        raise InputError(f"{error}. To make a new memory, say whose readings these are, with --sensor") from error
+
+
+def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
+    """A memory of any embedding, for all that needs none: showing, retracting, merging, compacting, exporting."""
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.memory.identity import AbsentEmbedding, Identity
+
+    with Store.open(path, mode="read") as store:
+        identity = Identity.read(store)
+    return TactileLearner.open(path, embedding=AbsentEmbedding(identity), mode=mode)
 
 
 def percent(share: float) -> str:

@@ -1,4 +1,4 @@
-"""`scroll-tactile memory …`: checking, mending, shrinking, merging and taking back."""
+"""`scroll-tactile memory …`: checking, repairing, compacting, merging and retracting."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from scroll_tactile.cli.terminal import Commands, progress_bar, say
+from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.pipelines.memories import open_for_upkeep
-from scroll_tactile.pipelines.plain_export import export_plain
 from store import StoreError, check_store, repair_store
 
 __all__ = ["memory"]
@@ -25,7 +23,7 @@ MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", 
 
 
 class Shared(StrEnum):
-    """How streams that both memories felt are counted."""
+    """How streams that both memories observed are counted."""
 
     ONCE = "once"
     TWICE = "twice"
@@ -55,7 +53,7 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 def repair(folder: MemoryFolder) -> None:
     """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
     # Where it can still be opened, what it knows is written down first: a repair may give up what led to it.
-    with suppress(ScrollTactileError, StoreError), open_for_upkeep(folder):
+    with suppress(ScrollTactileError, StoreError), opened_for_upkeep(folder):
         pass
     with progress_bar() as progress:
         done = repair_store(folder, progress=progress)
@@ -70,11 +68,11 @@ def repair(folder: MemoryFolder) -> None:
 @memory.command()
 def compact(
     folder: MemoryFolder,
-    keep: Annotated[int, typer.Option(min=0, help="The newest so many observations can still be taken back.")] = 0,
+    keep: Annotated[int, typer.Option(min=0, help="The newest so many observations can still be retracted.")] = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
-    """Give up the features of old observations for space: they stay learned, and cannot be taken back any more."""
-    with open_for_upkeep(folder) as learner:
+    """Give up the features of old observations for space: they stay learned, and can no longer be retracted."""
+    with opened_for_upkeep(folder) as learner:
         felt = sum(learner.materials.values())
         question = f"Of {felt} observations only the newest {keep} can be retracted or forgotten afterwards. Go on?"
         if not yes and not typer.confirm(question):
@@ -90,7 +88,9 @@ def export(
     target: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
 ) -> None:
     """Write all that a memory holds as CSV, JSON and NumPy files, which need no scroll-tactile to be read."""
-    with open_for_upkeep(folder, mode="read") as learner, progress_bar() as progress:
+    from scroll_tactile.pipelines.plain_export import export_plain
+
+    with opened_for_upkeep(folder, mode="read") as learner, progress_bar() as progress:
         export_plain(learner, target, progress)
     say(f"written: {escape(str(target))}")
 
@@ -100,11 +100,11 @@ def retract(
     folder: MemoryFolder,
     observation: Annotated[int, typer.Argument(help="Its number, as observe and export tell it.", show_default=False)],
 ) -> None:
-    """Take one observation back, exactly, as if it had never been felt."""
-    with open_for_upkeep(folder) as learner:
+    """Take one observation out again, exactly, as if it had never been made."""
+    with opened_for_upkeep(folder) as learner:
         learner.retract(observation)
         left = sum(learner.materials.values())
-    say(f"observation {observation} was taken back; {left} are left")
+    say(f"observation {observation} was retracted; {left} are left")
 
 
 @memory.command()
@@ -112,22 +112,22 @@ def forget(
     folder: MemoryFolder,
     material: Annotated[str, typer.Argument(help="Its name.", show_default=False)],
 ) -> None:
-    """Take back all observations of a material, exactly, as if it had never been felt."""
-    with open_for_upkeep(folder) as learner:
+    """Retract all observations of a material, exactly, as if it had never been touched."""
+    with opened_for_upkeep(folder) as learner:
         count = learner.forget(material)
         left = len(learner.materials)
-    say(f"{escape(material)}: {count} observations were taken back; {left} materials are left")
+    say(f"{escape(material)}: {count} observations were retracted; {left} materials are left")
 
 
 @memory.command()
 def merge(
     folder: MemoryFolder,
     other: Annotated[Path, typer.Argument(help="The memory that comes in; it stays as it is.", show_default=False)],
-    shared: Annotated[Shared, typer.Option(help="How a stream that both felt is counted.", show_default=False)],
+    shared: Annotated[Shared, typer.Option(help="How a stream that both observed is counted.", show_default=False)],
 ) -> None:
-    """Make a memory the one that felt all that both did, exactly."""
-    with open_for_upkeep(folder) as learner, progress_bar() as progress:
+    """Make a memory the one that observed all that both did, exactly."""
+    with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, shared=shared.value, progress=progress)
         digest, felt = learner.digest(), sum(learner.materials.values())
-    say(f"{done.observations} observations came in; {done.shared} streams were felt by both; {felt} are there now")
+    say(f"{done.observations} observations came in; {done.shared} streams were observed by both; {felt} are there now")
     say(f"[bold]digest:[/] {digest}")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile import Kernels
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, ask, observe_all
 from scroll_tactile.pipelines.runfile import RunFile

@@ -6,12 +6,11 @@ import json
 import numpy as np
 import pytest
 from commands import refused, run
+from scroll_tactile.pipelines.memories import open_for_upkeep
 from test_learner_machine import PAD, SETTINGS, fed, require_same, stream
 
-from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.embeddings import ModuleEmbedding
+from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.pipelines.memories import open_for_upkeep
 from scroll_tactile.pipelines.plain_export import export_plain
 from store import Store
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, check_embedding, sensors
+from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, sensors
 from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
 from scroll_tactile.embeddings.frames import LIGHT, STRENGTHS, SURFACE, light, surface
 from scroll_tactile.embeddings.resnet import ResNet
@@ -19,6 +19,7 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.testing import check_embedding
 
 GEL = Gel()
 NETWORK = ResNet.random(0).state_dict()

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import TactileLearner, sensors
+from scroll_tactile import Joined, Kernels, Maps, TactileLearner, Vision, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Joined, Kernels, Maps, Vision
 from scroll_tactile.errors import InputError
 from scroll_tactile.testing import check_embedding
 

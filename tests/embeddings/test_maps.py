@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import Maps, check_embedding
+from scroll_tactile import Maps
 from scroll_tactile.errors import InputError
+from scroll_tactile.testing import check_embedding
 
 
 def pressed(places, columns=60, layout=(6, 7)):

@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from scroll_tactile import TactileLearner, sensors
+from scroll_tactile import Capabilities, Embedding, Kernels, ModuleEmbedding, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Capabilities, Embedding, Kernels, ModuleEmbedding
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.testing import check_embedding
 

@@ -10,9 +10,8 @@ import pytest
 
 from scroll_tactile import Frames, Joined, Kernels, Maps, Robust, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import embed_windows
 from scroll_tactile.embeddings.banks import bank
-from scroll_tactile.embeddings.protocol import window_plan
+from scroll_tactile.embeddings.protocol import embed_windows, window_plan
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.statistics.grid import to_codes
 

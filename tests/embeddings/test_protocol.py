@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import Frames, Kernels, TactileLearner, check_embedding, sensors
-from scroll_tactile.embeddings import Capabilities, embed_windows
-from scroll_tactile.embeddings.protocol import capabilities_of, parts_of, require_rest, window_plan
+from scroll_tactile import Capabilities, Frames, Kernels, TactileLearner, sensors
+from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, require_rest, window_plan
 from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.testing import check_embedding
 
 
 class Plain:

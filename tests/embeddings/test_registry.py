@@ -251,7 +251,7 @@ def test_torch_is_not_imported_before_something_is_embedded():
 import sys, types
 package = types.ModuleType("scroll_tactile"); package.__path__ = [sys.argv[1]]  # its own __init__ is another's
 sys.modules["scroll_tactile"] = package
-from scroll_tactile.embeddings import Frames, Joined, Kernels, Maps, Robust
+from scroll_tactile import Frames, Joined, Kernels, Maps, Robust
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration
 import scroll_tactile.datasets.simulator, scroll_tactile.datasets.gel, scroll_tactile.testing
 for embedding in (Kernels(), Frames(), Robust(), Maps(layout=(3,)), Joined(Kernels(), Kernels(seed=2))):

@@ -7,9 +7,8 @@ import pytest
 from test_copies import contents
 from test_learner_machine import PAD, stream
 
-from scroll_tactile import Augmented, Kernels, TactileLearner, sensors
+from scroll_tactile import Augmented, Kernels, Robust, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Robust
 from scroll_tactile.embeddings.robust import is_noisy, noisy_statistics
 from scroll_tactile.errors import EmbeddingMismatchError, InputError
 from scroll_tactile.pipelines.robustness import dead, noise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile.embeddings import Vision
+from scroll_tactile import Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import make_runtime, steady
 from scroll_tactile.errors import InputError

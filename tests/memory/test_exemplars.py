@@ -13,8 +13,7 @@ from examples.benchmarks.buffers import compare
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarSample, herd, mean_code, quotas, rank
-from scroll_tactile.memory.identity import identity_of
-from scroll_tactile.memory.state import Capacity
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.signals.windows import Scale
 from store import Store
 
@@ -234,7 +233,7 @@ def test_a_sample_that_could_hold_nothing_is_refused(wrong):
 def test_a_memory_that_0_1_made_with_a_limit_in_bytes_opens_with_its_count_or_the_usual_one(kept, size, tmp_path):
     pad = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
     embedding = Kernels(dimension=64)
-    Store.open(tmp_path, identity=identity_of(pad, embedding, Capacity()) | {"exemplars": kept}).close()
+    Store.open(tmp_path, identity=Identity.of(pad, embedding, None).to_json() | {"exemplars": kept}).close()
     with TactileLearner.open(tmp_path, embedding=embedding) as learner:
         for seed in range(6):
             learner.observe("ab"[seed % 2], np.random.default_rng(seed).random((50, 2)))

@@ -8,7 +8,7 @@ from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, Str
 from examples.paper.studies.peers_replay import GDumb, Replaying, fit_softmax
 from scroll_tactile import Kernels, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import embed_windows
+from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.image import tactile_image
 

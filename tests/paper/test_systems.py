@@ -19,8 +19,8 @@ from examples.paper.systems.spikes import decode, encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
+from scroll_tactile import Vision
 from scroll_tactile.datasets.physiclear import HALF_SIZE
-from scroll_tactile.embeddings import Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError, TrainingError
 from scroll_tactile.pipelines.classification import Labelled

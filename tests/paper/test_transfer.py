@@ -18,9 +18,9 @@ from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, Shar
 from examples.paper.transfer.few_touches import WidestFeatures, WidestReadout, draw_touches, feeler_maker, few_touches
 from examples.paper.transfer.shared_features import SharedFeatures
 from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, some_frames
+from scroll_tactile import Kernels, Vision
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.physiclear import HALF_SIZE
-from scroll_tactile.embeddings import Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.learner import TactileLearner

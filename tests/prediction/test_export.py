@@ -6,9 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from scroll_tactile import Kernels, Sensor, TactileLearner, Vision, sensors
+from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Joined
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.onnx_export import export_onnx
 from scroll_tactile.signals.image import tactile_image

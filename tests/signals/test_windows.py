@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from scroll_tactile.embeddings import Frames
+from scroll_tactile import Frames
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
 from scroll_tactile.signals.windows import MOST_WINDOWS, Scale, extent, fitting, milestones, scales, scored, stages

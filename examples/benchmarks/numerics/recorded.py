@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from examples.benchmarks.numerics.cases import Case
+from scroll_tactile import Kernels
 from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import DatasetError
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.statistics.grid import BITS, to_codes

@@ -16,9 +16,9 @@ from examples.paper.commands.sets import Dataset, command_line, draw_into, origi
 from examples.paper.plots import draw_continual
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
+from scroll_tactile import Embedding, Joined, Kernels, Vision
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.continual import summary
 

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import require_data
 from examples.paper.studies.replay import Progress
+from scroll_tactile import Embedding, Kernels
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import mean_and_spread

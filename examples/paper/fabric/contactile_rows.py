@@ -15,7 +15,7 @@ from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
 from examples.paper.systems.networks import ResNetClassifier
-from scroll_tactile.embeddings import Embedding, Joined, Kernels, Vision
+from scroll_tactile import Embedding, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.finetune.training import Progress

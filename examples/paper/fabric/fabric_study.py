@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
 from examples.paper.studies.replay import Progress
+from scroll_tactile import Embedding, Maps
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.fabric_slide import CPM_RATIOS, Slides, ratios
 from scroll_tactile.datasets.letter_spike import DOTS, GRID, dots_of, letter_folds
-from scroll_tactile.embeddings import Embedding, Maps
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.fabric import score, score_compositions

@@ -23,8 +23,9 @@ from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import data_digest
 from examples.paper.runs.study import weights_digest
 from examples.paper.studies.replay import Progress
+from scroll_tactile import Embedding, Frames
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Frames, embed_windows
+from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread

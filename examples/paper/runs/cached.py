@@ -27,7 +27,7 @@ class Cached:
     embedding: the wrapped one. All its other attributes, such as a network to be tuned, are found here too.
 
     >>> import numpy as np
-    >>> from scroll_tactile.embeddings import Kernels
+    >>> from scroll_tactile import Kernels
     >>> cached = Cached(Kernels(dimension=64))
     >>> image = np.zeros((19, 400), dtype=np.float32)
     >>> cached.embed_windows(image, {300: [0, 50]})[300].shape, cached.held

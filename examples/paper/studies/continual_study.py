@@ -19,8 +19,8 @@ from examples.paper.runs.cached import Cached
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
+from scroll_tactile import Embedding
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings import Embedding, embed_windows
+from scroll_tactile import Embedding
+from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, ask, hold_out, observe_all

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cells import require_data
+from scroll_tactile import Embedding, Robust
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Embedding, Robust
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all

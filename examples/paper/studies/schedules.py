@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scroll_tactile.embeddings import Kernels
+from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled

@@ -19,7 +19,7 @@ from examples.paper.systems.spikes import encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import Make, TrainedNetwork
-from scroll_tactile.embeddings import Embedding, Frames, Joined, Kernels, Vision
+from scroll_tactile import Embedding, Frames, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError

@@ -8,7 +8,7 @@ import numpy as np
 
 from examples.paper.systems.constituent_squares import Shares, Told
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
-from scroll_tactile.embeddings import Embedding
+from scroll_tactile import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner

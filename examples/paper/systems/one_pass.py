@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
-from scroll_tactile.embeddings import Embedding
+from scroll_tactile import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner

@@ -21,8 +21,8 @@ from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
 from examples.paper.transfer.few_touches import Feeler, draw_touches, feeler_maker, few_touches
 from examples.paper.transfer.shared_features import Features, SharedFeatures
+from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.embeddings import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import mean_and_spread

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.systems.inputs import Image, average_columns
-from scroll_tactile.embeddings import Kernels
+from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image

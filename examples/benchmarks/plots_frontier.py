@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from examples.paper.drawing import available
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.drawing import available
 
 __all__ = ["draw_frontier"]
 

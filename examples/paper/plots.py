@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.drawing import picture
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.drawing import picture
 
 __all__ = [
     "draw_activation",

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.live import Live
 from rich.table import Table
 
 from scroll_tactile.cli.terminal import confusion_text, console, percent, say, verdict
-from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines import drawing as plots
-from scroll_tactile.pipelines.demo import Demo, Outcome
-from scroll_tactile.recordings.arrays import read_sensor
+
+if TYPE_CHECKING:
+    from scroll_tactile.pipelines.demo import Demo, Outcome
 
 __all__ = ["demo"]
 
@@ -25,7 +24,6 @@ def demo(
         typer.Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated materials.")] = 0,
-    plot: Annotated[Path | None, typer.Option(help="Draw which material was taken for which into this PNG.")] = None,
     sensor: Annotated[str, typer.Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
     features: Annotated[
         int, typer.Option(min=64, help="Features of the embedding: fewer than the usual 1008, which take longer.")
@@ -36,10 +34,13 @@ def demo(
 ) -> None:
     """Ten seconds of learning: twenty simulated materials, one by one, nothing forgotten.
 
-    After each material it is asked about touches it never felt of all materials met so far. In the end it is asked
+    After each material it is asked about held-out touches of all materials met so far. In the end it is asked
     about materials it has never met, and about the first 0.3 s of a touch. No data is needed, and nothing is kept
     unless you give --memory.
     """
+    from scroll_tactile.pipelines.demo import Demo
+    from scroll_tactile.recordings.arrays import read_sensor
+
     task = Demo(
         read_sensor(sensor),
         seed,
@@ -49,7 +50,6 @@ def demo(
         features=features,
         folder=memory,
     )
-    _require_folder(plot)
     say(
         f"[bold]Simulated[/] {task.sensor.name} touches, seed {seed}: the names are only names, and nothing here is a "
         f"result.\nEach material is learned from {touches} touches and tested on {held_out} others, "
@@ -63,16 +63,11 @@ def demo(
         )
     if not screen.is_terminal:
         screen.print(table)
-    _report(task, outcome, plot)
+    _report(task, outcome)
 
 
-def _require_folder(plot: Path | None) -> None:
-    if plot is not None and not plot.absolute().parent.is_dir():
-        raise InputError(f"expected --plot in a folder that exists; {plot.absolute().parent} does not")
-
-
-def _report(task: Demo, outcome: Outcome, plot: Path | None) -> None:
-    _show_confusions(task, outcome, plot)
+def _report(task: Demo, outcome: Outcome) -> None:
+    _show_confusions(task, outcome)
     forgotten = outcome.forgotten()
     say(
         "[bold]forgot:[/] "
@@ -90,18 +85,11 @@ def _report(task: Demo, outcome: Outcome, plot: Path | None) -> None:
         say(f"kept: try  scroll-tactile inspect {task.folder / 'memory'}")
 
 
-def _show_confusions(task: Demo, outcome: Outcome, plot: Path | None) -> None:
+def _show_confusions(task: Demo, outcome: Outcome) -> None:
+    from scroll_tactile.pipelines.metrics import confusion_counts
+
     names = [step.material for step in outcome.steps]
     confusions = outcome.answers.confusions()
-    counts = plots.confusion_counts(names, [task.held_out] * len(names), confusions)
-    if plot is not None and plots.available():
-        curve = [(at + 1, step.all) for at, step in enumerate(outcome.steps)]
-        title = f"Simulated {task.sensor.name}, not a result"
-        plots.draw(plot, names, counts, title=title, curve=curve)
-        say(f"plot: {plot}")
-    else:
-        if plot is not None:
-            say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]"). As text:')
-        say(confusion_text(names, counts))
-    worst = "; ".join(f"{truth} taken for {said} {count}×" for truth, said, count in confusions[:3])
+    say(confusion_text(names, confusion_counts(names, [task.held_out] * len(names), confusions)))
+    worst = "; ".join(f"{truth} taken for {predicted} {count}×" for truth, predicted, count in confusions[:3])
     say(f"[bold]worst confusions:[/] {worst or 'none'} (of {len(outcome.answers.truth)} touches)")

@@ -84,4 +84,4 @@ def compose(
             escape(constituent.name), there, share, escape(constituent.evidence[0][0]) if constituent.evidence else ""
         )
     console().print(table)
-    say(f"a material never felt: {percent(made_of.unfamiliar)}")
+    say(f"a material never observed: {percent(made_of.unfamiliar)}")

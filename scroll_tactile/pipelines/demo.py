@@ -32,7 +32,7 @@ class Outcome:
     """How a demonstration ended.
 
     answers: to the held-out touches of all materials. steps: accuracy after each material.
-    novel: material of another scene → what was said to a touch of it. short: the same for 0.3 s of known ones.
+    novel: material of another scene → the answer to a touch of it. short: the same for 0.3 s of known ones.
     observed: how many touches this run observed; a resumed one fewer. digest: of the memory.
     """
 
@@ -54,7 +54,7 @@ class Demo:
     """A demonstration: a sensor, a seed, and how many materials and touches.
 
     sensor: any but a camera. seed: of the scene. materials: how many, at most twenty. touches: learned of each.
-    held_out: touches of each that are only asked about. features: of the embedding; the usual 1008 take three times
+    held_out: touches of each that are only evaluated. features: of the embedding; the usual 1008 take three times
     as long to fit a readout to, and here twenty are fitted. folder: where the memory is kept, None for nowhere.
     """
 
@@ -71,7 +71,7 @@ class Demo:
         object.__setattr__(self, "scene", Scene(self.sensor, self.seed))
 
     def run(self, tell: Callable[[Step], object] = lambda step: None) -> Outcome:
-        """Learn and ask; `tell` hears of every material when it is learned, those of an interrupted run first.
+        """Learn and evaluate; `tell` is called with each material once it is learned, again after a restart.
 
         A run with a folder that was interrupted, in whatever way, goes on where it was.
 
@@ -96,24 +96,24 @@ class Demo:
 
     def _learn(self, learner: TactileLearner, notes: RunFile, tell: Callable[[Step], object]) -> Outcome:
         steps: list[Step] = []
-        lessons: list[Labelled] = []
-        exam: list[Labelled] = []
+        train: list[Labelled] = []
+        test: list[Labelled] = []
         observed = 0
         answers = Answers([], [])
         for name in self.scene.materials[: self.materials]:
-            lessons += self._touches(name, 0, self.touches)
-            exam += self._touches(name, self.touches, self.held_out)
+            train += self._touches(name, 0, self.touches)
+            test += self._touches(name, self.touches, self.held_out)
             kept = notes.notes.get(name)
             if kept is None:
-                observed += observe_all(learner, lessons)
-                answers = ask(learner, exam)
+                observed += observe_all(learner, train)
+                answers = ask(learner, test)
                 kept = {"own": answers.of(name).accuracy, "all": answers.accuracy}
                 notes.note(name, kept)
             steps.append(Step(name, kept["own"], kept["all"]))
             tell(steps[-1])
-        if len(answers.truth) < len(exam):  # a finished run was started again
-            observed += observe_all(learner, lessons)
-            answers = ask(learner, exam)
+        if len(answers.truth) < len(test):  # a finished run was started again
+            observed += observe_all(learner, train)
+            answers = ask(learner, test)
         return Outcome(answers, steps, self._novel(learner), self._short(learner), observed, learner.digest())
 
     def _touches(self, name: str, first: int, count: int) -> list[Labelled]:

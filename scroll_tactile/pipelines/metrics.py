@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["accuracy", "auroc", "calibration_error", "mean_and_spread"]
+__all__ = ["accuracy", "auroc", "calibration_error", "confusion_counts", "mean_and_spread"]
 
 
 def accuracy(truth: Sequence[str | None], said: Sequence[str | None]) -> float:
@@ -76,3 +76,18 @@ def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
 def _require_pairs(expected: int, came: int) -> None:
     if expected != came or not expected:
         raise InputError(f"expected as many answers as truths, and at least one; came {came} and {expected}")
+
+
+def confusion_counts(
+    names: Sequence[str], tested: Sequence[int], confusions: Sequence[tuple[str, str, int]]
+) -> np.ndarray:
+    """Counts of (truth, predicted), shape (C, C), from the wrong answers.
+
+    names: C materials. tested: touches of each. confusions: (truth, predicted, count) with predicted ≠ truth.
+    """
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.diag(np.asarray(tested, dtype=np.int64))
+    for truth, predicted, count in confusions:
+        counts[place[truth], place[predicted]] += count
+        counts[place[truth], place[truth]] -= count
+    return counts

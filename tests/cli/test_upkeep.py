@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 from commands import refused, run
-from scroll_tactile.pipelines.memories import open_for_upkeep
 from test_learner_machine import PAD, SETTINGS, fed, require_same, stream
 
 from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
+from scroll_tactile.cli.terminal import opened_for_upkeep
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
 from store import Store
@@ -185,7 +185,7 @@ class TestAnyEmbedding:
         assert words(run("memory", "compact", tmp_path / "n", "--yes"))
         with TactileLearner.open(tmp_path / "n", sensor=PAD, embedding=embedding) as learner:
             assert learner.digest() == digest
-        with open_for_upkeep(tmp_path / "n") as learner, pytest.raises(MismatchError, match="without its embedding"):
+        with opened_for_upkeep(tmp_path / "n") as learner, pytest.raises(MismatchError, match="without its embedding"):
             learner.observe("a", stream((0, 60)))
 
     def test_another_programs_store_is_refused(self, tmp_path):

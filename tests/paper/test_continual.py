@@ -236,7 +236,7 @@ class TestCommand:
         assert [fold["tuned"] for fold in kept] == [fold["tuned"] for fold in found["folds"]]
 
     def test_without_matplotlib_it_says_so(self, simulated: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("scroll_tactile.pipelines.drawing.available", lambda: False)
+        monkeypatch.setattr("examples.paper.drawing.available", lambda: False)
         result = run(*simulated, "--sizes", "0", "--no-peers", "--folds", "0", "--curve", 0, "--plot", "p.png")
         assert result.exit_code == 0, result.output
         assert 'pip install "scroll-tactile[plots]"' in result.stdout

@@ -7,13 +7,13 @@ import pytest
 from commands import refused, run
 from test_perturbations import PAD
 
+from examples.paper import drawing as plots
 from examples.paper.plots import draw_robustness, robustness_curves
 from examples.paper.studies.robustness_study import Robustness, ours, summary, worst
 from scroll_tactile import Kernels, Robust
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import DatasetError, InputError
-from scroll_tactile.pipelines import drawing as plots
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import validate
 

@@ -11,9 +11,7 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
-from scroll_tactile.pipelines.drawing import confusion_counts
-from scroll_tactile.pipelines.memories import open_memory
-from scroll_tactile.pipelines.metrics import accuracy, auroc, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy, auroc, calibration_error, confusion_counts, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 
 
@@ -145,5 +143,5 @@ def test_kernels_of_another_size_are_found_again(tmp_path: Path) -> None:
     with TactileLearner.open(tmp_path / "m", sensor=sensors.BIOTAC, embedding=Kernels(dimension=64)) as learner:
         learner.observe("silk", Scene(sensors.BIOTAC).touch("silk", 0))
         digest = learner.digest()
-    with open_memory(tmp_path / "m") as learner:
+    with TactileLearner.open(tmp_path / "m") as learner:
         assert learner.digest() == digest

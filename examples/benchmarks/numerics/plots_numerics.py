@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.drawing import available
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.drawing import available
 
 __all__ = ["draw_numerics", "points"]
 

@@ -10,12 +10,13 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from examples.paper import drawing as plots
 from examples.paper.commands.options import Data, FewMaterials, Folds, Json, Plot, Run, Seed
 from examples.paper.commands.sets import Dataset, command_line, draw_into, origin, parse_folds, read, require_folders
 from examples.paper.studies.replay import FIGURES, PUBLISHED, Replay, subset, summary
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.pipelines import drawing as plots
+from scroll_tactile.pipelines.metrics import confusion_counts
 
 __all__ = ["replay"]
 
@@ -137,5 +138,5 @@ def _plot(plot: Path, recordings: Recordings, results: Sequence[Mapping[str, Any
     names = list(dict.fromkeys(recordings.materials))
     confusions = [(truth, predicted, count) for (truth, predicted), count in _confusions(results).items()]
     tested = [sum(result["tested_of"].get(name, 0) for result in results) for name in names]
-    counts = plots.confusion_counts(names, tested, confusions)
+    counts = confusion_counts(names, tested, confusions)
     draw_into(plot, lambda file: plots.draw(file, names, counts, title=recordings.name))

@@ -12,11 +12,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+from examples.paper import drawing
 from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines import drawing
 
 __all__ = [
     "Dataset",

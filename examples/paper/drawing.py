@@ -12,7 +12,7 @@ import numpy as np
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["available", "confusion_counts", "draw", "picture"]
+__all__ = ["available", "draw", "picture"]
 
 
 def available() -> bool:
@@ -38,21 +38,6 @@ def picture(path: Path, width: float, height: float, dots: int = 120) -> Iterato
         figure.savefig(path, dpi=dots)
     except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
         raise InputError(f"the plot cannot be written to {path}: {error}") from error
-
-
-def confusion_counts(
-    names: Sequence[str], tested: Sequence[int], confusions: Sequence[tuple[str, str, int]]
-) -> np.ndarray:
-    """Counts of (truth, predicted), shape (C, C), from the wrong answers.
-
-    names: C materials. tested: touches of each. confusions: (truth, predicted, count) with predicted ≠ truth.
-    """
-    place = {name: i for i, name in enumerate(names)}
-    counts = np.diag(np.asarray(tested, dtype=np.int64))
-    for truth, predicted, count in confusions:
-        counts[place[truth], place[predicted]] += count
-        counts[place[truth], place[truth]] -= count
-    return counts
 
 
 def draw(

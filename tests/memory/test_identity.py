@@ -1,0 +1,233 @@
+"""What a memory says of its making: it opens from its path alone, with nothing embedded before the first touch."""
+
+import copy
+import json
+import pickle
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from scroll_tactile import Augmented, Joined, Kernels, Maps, Robust, Sensor, TactileLearner, Vision
+from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
+from scroll_tactile.memory.identity import Identity
+from store import DamageError, Store
+
+PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+EMBEDDINGS = {
+    "kernels": lambda: Kernels(dimension=64),
+    "seeded kernels": lambda: Kernels(dimension=64, seed=3),
+    "joined": lambda: Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1)),
+    "maps": lambda: Maps(layout=(3,)),
+    "robust": lambda: Robust(Kernels(dimension=64)),
+}
+
+
+class Means:
+    """An embedding of a user's own: the mean of each channel."""
+
+    name, dimension, bound, fingerprint = "means", 3, 1.0, "00" * 32
+
+    def embed(self, image):
+        return image.mean(axis=1)
+
+
+def touch(seed, readings=60):
+    return np.random.default_rng(seed).random((readings, 3))
+
+
+def filled(path, **settings):
+    learner = TactileLearner.open(path, sensor=PAD, **settings)
+    for seed in range(6):
+        learner.observe("ab"[seed % 2], touch(seed))
+    return learner
+
+
+@pytest.fixture(params=EMBEDDINGS)
+def memory(request, tmp_path):
+    """The folder of a memory, its digest, and its answer to a touch."""
+    augmentation = Augmented(copies=0, noisy=2) if request.param == "robust" else None
+    with filled(tmp_path / "m", embedding=EMBEDDINGS[request.param](), augmentation=augmentation) as learner:
+        return tmp_path / "m", learner.digest(), learner.predict(touch(9))
+
+
+def test_a_memory_opens_from_its_path_alone(memory):
+    path, digest, answer = memory
+    with TactileLearner.open(path) as learner:
+        assert (learner.digest(), learner.predict(touch(9))) == (digest, answer)
+        learner.observe("c", touch(10))
+
+
+@pytest.mark.parametrize("kind", ["kernels", "robust"])
+def test_a_memory_made_before_configurations_were_kept_opens_alone_too(tmp_path, kind):
+    embedding = EMBEDDINGS[kind]()
+    prepare(tmp_path / "m", embedding, lambda identity: identity["embedding"].pop("configuration"))
+    with filled(tmp_path / "m", embedding=embedding) as learner:
+        digest, answer = learner.digest(), learner.predict(touch(9))
+    with TactileLearner.open(tmp_path / "m") as learner:
+        assert (learner.digest(), learner.predict(touch(9))) == (digest, answer)
+    assert json.loads(run("inspect", tmp_path / "m", "--json").stdout)["digest"] == digest
+
+
+def test_a_memory_of_settings_that_nobody_noted_is_still_inspected(tmp_path):
+    embedding = Kernels(dimension=64, seed=3)
+    prepare(tmp_path / "m", embedding, lambda identity: identity["embedding"].pop("configuration"))
+    with filled(tmp_path / "m", embedding=embedding) as learner:
+        digest = learner.digest()
+    with pytest.raises(EmbeddingMismatchError, match="pass the one that made it"):
+        TactileLearner.open(tmp_path / "m")
+    assert json.loads(run("inspect", tmp_path / "m", "--json").stdout)["digest"] == digest
+
+
+def test_the_command_line_works_on_all_of_them(memory, tmp_path):
+    path, digest, answer = memory
+    np.save(tmp_path / "t.npy", touch(9))
+    assert json.loads(run("inspect", path, "--json").stdout)["digest"] == digest
+    assert json.loads(run("predict", path, tmp_path / "t.npy", "--json").stdout)["material"] == answer.material
+    assert run("observe", path, "new", tmp_path / "t.npy").exit_code == 0
+    assert json.loads(run("inspect", path, "--json").stdout)["materials"] == {"a": 3, "b": 3, "new": 1}
+
+
+def test_a_network_says_what_is_missing(tmp_path):
+    with filled(tmp_path / "m", embedding=Vision(weights=None, seed=0)) as learner:
+        digest = learner.digest()
+    with TactileLearner.open(tmp_path / "m") as learner:  # random weights are made again from their seed
+        assert learner.digest() == digest
+        learner.predict(touch(1))
+
+
+def test_inspecting_embeds_nothing_and_imports_no_torch(tmp_path):
+    filled(tmp_path / "m").close()
+    code = (
+        "import sys; from scroll_tactile.cli import app\n"
+        "try: app(['inspect', sys.argv[1], '--json'])\n"
+        "except SystemExit: pass\n"
+        "print('torch' in sys.modules)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "m")]
+    output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
+    assert json.loads(output[0])["materials"] == {"a": 3, "b": 3}
+    assert output[1] == "False"
+
+
+class TestOwnEmbedding:
+    def test_it_is_named_with_what_to_pass(self, tmp_path):
+        filled(tmp_path / "m", embedding=Means()).close()
+        with pytest.raises(EmbeddingMismatchError, match=r"'means' .*pass the one that made it.*embedding="):
+            TactileLearner.open(tmp_path / "m")
+        with TactileLearner.open(tmp_path / "m", embedding=Means()) as learner:
+            assert learner.predict(touch(0)).material == "a"
+
+    def test_what_needs_no_embedding_works_without(self, tmp_path):
+        filled(tmp_path / "m", embedding=Means()).close()
+        assert run("inspect", tmp_path / "m").exit_code == 0
+        assert run("memory", "retract", tmp_path / "m", 1).exit_code == 0
+        np.save(tmp_path / "t.npy", touch(9))
+        assert "pass the one that made it" in refused("predict", tmp_path / "m", tmp_path / "t.npy")
+
+
+def test_another_embedding_under_the_same_configuration_is_found_out_at_the_first_touch(tmp_path):
+    # As if a later version embedded otherwise.
+    prepare(tmp_path / "m", Kernels(), lambda identity: identity["embedding"].update(fingerprint="ab" * 32))
+    with TactileLearner.open(tmp_path / "m") as learner:
+        assert learner.materials == {}
+        for use in (learner.predict, lambda stream: learner.observe("a", stream)):
+            with pytest.raises(EmbeddingMismatchError, match="Features of one mean nothing to the other"):
+                use(touch(0))
+        assert learner.materials == {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sensor": "x"},
+        {"embedding": {}},
+        {"grid": None},
+        {"embedding": {"name": "kernels", "dimension": "x", "bound": 1.0, "fingerprint": "00"}},
+        {"exemplars": "abc"},
+        {"augmentation": {"copies": -1}},
+    ],
+)
+def test_an_identity_that_is_none_is_damage(tmp_path, change):
+    prepare(tmp_path / "m", Kernels(), lambda identity: identity.update(change))
+    with pytest.raises(DamageError, match=r"identity of .* cannot be read"):
+        TactileLearner.open(tmp_path / "m")
+
+
+class TestSnapshots:
+    def test_a_learner_pickles_into_another_process(self, tmp_path):
+        with filled(tmp_path / "m") as learner:
+            (tmp_path / "learner").write_bytes(pickle.dumps(learner))
+            answer = repr(learner.predict(touch(9)))
+            digest = learner.digest()
+        code = (
+            "import pickle, sys, numpy as np; learner = pickle.loads(open(sys.argv[1], 'rb').read())\n"
+            "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 3)))); print(learner)"
+        )
+        words = [sys.executable, "-c", code, str(tmp_path / "learner")]
+        output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
+        assert output[:2] == [digest, answer]
+        assert output[2] == f"<TactileLearner in memory, a snapshot of {tmp_path / 'm'}, pad, 2 materials>"
+
+    def test_a_copy_knows_what_was_known_and_goes_its_own_way(self, tmp_path):
+        with filled(tmp_path / "m") as learner:
+            twin = copy.deepcopy(learner)
+            assert twin.path is None
+            assert (twin.digest(), twin.exemplars) == (learner.digest(), learner.exemplars)
+            twin.observe("c", touch(7))
+            assert learner.materials == {"a": 3, "b": 3}
+            learner.observe("c", touch(7))
+            assert twin.digest() == learner.digest()
+            with pytest.raises(InputError, match="keeps no journal"):
+                twin.retract(1)
+
+    def test_settings_travel(self):
+        learner = TactileLearner(sensor=PAD, embedding=Means(), readout="ridge", exemplars=7)
+        assert pickle.loads(pickle.dumps(learner)).settings == learner.settings
+
+
+def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
+    filled(tmp_path / "new").close()
+    prepare(tmp_path / "old", Kernels(), lambda identity: identity["embedding"].pop("configuration"))
+    filled(tmp_path / "old").close()
+    with TactileLearner.open(tmp_path / "new") as learner:
+        assert learner.merge(tmp_path / "old", shared="twice").observations == 6
+    filled(tmp_path / "other", embedding=Kernels(dimension=64)).close()
+    with TactileLearner.open(tmp_path / "new") as learner, pytest.raises(MismatchError, match="embeddings differ"):
+        learner.merge(tmp_path / "other", shared="twice")
+
+
+def test_an_answer_is_of_one_state(tmp_path):
+    """While another thread observes, every answer is one that the memory gave between two of its observations."""
+    learner = TactileLearner(sensor=PAD, embedding=Robust(Kernels(dimension=64)), augmentation=Augmented(copies=1))
+    for seed in range(4):
+        learner.observe("ab"[seed % 2], touch(seed))
+    broken = touch(9) * [1, 0, 1]  # a dead channel, which the memory fills in as it then is
+    states = {repr(learner.predict(broken))}
+    twin, stop = copy.deepcopy(learner), threading.Event()
+    for seed in range(10, 22):
+        twin.observe("ab"[seed % 2], touch(seed))
+        states.add(repr(twin.predict(broken)))
+    answers: list[str] = []
+
+    def ask():
+        while not stop.is_set():
+            answers.append(repr(learner.predict(broken)))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    for seed in range(10, 22):
+        learner.observe("ab"[seed % 2], touch(seed))
+    stop.set()
+    thread.join()
+    assert answers and set(answers) <= states
+
+
+def prepare(path, embedding, change):
+    """An empty memory whose identity is changed before anything is observed."""
+    identity = Identity.of(PAD, embedding, None).to_json()
+    change(identity)
+    Store.open(path, identity=identity).close()

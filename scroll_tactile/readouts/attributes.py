@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 from scipy.special import expit
 
 __all__ = ["GAMMAS", "Curve", "RidgeSystem", "fit_curve", "solve"]
@@ -98,5 +97,7 @@ def fit_curve(
 
     start = np.array([prior.slope, 0.0])
     bounds = [(0.0, None), (None, None) if turning else (0.0, 0.0)]
+    from scipy.optimize import minimize  # late, as in `calibration`
+
     slope, above = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x.tolist()
     return Curve(slope, above - slope * half)

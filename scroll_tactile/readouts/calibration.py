@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.shrinkage import Selection
@@ -151,6 +150,8 @@ def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray)
             slope += np.einsum("tsc,tc->s", gap, chances / total)
         pull = weights / prior - 1
         return value + PRIOR_TOUCHES * float(pull @ pull) / 2, slope + PRIOR_TOUCHES * pull / prior
+
+    from scipy.optimize import minimize  # a third of a second, that whoever only looks at a memory is spared
 
     fit = minimize(loss, prior, jac=True, bounds=[(0.0, None)] * len(prior), method="L-BFGS-B")
     fitted: FloatArray = fit.x

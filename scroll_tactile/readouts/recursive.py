@@ -114,7 +114,7 @@ class WoodburyReadout(RecursiveReadout):
         """
         new = self._columns(rows, place)
         first, last = self._rank, self._rank + len(new)
-        if last > len(self._u) or not self._counts[place]:
+        if last > len(self._u):
             return False
         before, count = self._counts[place], len(rows)
         solved = self._solve(new)
@@ -202,9 +202,7 @@ class RecursiveLeastSquares(RecursiveReadout):
         self._covariance, self._weights = np.asfortranarray(covariance), weights
 
     def add(self, rows: npt.NDArray[np.integer], place: int) -> bool:
-        """Take in rows of codes, shape (k, d), of the class at a place, one by one; False for one without rows."""
-        if not self._counts[place]:
-            return False
+        """Take in rows of codes, shape (k, d), of the class at a place, one by one; always True."""
         values = rows - self._origin
         targets = np.zeros(len(self._counts))
         targets[place] = 1.0

@@ -9,7 +9,6 @@ import pytest
 from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
 from scroll_tactile.errors import DescriptionError, MaterialError, SensorMismatchError
 from scroll_tactile.memory.descriptions import checked, targets_of
-from scroll_tactile.readouts.attributes import Curve, fit_curve, solve
 from scroll_tactile.signals.stream import validate
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
@@ -285,44 +284,3 @@ class TestDescribing:
         assert targets["viscose"].presence == {"felt": True, "tweed": False}
         assert targets["soft"].presence == {"felt": True, "stone": False}
         assert targets["silk"] == replace(targets["silk"], presence={}, share={})
-
-
-class TestHeads:
-    def test_without_a_material_is_as_if_it_had_never_been(self):
-        rng = np.random.default_rng(0)
-        means, targets = rng.normal(size=(7, 5)), rng.normal(size=7)
-        gram = means @ means.T
-        for place in range(7):
-            left = np.delete(np.arange(7), place)
-            # γ is a share of the diagonal's mean: the same ridge for both.
-            centred = [part - part.mean(axis=0) for part in (means, means[left])]
-            size, smaller = (np.square(part).sum() / len(part) for part in centred)
-            system = solve(gram, 0.1)
-            told = system.weights_without(system.weights(targets), place)
-            fresh = solve(gram[np.ix_(left, left)], 0.1 * size / smaller).weights(targets[left])
-            np.testing.assert_allclose(np.delete(told, place), fresh, atol=1e-9)
-            assert told[place] == 0
-
-    def test_it_is_ridge_regression_over_the_materials(self):
-        rng = np.random.default_rng(1)
-        means, targets = rng.normal(size=(6, 9)), rng.normal(size=6)
-        centred = means - means.mean(axis=0)
-        ridge = 0.3 * np.square(centred).sum() / 6
-        slope = np.linalg.solve(centred.T @ centred + ridge * np.eye(9), centred.T @ (targets - targets.mean()))
-        head = solve(means @ means.T, 0.3).weights(targets)
-        new = rng.normal(size=9)
-        expected = targets.mean() + (new - means.mean(axis=0)) @ slope
-        assert head[:-1] @ (means @ new) + head[-1] == pytest.approx(expected)
-
-    def test_a_curve_follows_the_touches_and_begins_at_its_prior(self):
-        prior = Curve(6.0, -3.0)
-        assert fit_curve([], [], prior) == prior
-        rng = np.random.default_rng(2)
-        at = rng.uniform(-1, 2, 4000)
-        true = rng.uniform(size=4000) < 1 / (1 + np.exp(-(3 * at - 1)))
-        curve = fit_curve(at, true, prior)
-        assert (curve.slope, curve.offset) == pytest.approx((3, -1), abs=0.3)
-        assert fit_curve(at, ~true, prior).slope == pytest.approx(0, abs=1e-6)  # never the wrong way round
-        steady = fit_curve(at, true, prior, turning=False)
-        assert steady(0.5) == pytest.approx(0.5)
-        assert steady.slope < prior.slope

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from scroll_tactile.readouts.calibration import Calibration, calibrate, fit_weights
+from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate, fit_weights
 from scroll_tactile.readouts.shrinkage import select
 from scroll_tactile.statistics.sample import TouchSample, WindowSums
 from scroll_tactile.statistics.statistics import Statistics, fold_of
@@ -136,6 +136,17 @@ def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
     assert few.threshold(0.05) == few.threshold(0.5) > 0
 
 
+def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
+    statistics, sample = scene(materials=2, each=2)
+    selection = select(statistics, 10, "lda")
+    (stage,) = calibrate(sample, [[10]], {10: selection}, "lda")
+    assert len(stage.novelties) == 0
+    gram = selection.readout.gram
+    typical, size = selection.readout.novelty(gram).mean(), np.diagonal(gram).mean()
+    assert stage.novelty(np.array([typical])) == pytest.approx(0, abs=1e-9)
+    assert stage.novelty(np.array([typical + size])) == pytest.approx(stage.threshold(0.05))
+
+
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_the_novelty_of_known_touches_is_standardised(kind):
     for stage in calibrated(kind):
@@ -143,6 +154,48 @@ def test_the_novelty_of_known_touches_is_standardised(kind):
         assert np.mean(stage.novelties) == pytest.approx(0, abs=1e-6)
         assert np.std(stage.novelties) == pytest.approx(1, abs=1e-6)
         assert np.array_equal(np.sort(stage.novelties), stage.novelties)
+
+
+@pytest.mark.parametrize("materials", [1, 2, 3])
+@pytest.mark.parametrize("each", [1, 2, 3, 4, 5])
+def test_novelty_is_measured_by_eight_touches_or_more_whose_material_the_other_folds_know(materials, each):
+    statistics, sample = scene(materials=materials, each=each, seed=each)
+    folds = [(material, fold_of(key)) for material, key, _ in sample]
+    held_out = 0
+    for material, fold in folds:
+        known = {name for name, other in folds if other != fold}
+        held_out += material in known and len(known) > 1
+    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
+    for stage in calibrate(sample, STAGES, selections, "lda"):
+        assert len(stage.novelties) == (held_out if held_out >= FEWEST else 0)
+        if not held_out:
+            # The prior is of the scores of all scales together.
+            assert stage.weights.tolist() == pytest.approx(
+                [PRIOR_WEIGHT["lda"] / len(stage.weights)] * len(stage.weights)
+            )
+
+
+def test_a_touch_counts_only_where_every_scale_was_fitted_without_its_fold():
+    """At the wide scale some folds are known to no other, and what the scales know has one material in common."""
+    rng = np.random.default_rng(0)
+    statistics, sample = Statistics(DIMENSION, SCALES), TouchSample()
+    keys = {
+        fold: iter([key for key in (rng.bytes(32) for _ in range(300)) if fold_of(key) == fold]) for fold in range(3)
+    }
+    # (material, fold, reaches the wide scale), four of each.
+    touches = [("a", 0, True), ("b", 0, True), ("a", 1, False), ("b", 1, False), ("a", 2, False), ("c", 2, True)]
+    for material, fold, wide in touches * 4:
+        key = next(keys[fold])
+        codes = {10: rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)}
+        if wide:
+            codes[40] = rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)
+        statistics.add(material, fold, codes)
+        sample.add(material, key, WindowSums.of([{10: [0]}, *([{10: [0], 40: [0]}] if wide else [])], codes))
+    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
+    assert sorted(selections[10].held_out) != sorted(selections[40].held_out)
+    narrow, wide = calibrate(sample, STAGES, selections, "lda")
+    assert len(narrow.novelties) == 20  # all but those of c, which no other fold knows
+    assert len(wide.novelties) == 0
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])

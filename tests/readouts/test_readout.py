@@ -1,5 +1,7 @@
 """Readouts against the textbook's dense formulas, in fifty digits."""
 
+from fractions import Fraction
+
 import mpmath
 import numpy as np
 import pytest
@@ -167,6 +169,17 @@ def test_targets_of_plus_and_minus_one_are_those_of_0_and_1_at_temperature_2(gro
         weights, _ = solver.solve(centred=True)
         scores.append((rows - rows.mean(axis=0)) @ weights + wanted.mean(axis=0))
     assert softmax(scores[0], axis=1) == pytest.approx(softmax(scores[1] / 2, axis=1), rel=1e-12, abs=1e-15)
+
+
+def test_class_means_keep_the_digits_of_their_distance():
+    counts = np.array([3, 7, 1_000_003])
+    sums = np.array([[3 * EDGE - 1], [7 * EDGE - 3], [1_000_003 * EDGE - 400_001]])
+    center, means = centred_means(counts, sums)
+    exact = [Fraction(int(total), int(count)) for (total,), count in zip(sums, counts, strict=True)]
+    assert float(center[0]) == pytest.approx(sums.sum() / counts.sum(), rel=1e-15)
+    rounding = 4 * EDGE * float(np.finfo(np.longdouble).eps) + 2.0**-52  # of the means, and of what is left of them
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert abs(Fraction(means[i, 0]) - Fraction(means[j, 0]) - (exact[i] - exact[j])) <= rounding
 
 
 def test_many_rows_are_answered_as_each_alone():

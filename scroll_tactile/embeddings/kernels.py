@@ -100,6 +100,7 @@ class Kernels:
 
         width: the width of window that the image stands for, its own columns unless given.
         """
+        _require_image(image)
         width = image.shape[1] if width is None else width
         features: npt.NDArray[np.float32] = self.embed_windows(image, {width: [0]})[width][0]
         return features
@@ -114,8 +115,7 @@ class Kernels:
         the image is read with that width's kernels as far as it goes, or, where it is less than 0.65 of the
         width, continued by its mirror image.
         """
-        if image.ndim != 2 or 0 in image.shape:
-            raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
+        _require_image(image)
         columns = image.shape[1]
         if columns > MOST_COLUMNS and any(width < columns for width in windows):
             return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
@@ -165,6 +165,11 @@ class Kernels:
     def _proportions(self, width: int) -> int:
         """How many of the features are proportions in a window of this width; the rest are of levels."""
         return self.dimension - (round(self.dimension * SHARE_IN_SHORT) if width <= SHORT else 0)
+
+
+def _require_image(image: npt.NDArray[np.float32]) -> None:
+    if image.ndim != 2 or 0 in image.shape:
+        raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
 
 
 def _suffices(columns: int, width: int) -> bool:

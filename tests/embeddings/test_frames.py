@@ -39,12 +39,6 @@ def taught(repetitions=4, **settings):
     return learner
 
 
-def test_it_keeps_the_promises_of_an_embedding():
-    check_embedding(Frames(), channels=(3, 180, 360), columns=(1, 9, 80, 160))
-    check_embedding(Frames(cosines=64), channels=(3, 180), columns=(1, 80))
-    check_embedding(SEEING, channels=(3, 180), columns=(1, 80))
-
-
 def test_light_is_the_mean_colour_of_cells():
     frame = np.random.default_rng(0).integers(-2048, 2049, (3, 12, 24))
     expected = frame.reshape(3, 6, 2, 8, 3).mean(axis=(2, 4)).ravel() / 2048

@@ -6,7 +6,6 @@ import pytest
 from scroll_tactile import Joined, Kernels, Maps, TactileLearner, Vision, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
-from scroll_tactile.testing import check_embedding
 
 KERNELS = Kernels(dimension=64)
 VISION = Vision(None, seed=0, stages=(1, 2))
@@ -41,11 +40,6 @@ def test_it_is_its_parts_side_by_side():
     for width in windows:
         assert embedded[width][:, :64].tobytes() == KERNELS.embed_windows(image(), windows)[width].tobytes()
         assert embedded[width][:, 64:].tobytes() == VISION.embed_windows(image(), windows)[width].tobytes()
-
-
-def test_it_keeps_the_promises_of_an_embedding():
-    check_embedding(Joined(KERNELS, VISION), columns=(9, 60))
-    check_embedding(Joined(Loud(), KERNELS), columns=(9, 60))
 
 
 def test_each_part_is_divided_by_its_bound():

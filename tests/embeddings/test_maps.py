@@ -16,19 +16,6 @@ def pressed(places, columns=60, layout=(6, 7)):
     return image.reshape(-1, columns)
 
 
-@pytest.mark.parametrize(
-    "embedding",
-    [
-        Maps(layout=(5,), parts=3),
-        Maps(layout=(5,), parts=3, cosines=70),
-        Maps(layout=(4, 5), parts=2),
-        Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64),
-    ],
-)
-def test_it_keeps_the_promises_of_an_embedding(embedding):
-    check_embedding(embedding, channels=(int(np.prod(embedding.layout)),), columns=(9, 30, 75))
-
-
 def test_parts_are_means_in_their_order():
     image = np.arange(20, dtype=np.float32).reshape(2, 10) / 20
     features = Maps(layout=(2,), parts=5).embed(image).reshape(5, 2)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scroll_tactile import Embedding, TactileLearner, Vision, sensors
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings import Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import TOGETHER, pool_windows, to_planes
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, WeightsError
@@ -32,12 +33,6 @@ def image(channels, columns, seed=0):
     rng = np.random.default_rng([channels, columns, seed])
     walk = np.cumsum(rng.normal(size=(channels, columns)), axis=1)
     return np.clip(rng.uniform(-1, 1, (channels, 1)) + 0.05 * walk, -1, 1).astype(np.float32)
-
-
-@pytest.mark.parametrize("vision", [RANDOM, Vision(None, seed=1, stages=(0, 4), precision="bfloat16")], ids=repr)
-def test_it_keeps_the_promises_of_an_embedding(vision):
-    assert isinstance(vision, Embedding)
-    assert "an image gives the same bytes again" in check_embedding(vision, channels=(1, 19), columns=(1, 30, 100))
 
 
 def test_real_weights_keep_them_too(real_weights):
@@ -121,24 +116,6 @@ def test_a_window_covers_the_columns_of_a_map_that_it_should(columns, shrink, da
 def test_a_part_without_any_response_stays_zero():
     stage = torch.zeros(1, 4, 2, 6)
     assert pool_windows([stage, stage + 1], 12, [(0, 12)]).tolist() == [[[0.0] * 4 + [0.5] * 4]]
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("hostile", ["threads", "autocast", "gradients", "precision"])
-def test_the_callers_program_changes_no_bit(threads, hostile):
-    vision = Vision(None, seed=0, stages=(1, 4))
-    picture, before = image(60, 75), vision.embed(image(60, 75)).tobytes()
-    kept, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    try:
-        torch.set_num_threads(threads)
-        if hostile == "precision":
-            torch.set_float32_matmul_precision("medium")
-        with torch.set_grad_enabled(hostile == "gradients"), torch.autocast("cpu", enabled=hostile == "autocast"):
-            assert vision.embed(picture).tobytes() == before
-        assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(kept)
-        torch.set_float32_matmul_precision(precision)
 
 
 def test_bulk_is_the_same_but_for_the_last_bits():
@@ -249,12 +226,6 @@ def test_a_seed_beside_weights_is_refused():
 def test_weights_that_are_not_there_are_named(tmp_path):
     with pytest.raises(WeightsError, match="none at"):
         Vision(tmp_path / "none.pth")
-
-
-@pytest.mark.parametrize("shape", [(19,), (0, 5), (19, 0), (3, 4, 5)])
-def test_what_is_no_image_is_refused(shape):
-    with pytest.raises(InputError, match=r"expected a tactile image of shape \(C, T\)"):
-        RANDOM.embed(np.zeros(shape, np.float32))
 
 
 def test_the_universal_stem_says_what_is_too_small_for_it():

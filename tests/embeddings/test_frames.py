@@ -31,11 +31,11 @@ def camera(height, width):
     return sensors.GELSIGHT.model_copy(update=size)
 
 
-def taught(repetitions=4, **settings):
+def learned(repetitions=4, **settings):
     learner = TactileLearner(sensor=SMALL, **settings)
-    for at in range(repetitions):
+    for i in range(repetitions):
         for name in GEL.materials:
-            learner.observe(name, GEL.touch(name, at))
+            learner.observe(name, GEL.touch(name, i))
     return learner
 
 
@@ -74,10 +74,10 @@ def test_a_constant_offset_changes_the_light_alone():
 
 def test_the_network_sees_relief_and_no_level():
     image = np.random.default_rng(3).uniform(-0.2, 0.2, (90, 40)).astype(np.float32)
-    one, other = SEEING.embed(image), SEEING.embed(image + np.float32(0.25))
-    assert one.shape == (LIGHT + 2 * (64 + 128 + 256),)
-    assert one[LIGHT:] == pytest.approx(other[LIGHT:], abs=1e-4)
-    assert np.linalg.norm(one[LIGHT : LIGHT + 64]) == pytest.approx(1, abs=1e-5)
+    dark, light_ = SEEING.embed(image), SEEING.embed(image + np.float32(0.25))
+    assert dark.shape == (LIGHT + 2 * (64 + 128 + 256),)
+    assert dark[LIGHT:] == pytest.approx(light_[LIGHT:], abs=1e-4)
+    assert np.linalg.norm(dark[LIGHT : LIGHT + 64]) == pytest.approx(1, abs=1e-5)
 
 
 def test_cosines_approximate_a_kernel_of_the_surface_alone():
@@ -87,10 +87,10 @@ def test_cosines_approximate_a_kernel_of_the_surface_alone():
     images = [tactile_image(validate(frame[None], SMALL)) for frame in frames]
     waves = [embedding.embed(image).astype(np.float64) for image in images]
     counts = [Frames().embed(image)[LIGHT:].astype(np.float64) for image in images]
-    for one in range(3):
-        for other in range(3):
-            near = np.exp(-np.square(counts[one] - counts[other]).sum() / (2 * 1.2**2))
-            assert 2 * np.mean(waves[one] * waves[other]) == pytest.approx(near, abs=0.08)
+    for i in range(3):
+        for j in range(3):
+            near = np.exp(-np.square(counts[i] - counts[j]).sum() / (2 * 1.2**2))
+            assert 2 * np.mean(waves[i] * waves[j]) == pytest.approx(near, abs=0.08)
     assert np.array_equal(embedding.embed(images[0] + np.float32(0.25)), embedding.embed(images[0]))
 
 
@@ -115,7 +115,7 @@ def test_the_fingerprint_tells_rests_and_networks_apart():
     rest = np.zeros(SMALL.shape)
     kinds = [Frames(), Frames(rest=None), Frames(rest=rest), Frames(rest=rest + 1), SEEING, Frames(NETWORK, rest=None)]
     kinds += [Frames(cosines=64), Frames(cosines=64, seed=2)]
-    assert len({one.fingerprint for one in kinds}) == len(kinds)
+    assert len({kind.fingerprint for kind in kinds}) == len(kinds)
     assert Frames(rest=rest).fingerprint == Frames(rest=rest.astype(int).tolist()).fingerprint
 
 
@@ -139,37 +139,37 @@ def test_images_of_channels_are_refused():
 
 @pytest.fixture(scope="module")
 def memory():
-    return taught()
+    return learned()
 
 
 def test_a_memory_of_a_camera_knows_what_was_pressed_into_it(memory):
     assert isinstance(memory.embedding, Frames)
-    right = [memory.predict(GEL.touch(name, at)).material == name for at in range(10, 13) for name in MATERIALS]
+    right = [memory.predict(GEL.touch(name, i)).material == name for i in range(10, 13) for name in MATERIALS]
     assert np.mean(right) >= 0.9
 
 
 def test_frames_without_contact_change_nothing(memory):
     touch = GEL.touch("cord", 20).readings
     padded = np.concatenate([touch[:1], touch[:1], touch[:1], touch[1:3], touch[:1], touch[3:]])
-    one, other = memory.predict(touch), memory.predict(padded)
-    assert one == other
-    assert one.seconds <= len(touch) / SMALL.rate
+    answer = memory.predict(touch)
+    assert answer == memory.predict(padded)
+    assert answer.seconds <= len(touch) / SMALL.rate
 
 
 @pytest.mark.parametrize("embedding", [Frames(), SEEING], ids=["counts", "network"])
 def test_any_order_gives_the_same_memory(embedding):
-    touches = [(name, GEL.touch(name, at)) for at in range(2) for name in MATERIALS[:3]]
-    one, other = (TactileLearner(sensor=SMALL, embedding=embedding) for _ in range(2))
+    touches = [(name, GEL.touch(name, i)) for i in range(2) for name in MATERIALS[:3]]
+    ordered, batched = (TactileLearner(sensor=SMALL, embedding=embedding) for _ in range(2))
     for name, touch in touches:
-        one.observe(name, touch)
-    with other.batch():
+        ordered.observe(name, touch)
+    with batched.batch():
         for name, touch in touches[::-1]:
-            other.observe(name, touch.readings.astype(np.uint8))
-    assert one.digest() == other.digest()
-    assert one.predict(touches[0][1]) == other.predict(touches[0][1])
+            batched.observe(name, touch.readings.astype(np.uint8))
+    assert ordered.digest() == batched.digest()
+    assert ordered.predict(touches[0][1]) == batched.predict(touches[0][1])
 
 
-def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
+def test_it_is_durable_and_what_is_retracted_was_never_there(tmp_path):
     with TactileLearner.open(tmp_path / "eye", sensor=SMALL, exemplars=9) as learner:
         for name in MATERIALS[:2]:
             learner.observe(name, GEL.touch(name, 0))
@@ -178,7 +178,11 @@ def test_it_is_durable_and_what_is_taken_back_was_never_there(tmp_path):
         assert learner.digest() == before
     with TactileLearner.open(tmp_path / "eye") as learner:
         assert learner.digest() == before
-        assert {len(one.readings) for those in learner._ranked().values() for one in those} <= {3, 4, 5}  # of 5
+        assert {len(each.readings) for ranked in learner.ranked_exemplars().values() for each in ranked} <= {
+            3,
+            4,
+            5,
+        }  # of 5
     with TactileLearner.open(tmp_path / "other", sensor=SMALL) as learner:
         learner.observe("cord", GEL.touch("cord", 0))
         assert learner.exemplars == {}  # a camera's frames are large: none are kept unless asked for
@@ -202,16 +206,16 @@ def test_pictures_of_any_size(size):
     gel = Gel(camera(*size))
     learner = TactileLearner(sensor=gel.sensor, exemplars=0)
     for name in MATERIALS[:2]:
-        for at in range(2):
-            learner.observe(name, gel.touch(name, at, frames=3))
+        for i in range(2):
+            learner.observe(name, gel.touch(name, i, frames=3))
     assert learner.predict(gel.touch("cord", 7, frames=2)).material in MATERIALS[:2]
 
 
 def test_a_memory_of_single_frames_takes_no_resting_image():
     learner = TactileLearner(sensor=SMALL, embedding=Frames(rest=None))
-    for at in range(3):
+    for i in range(3):
         for name in MATERIALS[:3]:
-            learner.observe(name, GEL.touch(name, at).readings[-1:])
+            learner.observe(name, GEL.touch(name, i).readings[-1:])
     assert learner.predict(GEL.touch("cord", 9).readings[-1:]).material == "cord"
     assert learner.predict(np.full((1, *SMALL.shape), 9, np.uint8)).material in MATERIALS  # constant: no error
 
@@ -219,9 +223,9 @@ def test_a_memory_of_single_frames_takes_no_resting_image():
 def test_a_resting_image_given_once_serves_every_stream(memory):
     rest = GEL.touch("cord", 0, force=0).readings[0]
     given = TactileLearner(sensor=SMALL, embedding=Frames(rest=rest))
-    for at in range(4):
+    for i in range(4):
         for name in MATERIALS[:3]:
-            given.observe(name, GEL.touch(name, at).readings[1:])
+            given.observe(name, GEL.touch(name, i).readings[1:])
     assert given.predict(GEL.touch("gravel", 9).readings[3:]).material == "gravel"
     with pytest.raises(NoContactError, match="the one given"):
         given.predict(rest[None])
@@ -251,16 +255,16 @@ def test_bad_streams_of_frames_are_refused_and_nothing_is_kept(memory):
     assert memory.digest() == before
 
 
-def test_constituents_are_told_of_frames(memory):
+def test_constituents_of_frames(memory):
     for name in MATERIALS:
         memory.describe(name, {"woven": name in ("burlap", "mesh", "cord")})
-    told = memory.compose(GEL.touch("mesh", 30))["woven"]
-    assert told.presence > 0.5
-    assert told.evidence[0][0] == "mesh"
+    composition = memory.compose(GEL.touch("mesh", 30))["woven"]
+    assert composition.presence > 0.5
+    assert composition.evidence[0][0] == "mesh"
 
 
 def test_f_star_reads_what_f_reads():
-    learner = taught(3, exemplars=18)
+    learner = learned(3, exemplars=18)
     report = learner.fine_tune(epochs=1)
     assert report.exemplars == 18
     assert learner.tuned_digest() is not None

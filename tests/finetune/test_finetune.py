@@ -27,21 +27,21 @@ EMBEDDINGS = {
     "kernels+vision": lambda: Joined(Kernels(dimension=64), Vision(None, seed=0, stages=(1,))),
 }
 kinds = pytest.mark.parametrize("kind", EMBEDDINGS)
-touches = [(name, SCENE.touch(name, at)) for at in range(6) for name in NAMES]
+touches = [(name, SCENE.touch(name, i)) for i in range(6) for name in NAMES]
 
 
-def taught(kind, order=None, path=None, **settings):
+def learned(kind, order=None, path=None, **settings):
     settings = {"sensor": PAD, "embedding": EMBEDDINGS[kind](), "exemplars": 12} | settings
     learner = TactileLearner.open(path, **settings) if path else TactileLearner(**settings)
-    for at in range(len(touches)) if order is None else order:
-        learner.observe(*touches[at])
+    for i in range(len(touches)) if order is None else order:
+        learner.observe(*touches[i])
     return learner
 
 
 @kinds
 def test_any_schedule_gives_the_same_buffer_and_with_the_same_seed_the_same_f_star_byte_for_byte(kind):
     orders = [np.random.default_rng(seed).permutation(len(touches)) for seed in range(2)]
-    first, second = (taught(kind, order) for order in orders)
+    first, second = (learned(kind, order) for order in orders)
     assert first.exemplars == second.exemplars
     reports = [learner.fine_tune(epochs=2, seed=5) for learner in (first, second)]
     assert reports[0].digest == reports[1].digest == first.tuned_digest() == second.tuned_digest()
@@ -51,16 +51,16 @@ def test_any_schedule_gives_the_same_buffer_and_with_the_same_seed_the_same_f_st
 
 
 def test_the_buffer_has_its_size_and_is_shared_evenly():
-    learner = taught("kernels")
+    learner = learned("kernels")
     assert {name: len(keys) for name, keys in learner.exemplars.items()} == dict.fromkeys(sorted(NAMES), 3)
     felt = {learner.observe(name, stream).key for name, stream in touches}
     assert {key for keys in learner.exemplars.values() for key in keys} <= felt
-    assert taught("kernels", exemplars=0).exemplars == {}
+    assert learned("kernels", exemplars=0).exemplars == {}
 
 
 @kinds
 def test_f_stays_as_it_was_and_f_star_answers_only_where_it_did_better(kind):
-    learner = taught(kind)
+    learner = learned(kind)
     probe = SCENE.touch(NAMES[1], 50)
     before, digest = learner.predict(probe), learner.digest()
     report = learner.fine_tune(epochs=2)
@@ -82,7 +82,7 @@ def kept(learner):
 
 @kinds
 def test_an_f_star_that_is_kept_gives_the_probabilities(kind):
-    learner = taught(kind)
+    learner = learned(kind)
     learner.fine_tune(epochs=1)
     kept(learner)
     probe = SCENE.touch(NAMES[2], 60)
@@ -100,25 +100,25 @@ def test_an_f_star_that_is_kept_gives_the_probabilities(kind):
 
 
 def test_what_f_star_does_not_know_or_is_too_short_for_is_answered_by_f():
-    learner = taught("kernels")
+    learner = learned("kernels")
     learner.fine_tune(epochs=1)
     kept(learner)
     probe = SCENE.touch(NAMES[0], 50)
     short = probe.first(0.35)
     assert not learner.predict(short, tuned=True).tuned
     assert learner.predict(short, tuned=True) == learner.predict(short)
-    for at in range(6):
-        learner.observe(SCENE.materials[7], SCENE.touch(SCENE.materials[7], at))
+    for i in range(6):
+        learner.observe(SCENE.materials[7], SCENE.touch(SCENE.materials[7], i))
     assert not learner.predict(probe, tuned=True).tuned
     assert learner.predict(probe, tuned=True, scene=NAMES).tuned
 
 
 @pytest.mark.parametrize("kind", ["kernels", "kernels+vision"])
 def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
-    learner = taught(kind, path=tmp_path / "m")
+    learner = learned(kind, path=tmp_path / "m")
     digest = learner.fine_tune(epochs=1).digest
-    for at in range(6, 8):  # after the generation: in the journal alone
-        learner.observe(NAMES[0], SCENE.touch(NAMES[0], at))
+    for i in range(6, 8):  # after the generation: in the journal alone
+        learner.observe(NAMES[0], SCENE.touch(NAMES[0], i))
     expected = (learner.exemplars, learner.digest(), digest)
     answer = kept(learner).predict(SCENE.touch(NAMES[1], 70), tuned=True)
     learner._ledger.store.close()  # as if the power failed: no generation is written
@@ -130,7 +130,7 @@ def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
 
 
 def test_one_exemplar_is_one_read_of_the_store(tmp_path):
-    with taught("kernels", path=tmp_path / "m") as learner:
+    with learned("kernels", path=tmp_path / "m") as learner:
         learner.fine_tune(epochs=1)
         stored, lengths = learner._ledger.store.latest(), []
         for one in learner.memory.exemplars:
@@ -143,7 +143,7 @@ def test_one_exemplar_is_one_read_of_the_store(tmp_path):
 
 
 def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
-    with taught("kernels", path=tmp_path / "m") as learner:
+    with learned("kernels", path=tmp_path / "m") as learner:
         before = learner.fine_tune(epochs=1, seed=1).digest
 
         def interrupt(what, done, of):
@@ -167,7 +167,7 @@ def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
 
 
 def test_a_loss_that_is_not_finite_stops_and_says_where(monkeypatch):
-    learner = taught("kernels")
+    learner = learned("kernels")
     before = learner.fine_tune(epochs=1).digest
     monkeypatch.setattr(training, "HEAD_RATE", float("inf"))
     for epochs, where in (
@@ -179,8 +179,8 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(monkeypatch):
     assert learner.tuned_digest() == before
 
 
-def test_a_device_without_memory_left_is_told_as_such(monkeypatch):
-    learner = taught("kernels")
+def test_a_device_without_memory_left_is_named_as_such(monkeypatch):
+    learner = learned("kernels")
 
     def full(*args, **kwargs):
         raise torch.OutOfMemoryError("tried to allocate 2 GiB")
@@ -202,10 +202,10 @@ def test_what_cannot_be_fine_tuned_says_why(tmp_path):
     with pytest.raises(errors.InputError, match="Observe longer touches"):
         learner.fine_tune()
     with pytest.raises(errors.InputError, match=r"buffer has none of .*exemplars=3.*room for 4 or more"):
-        taught("kernels", exemplars=3).fine_tune()
+        learned("kernels", exemplars=3).fine_tune()
     with pytest.raises(errors.InputError, match="with exemplars > 0"):
-        taught("kernels", exemplars=0).fine_tune()
-    full = taught("kernels")
+        learned("kernels", exemplars=0).fine_tune()
+    full = learned("kernels")
     for settings in (
         {"epochs": 0},
         {"epochs": 1.5},
@@ -219,16 +219,16 @@ def test_what_cannot_be_fine_tuned_says_why(tmp_path):
         with pytest.raises(errors.InputError, match="expected"):
             full.fine_tune(**settings)
     for settings in ({"exemplars": -1}, {"exemplars": 2.5}):
-        with pytest.raises(errors.InputError, match="whole number"):
+        with pytest.raises(errors.InputError, match="expected exemplars"):
             TactileLearner(sensor=PAD, **settings)
-    closed = taught("kernels", path=tmp_path / "m")
+    closed = learned("kernels", path=tmp_path / "m")
     closed.close()
     with pytest.raises(StoreError, match="closed"):
         closed.fine_tune()
 
 
 def test_a_memory_is_opened_with_the_buffer_that_it_was_made_with(tmp_path):
-    taught("kernels", path=tmp_path / "m").close()
+    learned("kernels", path=tmp_path / "m").close()
     embedding = EMBEDDINGS["kernels"]()
     with pytest.raises(errors.MismatchError, match="made with exemplars=12"):
         TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=20)
@@ -256,10 +256,10 @@ def test_the_network_to_be_tuned_reads_as_the_embedding_does(kind):
 
 
 def test_ridge_can_be_fine_tuned_too_and_the_whole_network(monkeypatch):
-    learner = taught("kernels", readout="ridge")
+    learner = learned("kernels", readout="ridge")
     assert learner.fine_tune(epochs=1).mode == "head"
     monkeypatch.setattr(finetune, "WHOLE_NETWORK_FROM", 1)
-    whole = taught("kernels+vision")
+    whole = learned("kernels+vision")
     report = whole.fine_tune(epochs=1)
     assert report.mode == "network"
     probe = SCENE.touch(NAMES[1], 70)
@@ -269,7 +269,7 @@ def test_ridge_can_be_fine_tuned_too_and_the_whole_network(monkeypatch):
 
 def test_the_start_is_f_itself():
     for readout in ("lda", "ridge"):
-        learner = taught("kernels", readout=readout)
+        learner = learned("kernels", readout=readout)
         model = learner.model()
         start = training.start_of(model, model.names)
         features = TouchFeatures(learner.embedding, learner.plan)
@@ -292,7 +292,7 @@ def test_touches_that_are_all_too_short_say_so(kind):
 
 
 def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):
-    taught("kernels", path=tmp_path / "m").close()
+    learned("kernels", path=tmp_path / "m").close()
     with (
         TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"](), mode="read") as reader,
         pytest.raises(StoreError, match="open it to write"),
@@ -302,7 +302,7 @@ def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, StoreError("no space left")])
 def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, monkeypatch, stop):
-    learner = taught("kernels", path=tmp_path / "m")
+    learner = learned("kernels", path=tmp_path / "m")
     before = learner.fine_tune(epochs=1, seed=1).digest
     commit = learner._ledger.store.commit
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
@@ -60,12 +61,14 @@ def holds_store(folder: Path) -> bool:
         if not folder.is_dir():
             raise NotAStoreError(f"{folder} is a file; a store is a folder")
         journal = folder / JOURNAL_FILE
-        if journal.is_file():
-            _require_ours(journal, _header(journal))
-            # Before SQLite sees it: with a smaller page, or fewer of them, it would write over rows.
-            if (fault := header_fault(journal)) is not None:
-                raise DamageError(f"{fault}: repair the store (repair_store)", path=journal)
-            return True
+        # A repair may be moving it away just now.
+        with suppress(FileNotFoundError):
+            if journal.is_file():
+                _require_ours(journal, _header(journal))
+                # Before SQLite sees it: with a smaller page, or fewer of them, it would write over rows.
+                if (fault := header_fault(journal)) is not None:
+                    raise DamageError(f"{fault}: repair the store (repair_store)", path=journal)
+                return True
         try:
             _refuse_foreign(folder)
         except (DamageError, NotAStoreError):

@@ -73,6 +73,12 @@ def flip(file, place=-9, bit=2):
     file.write_bytes(data)
 
 
+def flip_chunk(file, chunk, chunks):
+    """Flip a bit in the middle of a chunk, where the index at the end of the file says that it lies."""
+    index = np.frombuffer(file.read_bytes()[-4 - 16 * chunks : -4], "<u8").reshape(chunks, 2)
+    flip(file, int(index[chunk, 0] + index[chunk, 1] // 2))
+
+
 def damage(path):
     return [problem for problem in check_store(path) if problem.kind != "leftover"]
 

@@ -7,9 +7,8 @@ import sqlite3
 import threading
 from contextlib import closing
 
-import numpy as np
 import pytest
-from store_builds import LAST, add, change, commit, contents, damage, flip, folders, state, values
+from store_builds import LAST, add, change, commit, contents, damage, flip, flip_chunk, folders, state, values
 
 import store.schema
 from store import DamageError, NotAStoreError, Problem, Store, StoreError, VersionError, check_store, repair_store
@@ -121,23 +120,22 @@ def test_arrays_that_were_given_up_and_are_there_are_found(path):
         assert "row 3 has arrays that fail their checksum" in problem.what
 
 
+def rows_of(folder):
+    return folder / "rows" / "c" / "0" / "0"
+
+
 GENERATIONS = {
-    "a chunk": (lambda folder: flip(folder / "rows" / "c" / "0" / "0", 30), "chunk 0 (rows 0 to 25) of array 'rows'"),
-    "another chunk": (lambda folder: spoil_chunk(folder, 2), "chunk 2 (rows 50 to 75) of array 'rows'"),
+    "a chunk": (lambda folder: flip(rows_of(folder), 30), "chunk 0 (rows 0 to 25) of array 'rows'"),
+    "another chunk": (
+        lambda folder: flip_chunk(rows_of(folder), 2, 4),
+        "chunk 2 (rows 50 to 75) of array 'rows'",
+    ),
     "an array": (lambda folder: flip(folder / "names" / "c" / "0" / "0", 20), "array 'names' of generation"),
     "an array's description": (lambda folder: (folder / "sum" / "zarr.json").write_text("{}"), "array 'sum'"),
     "an array's folder": (lambda folder: shutil.rmtree(folder / "sum"), "array 'sum' of generation"),
     "the group": (lambda folder: (folder / "zarr.json").unlink(), "zarr.json cannot be read"),
     "the folder": (shutil.rmtree, "zarr.json cannot be read"),
 }
-
-
-def spoil_chunk(folder, chunk):
-    file = folder / "rows" / "c" / "0" / "0"
-    data = bytearray(file.read_bytes())
-    index = np.frombuffer(data[-4 - 4 * 16 : -4], "<u8").reshape(4, 2)
-    data[int(index[chunk, 0] + index[chunk, 1] // 2)] ^= 1
-    file.write_bytes(data)
 
 
 @pytest.mark.parametrize("choose", [newest, older])
@@ -154,7 +152,7 @@ def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said
 
 def test_every_damaged_chunk_is_named_and_no_other(path):
     for chunk in (0, 3):
-        spoil_chunk(newest(path), chunk)
+        flip_chunk(rows_of(newest(path)), chunk, 4)
     assert [problem.what.split(" (")[0] for problem in check_store(path)] == ["chunk 0", "chunk 3"]
 
 
@@ -337,7 +335,7 @@ def test_everything_that_is_wrong_is_told_at_once(path):
         "DELETE FROM payload WHERE sequence = 12",
         "UPDATE meta SET value = '' WHERE key = 'created'",
     )
-    spoil_chunk(newest(path), 1)
+    flip_chunk(rows_of(newest(path)), 1, 4)
     flip(older(path) / "names" / "c" / "0" / "0", 20)
     told = found(path)
     for said in ("created", "row 8 fails", "row 12 has lost", "row 18 fails", "chunk 1 (rows 25", "array 'names'"):

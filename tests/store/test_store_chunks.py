@@ -10,6 +10,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from store_builds import flip_chunk
 
 from store import DamageError, RecordError, Store, StoreError
 
@@ -88,19 +89,9 @@ def test_only_the_chunk_asked_for_is_read(readings, monkeypatch):
     assert 0 < sum(read) < size / 10
 
 
-def spoil(opened, chunk):
-    """Flip a bit in the middle of a chunk, where the file's index says that it lies."""
-    file = file_of(opened)
-    content = bytearray(file.read_bytes())
-    index = np.frombuffer(content[-4 - 40 * 16 : -4], "<u8").reshape(40, 2)
-    content[int(index[chunk, 0] + index[chunk, 1] // 2)] ^= 4
-    file.write_bytes(content)
-    return file
-
-
 def test_damage_in_a_chunk_is_named_and_does_not_matter_to_the_others(readings, caplog):
     opened, x = readings
-    file = spoil(opened, 7)
+    flip_chunk(file := file_of(opened), 7, 40)
     assert opened.read_rows("x", 0, 175).tobytes() == x[:175].tobytes()
     assert opened.read_rows("x", 200, 1000).tobytes() == x[200:].tobytes()
     for first, last in ((175, 200), (199, 201), (0, 1000)):
@@ -120,25 +111,6 @@ def test_a_chunk_in_anothers_place_is_found(readings):
     with pytest.raises(DamageError, match="chunk 0"):
         opened.read_rows("x", 0, 1)
     assert opened.read_rows("x", 60, 61).tobytes() == x[60:61].tobytes()
-
-
-LOST = {
-    "the file": lambda file: file.unlink(),
-    "its end": lambda file: file.write_bytes(file.read_bytes()[:-9]),
-    "its content": lambda file: file.write_bytes(b""),
-    "its index": lambda file: file.write_bytes(file.read_bytes()[:-60] + bytes(60)),
-    "the description": lambda file: (file.parents[2] / "zarr.json").write_text("{}"),
-    "the group": lambda file: (file.parents[3] / "zarr.json").unlink(),
-}
-
-
-@pytest.mark.parametrize("lose", LOST.values(), ids=LOST.keys())
-def test_what_is_lost_is_damage(readings, lose):
-    opened, _ = readings
-    lose(file_of(opened))
-    with pytest.raises(DamageError, match="generation 1"):
-        opened.read_rows("x", 990, 1000)
-    assert opened.latest() is None
 
 
 def test_rows_of_a_generation_are_read_as_long_as_it_is_there(readings):

@@ -80,11 +80,6 @@ def test_rows_give_up_their_arrays_for_the_base_and_keep_their_heads(opened):
             assert agrees(again, 5)
 
 
-def test_without_a_compaction_there_is_no_base(opened):
-    assert opened.base() is None
-    assert opened.compacted == 0
-
-
 @pytest.mark.parametrize("upto", [0, LAST])
 def test_none_or_all_of_the_rows_can_be_compacted(opened, upto):
     opened.compact(sums(upto), upto=upto)

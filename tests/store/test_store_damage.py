@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from store_builds import change, flip, folders
+from store_builds import change, flip, flip_chunk, folders, same_arrays, state
 
 from store import DamageError, NotAStoreError, Store
 
@@ -22,6 +22,10 @@ def path(tmp_path):
             if number in (2, 4):
                 opened.commit({"x": np.arange(1000) + number, "y": np.array(number)}, upto=number)
     return tmp_path / "s"
+
+
+def chunk_of(folder):
+    return folder / "x" / "c" / "0"
 
 
 @pytest.mark.parametrize(
@@ -116,24 +120,30 @@ def test_missing_rows_are_named_and_their_numbers_not_given_again(path):
         assert opened.append("a", "b", b"").sequence == 5
 
 
-def chunk_of(folder):
-    return folder / "x" / "c" / "0"
+def file_of(folder):
+    return folder / "rows" / "c" / "0" / "0"
+
+
+def rewrite(file, change):
+    file.write_bytes(change(file.read_bytes()))
 
 
 SPOIL = {
-    "a bit of a chunk": lambda folder: flip(chunk_of(folder), -5),
-    "a bit of its header": lambda folder: flip(chunk_of(folder), 4),
-    "a chunk cut short": lambda folder: chunk_of(folder).write_bytes(chunk_of(folder).read_bytes()[:20]),
-    "an empty chunk": lambda folder: chunk_of(folder).write_bytes(b""),
-    "no chunk": lambda folder: chunk_of(folder).unlink(),
-    "no array": lambda folder: shutil.rmtree(folder / "x"),
-    "an array's description": lambda folder: (folder / "x" / "zarr.json").write_text("{}"),
-    "an array's shape": lambda folder: (folder / "x" / "zarr.json").write_text(
-        (folder / "x" / "zarr.json").read_text().replace("1000", "1001")
+    "a bit of a chunk": lambda folder: flip_chunk(file_of(folder), 2, 4),
+    "a bit of its header": lambda folder: flip(file_of(folder), 4),
+    "a bit of the index": lambda folder: flip(file_of(folder), -9),
+    "a zeroed index": lambda folder: rewrite(file_of(folder), lambda data: data[:-60] + bytes(60)),
+    "a file cut short": lambda folder: rewrite(file_of(folder), lambda data: data[:-9]),
+    "an empty file": lambda folder: file_of(folder).write_bytes(b""),
+    "no file": lambda folder: file_of(folder).unlink(),
+    "no array": lambda folder: shutil.rmtree(folder / "rows"),
+    "an array's description": lambda folder: (folder / "rows" / "zarr.json").write_text("{}"),
+    "an array's shape": lambda folder: rewrite(
+        folder / "rows" / "zarr.json", lambda data: data.replace(b"100", b"101")
     ),
     "no group": lambda folder: (folder / "zarr.json").unlink(),
-    "the group's format": lambda folder: (folder / "zarr.json").write_text(
-        (folder / "zarr.json").read_text().replace('"format": 1', '"format": 9')
+    "the group's format": lambda folder: rewrite(
+        folder / "zarr.json", lambda data: data.replace(b'"format": 1', b'"format": 9')
     ),
     "nothing left": shutil.rmtree,
 }
@@ -141,13 +151,15 @@ SPOIL = {
 
 @pytest.mark.parametrize("spoil", SPOIL.values(), ids=SPOIL.keys())
 @pytest.mark.parametrize("mode", ["read", "write"])
-def test_a_spoilt_generation_is_named_and_the_one_before_it_taken(path, spoil, mode, caplog):
-    folder = path / "generations" / "00000002"
+def test_a_spoilt_generation_is_named_and_the_one_before_it_taken(plain, spoil, mode, caplog):
+    folder = plain / "generations" / "00000002"
     spoil(folder)
-    with Store.open(path, mode=mode) as opened, caplog.at_level(logging.WARNING):
+    with Store.open(plain, mode=mode) as opened, caplog.at_level(logging.WARNING):
+        with pytest.raises(DamageError, match="generation 2"):
+            opened.read_rows("rows", 0, 100)
         found = opened.latest()
-    assert (found.number, found.upto) == (1, 2)
-    assert found.arrays["x"].tobytes() == (np.arange(1000) + 2).tobytes()
+    assert (found.number, found.upto) == (1, 10)
+    assert same_arrays(found.arrays, state(10))
     (warning,) = caplog.messages
     assert "generation 2" in warning
     assert str(folder) in warning

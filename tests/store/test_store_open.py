@@ -17,7 +17,6 @@ from store_builds import change, contents
 
 import store.store
 from store import (
-    DamageError,
     LockedError,
     NotAStoreError,
     ReadOnlyError,
@@ -278,14 +277,6 @@ def test_an_interrupted_creation_is_finished_by_the_next(tmp_path):
     with Store.open(tmp_path, identity={"a": 1}) as opened:
         assert opened.append("a", "b", b"").sequence == 1
     assert not (tmp_path / "journal.sqlite.new").exists()
-
-
-def test_generations_without_a_journal_are_not_taken_for_an_empty_folder(tmp_path):
-    with Store.open(tmp_path, identity={}) as opened:
-        opened.commit({"x": np.arange(3)}, upto=0)
-    (tmp_path / "journal.sqlite").unlink()
-    with pytest.raises(DamageError, match="generations but no"):
-        Store.open(tmp_path, identity={})
 
 
 def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):

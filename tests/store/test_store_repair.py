@@ -25,6 +25,7 @@ from store_builds import (
     values,
 )
 
+import store.header
 import store.repair
 import store.store
 from store import (
@@ -310,7 +311,7 @@ def test_without_a_journal_the_newest_generation_is_gone_on_from(either, which, 
         file.unlink()
     else:
         file.write_bytes({"empty": b"", "stub": b"SQLite format 3\0", "text": b"dear diary" * 900}[how])
-    with pytest.raises(DamageError, match="repair"):
+    with pytest.raises(DamageError, match="generations but no .* repair" if how == "deleted" else "repair"):
         Store.open(path, identity={"for": "another"})
     done = repair_store(path)
     assert done.kept == 15
@@ -575,6 +576,18 @@ def test_a_reader_that_comes_while_the_journal_is_replaced_reads_or_is_told(path
     else:
         with pytest.raises(DamageError, match=r"has journal\.sqlite\.damaged .*but no journal\.sqlite"):
             Store.open(path, mode="read")
+
+
+def test_a_reader_that_looks_just_when_the_journal_is_moved_away_is_told(path, monkeypatch):
+    real = store.header._header
+
+    def moved(journal):
+        journal.rename(path / "journal.sqlite.damaged")
+        return real(journal)
+
+    monkeypatch.setattr(store.header, "_header", moved)
+    with pytest.raises(DamageError, match="repair the store"):
+        Store.open(path, mode="read")
 
 
 def test_readers_meanwhile_get_right_answers_or_are_told(path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from pathlib import Path
@@ -15,9 +15,9 @@ import numpy as np
 
 from store.exceptions import DamageError, RecordError, StoreError, reported
 from store.files import remove_tree
-from store.groups import PARTIAL, GroupReader, folder_name, write_group
+from store.groups import PARTIAL, Draft, GroupReader, folder_name, write_group
 from store.journal import Journal
-from store.records import Generation, GenerationRow, from_json
+from store.records import Generation, GenerationRow
 from store.schema import GENERATIONS
 
 __all__ = ["Generations", "highest_number", "numbers", "remove_others"]
@@ -30,7 +30,6 @@ logger = logging.getLogger(__name__)
 KEPT_GENERATIONS = 2
 
 Answer = TypeVar("Answer")
-Commit = tuple[Mapping[str, np.ndarray], int, str, Mapping[str, int]]
 
 
 class Generations:
@@ -45,7 +44,7 @@ class Generations:
         self._spoilt: set[int] = set()
         self._worker = ThreadPoolExecutor(1, f"store commit {folder.name}")
         self._queue = threading.Lock()
-        self._waiting: Commit | None = None
+        self._waiting: Draft | None = None
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
         for row in journal.generations():
@@ -111,22 +110,13 @@ class Generations:
         attributes, _ = row.verified(self._journal.path)
         return Generation(row.number, row.upto, attributes, self._reader(row).arrays())
 
-    def commit(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        upto: int,
-        attributes: str,
-        chunks: Mapping[str, int],
-        *,
-        base: bool = False,
-    ) -> int:
-        """Write checked arrays as a generation, make the journal name it, and return its number."""
+    def commit(self, draft: Draft, *, base: bool = False) -> int:
+        """Write a draft as a generation, make the journal name it, and return its number."""
         with self._committing:
             earlier = self._journal.generations()
             number = 1 + max([highest_number(self._parent), *(row.number for row in earlier)])
-            identity = self._journal.identity
-            content = write_group(self._parent, number, upto, arrays, from_json(attributes), chunks, identity)
-            row = GenerationRow.of(number, upto, int(base), time.time(), attributes, content)
+            content = write_group(self._parent, number, draft, self._journal.identity)
+            row = GenerationRow.of(number, draft.upto, int(base), time.time(), draft.attributes, content)
             kept = {row.number for row in self._kept(earlier, base=base)}
             # When this fails the folder stays, for the next commit or open to remove: what could not be
             # synced may be on the disk all the same, and name it after a crash.
@@ -144,7 +134,7 @@ class Generations:
         bases = [row for row in earlier if row.sound and row.base]
         return sound[: KEPT_GENERATIONS - 1] + bases[:1] + [row for row in earlier if not row.sound]
 
-    def compact(self, arrays: Mapping[str, np.ndarray], upto: int, attributes: str, chunks: Mapping[str, int]) -> None:
+    def compact(self, draft: Draft) -> None:
         """Commit a base; raise DamageError or RecordError where no sound generation with all rows is beside it."""
         newest, named = self.latest(), self._journal.newest()
         if named is not None and (newest is None or newest.number != named):
@@ -159,19 +149,19 @@ class Generations:
                 f"{self._folder} can be compacted only beside a generation with all {self._journal.last()} records; "
                 f"{there}: commit one first"
             )
-        self.commit(arrays, upto, attributes, chunks, base=True)
+        self.commit(draft, base=True)
         try:
             self._journal.shrink()
         except StoreError as error:
             logger.warning("%s: the space was not given back yet: %s", self._folder, error)
 
-    def commit_later(self, commit: Commit) -> None:
+    def commit_later(self, draft: Draft) -> None:
         """Do `commit` in a background thread; a newer one takes the place of one that still waits.
 
         Logs a failure and keeps it until `raise_failure`.
         """
         with self._queue:
-            self._waiting = commit
+            self._waiting = draft
         try:
             self._submitted = self._worker.submit(self._commit_newest)
         except RuntimeError:  # the interpreter is shutting down, and starts no job any more
@@ -179,11 +169,11 @@ class Generations:
 
     def _commit_newest(self) -> None:
         with self._queue:
-            commit, self._waiting = self._waiting, None
-        if commit is None:
+            draft, self._waiting = self._waiting, None
+        if draft is None:
             return
         try:
-            self.commit(*commit)
+            self.commit(draft)
         except Exception as error:
             logger.exception("%s: a background commit failed; the journal still holds its rows", self._folder)
             self._failure = error

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,12 @@ import numpy as np
 from store.encoding import array_digest, chunk_digest, flat_bytes
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import remove_tree, sync_folder, sync_tree
-from store.records import JSON
+from store.records import JSON, from_json
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["PARTIAL", "GroupReader", "folder_name", "read_own_description", "write_group"]
+__all__ = ["PARTIAL", "Draft", "GroupReader", "folder_name", "read_own_description", "write_group"]
 
 GROUP_VERSION = 1
 PARTIAL = ".partial"
@@ -38,37 +39,40 @@ def folder_name(number: int) -> str:
     return f"{number:08d}"
 
 
-def write_group(
-    parent: Path,
-    number: int,
-    upto: int,
-    arrays: Mapping[str, np.ndarray],
-    attributes: Mapping[str, JSON],
-    chunks: Mapping[str, int],
-    identity: Mapping[str, JSON],
-) -> dict[str, Any]:
-    """Write checked arrays as a durable zarr group in `parent`; return what a reader verifies them against.
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """Checked arrays that are to become a generation; `attributes` is JSON, `chunks` name → rows of a chunk."""
 
-    That is the group's format and, for each array, its dtype, shape and sha256, and for an array in
-    `chunks` (name → rows) a digest of each chunk, as JSON. The group also describes itself so, and names
+    arrays: Mapping[str, np.ndarray]
+    upto: int
+    attributes: str
+    chunks: Mapping[str, int]
+
+
+def write_group(parent: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> dict[str, Any]:
+    """Write a draft as a durable zarr group in `parent`; return what a reader verifies it against.
+
+    That is the group's format and, for each array, its dtype, shape and sha256, and for an array kept in
+    chunks a digest of each chunk, as JSON. The group also describes itself so, and names
     its store, so that it verifies without the journal. On any error nothing is left behind.
     Raises StoreFullError, ReadOnlyError or StoreError.
     """
-    described = {name: _describe(array, chunks.get(name)) for name, array in arrays.items()}
+    described = {name: _describe(array, draft.chunks.get(name)) for name, array in draft.arrays.items()}
     content = {"format": GROUP_VERSION, "arrays": described}
+    known = {"number": number, "upto": draft.upto, "attributes": from_json(draft.attributes), "identity": identity}
+    known |= content
     final = parent / folder_name(number)
-    draft = parent / (folder_name(number) + PARTIAL)
+    partial = parent / (folder_name(number) + PARTIAL)
     try:
-        with reported(draft, f"writing generation {number}"):
+        with reported(partial, f"writing generation {number}"):
             parent.mkdir(exist_ok=True)
-            remove_tree(draft)
-            known = {"number": number, "upto": upto, "attributes": attributes, "identity": identity, **content}
-            _write_zarr(draft, known | {"sha256": _own_digest(known)}, arrays, chunks)
-            sync_tree(draft)
-            draft.rename(final)
+            remove_tree(partial)
+            _write_zarr(partial, known | {"sha256": _own_digest(known)}, draft)
+            sync_tree(partial)
+            partial.rename(final)
             sync_folder(parent)
     except BaseException:
-        remove_tree(draft)
+        remove_tree(partial)
         remove_tree(final)
         raise
     return content
@@ -86,16 +90,14 @@ def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
     return described | {"rows": rows, "chunks": pieces}
 
 
-def _write_zarr(
-    path: Path, attributes: dict[str, Any], arrays: Mapping[str, np.ndarray], chunks: Mapping[str, int]
-) -> None:
+def _write_zarr(path: Path, attributes: dict[str, Any], draft: Draft) -> None:
     # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
     import zarr
     from zarr.codecs import BloscCodec
     from zarr.storage import LocalStore
 
     group = zarr.create_group(store=LocalStore(path), zarr_format=3, attributes=attributes)
-    for name, array in arrays.items():
+    for name, array in draft.arrays.items():
         plain = array
         if array.dtype.kind == "U":
             # zarr v3 has no settled type for fixed-width text and warns of it: code points have one.
@@ -104,7 +106,7 @@ def _write_zarr(
             name,
             shape=plain.shape,
             dtype=plain.dtype,
-            **_layout(plain, chunks.get(name)),
+            **_layout(plain, draft.chunks.get(name)),
             compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
             fill_value=0,
             attributes={"dtype": array.dtype.str},

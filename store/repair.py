@@ -13,7 +13,7 @@ from typing import cast
 from store.exceptions import DamageError, reported
 from store.files import sync_folder
 from store.generations import highest_number, remove_others
-from store.groups import GroupReader, folder_name, write_group
+from store.groups import Draft, GroupReader, folder_name, write_group
 from store.lock import WriterLock
 from store.records import (
     GENERATION_COLUMNS,
@@ -173,14 +173,15 @@ def _lost_generations(survey: Survey) -> list[str]:
 def _row_to_keep(survey: Survey, plan: _Plan, found: FoundGeneration) -> GenerationRow:
     """Return the row of a generation that stays; write one again that does not describe itself."""
     assert found.row is not None
-    attributes, content = found.row.verified(survey.journal)
+    _, content = found.row.verified(survey.journal)
     number = found.number
     if found.own is not None:
         parent = found.folder.parent
         arrays = GroupReader(found.folder, number, content).arrays()
         chunks = {name: described["rows"] for name, described in content["arrays"].items() if "rows" in described}
         number = 1 + highest_number(parent)
-        content = write_group(parent, number, found.upto, arrays, attributes, chunks, survey.identity or {})
+        draft = Draft(arrays, found.upto, found.row.attributes.decode(), chunks)
+        content = write_group(parent, number, draft, survey.identity or {})
     base = found.upto == plan.base and (found.is_base or (plan.fresh and found is plan.generations[0]))
     return GenerationRow.of(number, found.upto, int(base), found.row.time, found.row.attributes.decode(), content)
 

@@ -25,6 +25,7 @@ from store.exceptions import (
 )
 from store.files import file_size, tree_size
 from store.generations import Generations
+from store.groups import Draft
 from store.header import holds_store, lock_to_write
 from store.journal import Journal
 from store.lock import WriterLock
@@ -273,9 +274,9 @@ class Store:
         Raises RecordError for arrays, attributes, chunks or an `upto` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the generation before then stays current.
         """
-        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes, chunks)
         self._idle()
-        return self._generations.commit(checked, upto, text, pieces)
+        return self._generations.commit(draft)
 
     def compact(
         self,
@@ -293,9 +294,9 @@ class Store:
         that generation cannot be read back, and as `commit`. It gives the space back to the disk where there
         is room to do so, and logs a warning where there is not.
         """
-        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes, chunks)
         self._idle()
-        self._generations.compact(checked, upto, text, pieces)
+        self._generations.compact(draft)
 
     def commit_later(
         self,
@@ -311,17 +312,17 @@ class Store:
         raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
         What cannot be kept is refused at once, with RecordError.
         """
-        checked, text, pieces = self._check_commit(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes, chunks)
         self._generations.raise_failure()
-        self._generations.commit_later((checked, upto, text, pieces))
+        self._generations.commit_later(draft)
 
-    def _check_commit(
+    def _draft(
         self,
         arrays: Mapping[str, np.ndarray],
         upto: int,
         attributes: Mapping[str, JSON] | None,
         chunks: Mapping[str, int] | None,
-    ) -> tuple[dict[str, np.ndarray], str, dict[str, int]]:
+    ) -> Draft:
         self._check_open(write=True)
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a generation")
@@ -333,7 +334,7 @@ class Store:
                 f"is, not {upto!r}"
             )
         checked = check_arrays(arrays)
-        return checked, to_json("attributes", attributes), check_chunks(chunks, checked)
+        return Draft(checked, upto, to_json("attributes", attributes), check_chunks(chunks, checked))
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""

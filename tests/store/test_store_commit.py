@@ -26,11 +26,11 @@ class Gate:
         self.write = store.generations.write_group
         monkeypatch.setattr(store.generations, "write_group", self)
 
-    def __call__(self, parent, number, upto, *rest):
-        self.uptos.append(upto)
+    def __call__(self, parent, number, draft, identity):
+        self.uptos.append(draft.upto)
         self.reached.set()
         assert self.open.wait(10)
-        return self.write(parent, number, upto, *rest)
+        return self.write(parent, number, draft, identity)
 
 
 def test_the_current_and_the_one_before_it_are_kept(opened):

@@ -12,9 +12,8 @@ import typer
 from rich.table import Table
 
 from examples.benchmarks.buffers import run_buffers
-from examples.benchmarks.frontier import measure_frontier
+from examples.benchmarks.frontier import draw_frontier, measure_frontier
 from examples.benchmarks.interleaved import run_interleaved
-from examples.benchmarks.plots_frontier import draw_frontier
 from examples.benchmarks.show_speed import show_frontier, show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.vision_speed import run_vision
@@ -35,8 +34,17 @@ def _written(context: typer.Context, path: Path | None, result: Mapping[str, Any
     if path is None:
         return
     load = [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None
-    write_json(path, {"command": _command(context), **result, "load_average_after": load})
+    write_json(path, _rounded({"command": _command(context), **result, "load_average_after": load}))
     say(f"written to {path}")
+
+
+def _rounded(value: Any) -> Any:
+    """A result whose floats have six digits: more say nothing, and take room."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, Mapping):
+        return {key: _rounded(part) for key, part in value.items()}
+    return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def _command(context: typer.Context) -> str:

@@ -35,9 +35,10 @@ from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
+from scroll_tactile.pipelines.drawing import picture
 from scroll_tactile.readouts.readout import ReadoutName
 
-__all__ = ["WIDTHS", "knee", "measure_frontier", "run_frontier", "run_peers"]
+__all__ = ["WIDTHS", "draw_frontier", "knee", "measure_frontier", "run_frontier", "run_peers"]
 
 Record = dict[str, Any]
 Note = Callable[[str], object]
@@ -46,6 +47,7 @@ FloatArray = npt.NDArray[np.float64]
 WIDTHS = (126, 252, 504, 1008, 2016)
 LENGTHS = (0.3, 1.0, None)  # seconds; None: all of a touch
 PEERS_WIDTH = 252  # features: padasip's filters carry a P each, and at 1008 a touch takes them a second
+STYLES = {"lda": "-", "ridge": "--"}
 SLOW = 20  # predictions that are timed where each follows an observation
 
 
@@ -212,3 +214,57 @@ def knee(records: Sequence[Record], readout: ReadoutName = "lda") -> Record:
         step |= {"standard_error": spread, "gained_by_wider": gained}
     chosen = next(step["width"] for step in steps if step["gained_by_wider"] <= step["standard_error"])
     return {"readout": readout, "width": chosen, "default": Kernels().dimension, "steps": steps}
+
+
+def draw_frontier(path: Path, records: Sequence[Record], peers: Sequence[Record], *, default: int) -> None:
+    """Draw the records of `run_frontier` and `run_peers` into a picture; `default` is the width to be marked.
+
+    Raises InputError where matplotlib is missing or the file cannot be written.
+    """
+    with picture(path, 13, 6) as figure:
+        ours, others = figure.subplots(1, 2)
+        _draw_widths(ours, records, default)
+        _draw_peers(others, [record for record in peers if record["measured"]])
+        for panel in (ours, others):
+            panel.set(xscale="log", yscale="log", ylabel="touches taken for something else, %")
+            panel.grid(alpha=0.25, which="both")
+            if panel.get_legend_handles_labels()[0]:
+                panel.legend(fontsize=8)
+
+
+def _draw_widths(panel: Any, records: Sequence[Record], default: int) -> None:
+    lines = dict.fromkeys((record["dataset"], record["length"], record["readout"]) for record in records)
+    colours = {key: f"C{i}" for i, key in enumerate(dict.fromkeys((dataset, length) for dataset, length, _ in lines))}
+    for dataset, length, readout in lines:
+        mine = [
+            record
+            for record in records
+            if (record["dataset"], record["length"], record["readout"]) == (dataset, length, readout)
+        ]
+        mine.sort(key=lambda record: record["width"])
+        times, errors = [record["predict_ms"] for record in mine], [_percent(record) for record in mine]
+        colour = colours[dataset, length]
+        label = f"{dataset}, {'whole touches' if length == 'all' else length}, {readout}"
+        panel.plot(times, errors, STYLES[readout], color=colour, marker=".", label=label)
+        marked = [place for place, record in enumerate(mine) if record["width"] == default]
+        panel.scatter([times[place] for place in marked], [errors[place] for place in marked], s=90, color=colour)
+    panel.set(xlabel="ms a prediction, embedding included", title=f"widths of the embedding; large: {default}, default")
+
+
+def _draw_peers(panel: Any, peers: Sequence[Record]) -> None:
+    names = list(dict.fromkeys(record["learner"] for record in peers))
+    markers = dict(zip(dict.fromkeys(record["dataset"] for record in peers), "os^D", strict=False))
+    for i, name in enumerate(names):
+        for record in (record for record in peers if record["learner"] == name):
+            label = f"{name}, {record['dataset']}"
+            pair = record["observe_ms"] + record["fresh_ms"]
+            panel.scatter(
+                pair, _percent(record), s=70, color=f"C{i % 10}", marker=markers[record["dataset"]], label=label
+            )
+    features = peers[0]["features"] if peers else ""
+    panel.set(xlabel="ms an observation and the prediction that follows", title=f"the same {features} features for all")
+
+
+def _percent(record: Record) -> float:
+    # None wrong has no place on a logarithmic axis: it stands where a tenth of a percent is.
+    return max(100.0 * float(record["wrong"]), 0.1)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from examples.benchmarks.frontier import knee, measure_frontier, run_frontier, run_peers
-from examples.benchmarks.plots_frontier import draw_frontier
+from examples.benchmarks.frontier import draw_frontier, knee, measure_frontier, run_frontier, run_peers
 from examples.benchmarks.vector_peers import Ours, PseudoInverse, Refitted, lacking
 from scroll_tactile import sensors
 from scroll_tactile.datasets import Recordings

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.drawing import available
-from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.drawing import picture
 
 __all__ = ["draw_numerics", "points"]
 
@@ -62,49 +61,39 @@ def draw_numerics(path: Path, records: Records, *, title: str) -> None:
 
     Raises InputError where matplotlib is missing or the file cannot be written.
     """
-    if not available():
-        raise InputError('pictures need matplotlib: pip install "scroll-tactile[plots]"')
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     drawn = points(records)
     families = list(dict.fromkeys(family for _, family, _, _ in drawn))
     methods = list(dict.fromkeys(method for method, _, _, _ in drawn))
     colours = {method: COLOURS.get(method, f"C{i % 10}") for i, method in enumerate(methods)}
     markers = {family: LETTERS.get(family, MARKERS[i % len(MARKERS)]) for i, family in enumerate(families)}
-    figure = Figure(figsize=(13, 8), layout="constrained")
-    FigureCanvasAgg(figure)
-    panel = figure.add_subplot()
-    for method, family, seconds, error in drawn:
-        mark = markers[family]
-        height = error if error < NO_ANSWER else NO_ANSWER * BETWEEN ** (1 + methods.index(method))
-        panel.scatter(seconds * 1e6, height, s=70, alpha=0.85, color=colours[method], marker=mark, linewidths=0)
-    panel.set(xscale="log", yscale="log", title=title)
-    panel.set(xlabel="processor time for each row, µs (median of the family's cases)")
-    panel.set(ylabel="relative error of the weights (worst of the family's cases)")
-    top = NO_ANSWER * BETWEEN ** (len(methods) + 1)
-    panel.set_ylim(LEAST / 3, top)
-    panel.set_yticks([10.0**power for power in range(-15, 3, 3)])
-    panel.axhline(1.0, color="grey", linewidth=0.8, linestyle=":")
-    panel.axhline(2.0**-53, color="grey", linewidth=0.8, linestyle=":")
-    panel.axhspan(NO_ANSWER, top, color="grey", alpha=0.12, linewidth=0)
-    for height, words in ((1.0, "nothing is right"), (2.0**-53, "rounding of a double")):
+    with picture(path, 13, 8) as figure:
+        panel = figure.add_subplot()
+        for method, family, seconds, error in drawn:
+            mark = markers[family]
+            height = error if error < NO_ANSWER else NO_ANSWER * BETWEEN ** (1 + methods.index(method))
+            panel.scatter(seconds * 1e6, height, s=70, alpha=0.85, color=colours[method], marker=mark, linewidths=0)
+        panel.set(xscale="log", yscale="log", title=title)
+        panel.set(xlabel="processor time for each row, µs (median of the family's cases)")
+        panel.set(ylabel="relative error of the weights (worst of the family's cases)")
+        top = NO_ANSWER * BETWEEN ** (len(methods) + 1)
+        panel.set_ylim(LEAST / 3, top)
+        panel.set_yticks([10.0**power for power in range(-15, 3, 3)])
+        panel.axhline(1.0, color="grey", linewidth=0.8, linestyle=":")
+        panel.axhline(2.0**-53, color="grey", linewidth=0.8, linestyle=":")
+        panel.axhspan(NO_ANSWER, top, color="grey", alpha=0.12, linewidth=0)
+        for height, words in ((1.0, "nothing is right"), (2.0**-53, "rounding of a double")):
+            panel.annotate(
+                words, (0.004, height), xycoords=("axes fraction", "data"), va="bottom", fontsize=8, color="grey"
+            )
         panel.annotate(
-            words, (0.004, height), xycoords=("axes fraction", "data"), va="bottom", fontsize=8, color="grey"
+            "no answer, or an error of 1000 and more",
+            (0.004, NO_ANSWER * 1.3),
+            xycoords=("axes fraction", "data"),
+            fontsize=8,
+            color="grey",
         )
-    panel.annotate(
-        "no answer, or an error of 1000 and more",
-        (0.004, NO_ANSWER * 1.3),
-        xycoords=("axes fraction", "data"),
-        fontsize=8,
-        color="grey",
-    )
-    panel.grid(alpha=0.25)
-    _legends(figure, panel, colours, markers)
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:  # ValueError: a kind of file that matplotlib does not write
-        raise InputError(f"the plot cannot be written to {path}: {error}") from error
+        panel.grid(alpha=0.25)
+        _legends(figure, panel, colours, markers)
 
 
 def _legends(figure: Any, panel: Any, colours: Mapping[str, str], markers: Mapping[str, str]) -> None:

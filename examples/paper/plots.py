@@ -1,4 +1,4 @@
-"""The figures of the studies, drawn from their results; matplotlib is imported where it is used."""
+"""The pictures of the studies. All need matplotlib and raise InputError without it, or where no file can be made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The order of a pass; how accuracy went during it, material by material; and what was forgotten by its end.
+"""How accuracy went during a pass, material by material, and what was forgotten by its end.
 
 >>> forgetting([{"felt": 1.0}, {"felt": 0.75, "silk": 1.0}, {"felt": 0.5, "silk": 1.0, "wool": 1.0}])
 0.25
@@ -7,65 +7,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
-
-import numpy as np
+from typing import Any
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.metrics import mean_and_spread
 
-__all__ = [
-    "SCHEDULES",
-    "Point",
-    "Points",
-    "ScheduleName",
-    "accuracy_of",
-    "arrange",
-    "curve",
-    "forgetting",
-    "forgetting_of",
-    "part_ends",
-    "summary",
-    "tally",
-]
-
-ScheduleName = Literal["class-by-class", "reversed", "shuffled", "batches", "interleaved"]
-SCHEDULES: tuple[ScheduleName, ...] = get_args(ScheduleName)
-
-_BATCH = 4  # materials in a batch: five batches of twenty, the usual split of continual learning
-
-
-def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list[int]:
-    """The order in which N touches are learned: a permutation of 0 … N − 1.
-
-    materials: of each touch, N names. seed: 0 or more.
-    "class-by-class": all touches of one material, then of the next, materials in a drawn order; "reversed": the
-    same backwards; "shuffled": at random; "batches": four materials at a time, shuffled among themselves;
-    "interleaved": one touch of every material, then the next of every one.
-
-    Raises InputError for another schedule.
-    """
-    if schedule not in SCHEDULES:
-        raise InputError(f"expected a schedule, one of {', '.join(SCHEDULES)}; came {schedule!r}")
-    random = np.random.default_rng(seed)
-    names = sorted(set(materials))
-    turn = {names[place]: at for at, place in enumerate(random.permutation(len(names)))}
-    draw = random.permutation(len(materials))
-    seen: dict[str, int] = {}
-    repetition = []
-    for name in materials:
-        repetition.append(seen.get(name, 0))
-        seen[name] = repetition[-1] + 1
-    places = range(len(materials))
-    if schedule == "shuffled":
-        return [int(at) for at in draw]
-    if schedule == "batches":
-        return sorted(places, key=lambda at: (turn[materials[at]] // _BATCH, draw[at]))
-    if schedule == "interleaved":
-        return sorted(places, key=lambda at: (repetition[at], turn[materials[at]]))
-    order = sorted(places, key=lambda at: (turn[materials[at]], repetition[at]))
-    return order[::-1] if schedule == "reversed" else order
-
+__all__ = ["Point", "Points", "accuracy_of", "curve", "forgetting", "forgetting_of", "summary", "tally"]
 
 Point = dict[str, list[int]]
 """At one moment: material → [right answers, answers]."""
@@ -123,18 +70,6 @@ def forgetting_of(points: Points) -> float | None:
     """`forgetting` of counts."""
     ordered = [points[key] for key in sorted(points, key=int)]
     return forgetting([{name: right / asked for name, (right, asked) in point.items()} for point in ordered])
-
-
-def part_ends(schedule: ScheduleName, materials: Sequence[str]) -> list[int]:
-    """After how many touches each part of a pass ends; a pass has as many parts as materials.
-
-    materials: of each touch, in the order in which they are learned. Where they come one by one a part is a
-    material; else the parts are equally long: of twenty materials, twentieths.
-    """
-    total, kinds = len(materials), len(set(materials))
-    if schedule in ("class-by-class", "reversed"):
-        return [at for at in range(1, total + 1) if at == total or materials[at] != materials[at - 1]]
-    return [round(total * part / kinds) for part in range(1, kinds + 1)]
 
 
 def summary(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

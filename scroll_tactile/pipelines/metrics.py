@@ -2,21 +2,18 @@
 
 >>> accuracy(["felt", "silk"], ["felt", "wool"])
 0.5
->>> auroc([0.9, 0.8], [0.1, 0.8])
-0.875
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["accuracy", "auroc", "calibration_error", "confusion_counts", "mean_and_spread"]
+__all__ = ["accuracy", "calibration_error", "mean_and_spread"]
 
 
 def accuracy(truth: Sequence[str | None], said: Sequence[str | None]) -> float:
@@ -44,27 +41,6 @@ def calibration_error(probability: npt.ArrayLike, right: npt.ArrayLike, bins: in
     gaps = np.zeros(bins)
     np.add.at(gaps, place, hits - chances)  # n_b times the difference of the means
     return float(np.abs(gaps).sum() / len(chances))
-
-
-def auroc(positive: npt.ArrayLike, negative: npt.ArrayLike) -> float:
-    """Area under the ROC curve, the chance that a positive scores above a negative, ties counted half.
-
-    From ranks: (R − P(P+1)/2) / (P·N), R being the sum of the positives' ranks among all, equal scores sharing
-    their mean rank (Mann and Whitney). positive, negative: scores, shapes (P,) and (N,).
-    Raises InputError where either is empty.
-    """
-    above = np.asarray(positive, dtype=np.float64)
-    below = np.asarray(negative, dtype=np.float64)
-    if not len(above) or not len(below):
-        raise InputError(f"expected scores of both kinds; came {len(above)} positive and {len(below)} negative")
-    scores = np.concatenate([above, below])
-    order = np.argsort(scores, kind="stable")
-    ranks = np.empty(len(scores))
-    edges = np.flatnonzero(np.diff(scores[order], prepend=np.nan, append=np.nan) != 0)
-    for begin, end in pairwise(edges):
-        ranks[order[begin:end]] = (begin + end + 1) / 2
-    count = len(above)
-    return float((ranks[:count].sum() - count * (count + 1) / 2) / (count * len(below)))
 
 
 def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:

@@ -1,25 +1,23 @@
-"""Touches as they would have been felt otherwise: shorter, faster, through noise, broken wires or a drifting sensor.
+"""Touches as another session would record them: shorter, faster, noisy, with dead channels or a drifting sensor.
 
 Each perturbation makes a stream of a stream. What is drawn is drawn from a seed and the stream's content hash, so
 that it does not depend on which other streams are tested, or in what order. With no strength a stream is returned as
-it is. Test streams only are perturbed: what a system learns from is its own affair.
+it is. Only test streams are perturbed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Image, changed, resize
 from scroll_tactile.signals.copies import hiss, silence, wander
 from scroll_tactile.signals.stream import Stream, fewest_readings
 
-__all__ = ["STUDIES", "Study", "dead", "drift", "length", "noise", "speed"]
+__all__ = ["dead", "drift", "length", "noise", "speed"]
 
 _KINDS = {"noise": 0, "dead": 1, "drift": 2}
 
@@ -57,7 +55,7 @@ def noise(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
 
 
 def dead(stream: Stream, share: float, seed: int = 0) -> Stream:
-    """Broken wires: a share of the channels, rounded, reads the low end of the sensor's range from beginning to end.
+    """Dead channels: a share of them, rounded, reads the low end of the sensor's range from beginning to end.
 
     Which channels is drawn anew for each touch. Raises InputError for a share above 1.
     """
@@ -73,40 +71,6 @@ def drift(stream: Stream, strength: float, seed: int = 0) -> Stream:
     drawn evenly between ± these for each channel. Clipped to the range.
     """
     return _drawn(stream, "drift", strength, seed, lambda image, rng: wander(image, strength, strength, rng))
-
-
-@dataclass(frozen=True)
-class Study:
-    """A way in which test touches are perturbed, and how strongly.
-
-    perturb: the perturbation. strengths: those of a full study. quick: those of a quick one. unit: what they are.
-    """
-
-    name: str
-    perturb: Callable[[Stream, float, int], Stream]
-    strengths: tuple[float, ...]
-    quick: tuple[float, ...]
-    unit: str
-
-    def of(self, sensor: Sensor, *, quick: bool = False) -> tuple[float, ...]:
-        """The strengths for a sensor: of lengths those below the usual one, and then it."""
-        chosen = self.quick if quick else self.strengths
-        if self.name != "length":
-            return chosen
-        return (*(one for one in chosen if one < sensor.duration), sensor.duration)
-
-
-STUDIES = {
-    study.name: study
-    for study in (
-        Study("length", length, (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0), (0.3,), "seconds"),
-        Study("speed", speed, (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0), (0.5, 1.0, 2.0), "× the usual speed"),
-        Study("noise", noise, (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0), (0.0, 0.5), "share of the range"),
-        Study("dead", dead, (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5), (0.0, 0.2), "share of the channels"),
-        Study("drift", drift, (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, 0.05), "share of the range, and of the gain"),
-    )
-}
-"""The studies on folds as published; `robustness` adds "session", which perturbs nothing."""
 
 
 def _drawn(

@@ -5,7 +5,7 @@ import pytest
 
 from examples.paper.runs.cached import Cached
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
-from examples.paper.studies.peers_replay import GDumb, Replaying, fit_softmax
+from examples.paper.studies.peers_replay import GDumb, Replaying
 from scroll_tactile import Kernels, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import embed_windows
@@ -109,14 +109,6 @@ class TestGDumb:
             peer.observe(rows[at], names[at])
             assert sum(peer.held.values()) <= 10
         assert sorted(peer.held.values()) == [2, 2, 3, 3]
-
-    def test_the_softmax_is_scikit_learns(self) -> None:
-        linear = pytest.importorskip("sklearn.linear_model")
-        rows, names = blobs()
-        places = np.array([NAMES.index(name) for name in names])
-        truth = linear.LogisticRegression(C=1.0, tol=1e-8, max_iter=2000).fit(rows, places)
-        ours = fit_softmax(rows, places, 4)
-        np.testing.assert_allclose(ours[:-1].T, truth.coef_, atol=2e-3)
 
     def test_no_buffer_is_refused(self) -> None:
         with pytest.raises(InputError, match="1 touch"):

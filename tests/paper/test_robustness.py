@@ -9,8 +9,8 @@ from test_perturbations import PAD
 
 from examples.paper import drawing as plots
 from examples.paper.plots import draw_robustness, robustness_curves
-from examples.paper.studies.robustness_study import Robustness, ours, summary, worst
-from scroll_tactile import Kernels, Robust
+from examples.paper.studies.robustness_study import Robustness, ours, summary
+from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import DatasetError, InputError
@@ -129,7 +129,7 @@ def test_ours_learns_with_its_copies_and_without():
     assert found[0.2, True] >= found[0.2, False]
 
 
-def test_means_over_folds_and_the_worst_of_a_stretch():
+def test_means_over_folds():
     base = {"study": "speed", "system": "s", "augmented": True}
     shares = [(0.5, 0.8), (0.5, 0.6), (1.0, 0.9), (1.0, 0.9), (4.0, 0.1)]
     rows = summary([base | {"strength": strength, "accuracy": share} for strength, share in shares])
@@ -138,8 +138,6 @@ def test_means_over_folds_and_the_worst_of_a_stretch():
         (1, 0.9, 2),
         (4, 0.1, 1),
     ]
-    assert worst(rows, "speed", "s", True, 0.5, 2) == pytest.approx(0.7)
-    assert worst(rows, "speed", "s", False, 0.5, 2) is None
 
 
 def test_the_picture(tmp_path):

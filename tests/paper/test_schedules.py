@@ -2,11 +2,10 @@
 
 import pytest
 
-from examples.paper.studies.schedules import try_schedules
+from examples.paper.studies.schedules import SCHEDULES, ScheduleName, arrange, try_schedules
 from scroll_tactile import sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.continual import SCHEDULES, ScheduleName, arrange
 
 NAMES = [f"m{number}" for number in range(8) for _ in range(3)]
 

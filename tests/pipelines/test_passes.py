@@ -3,7 +3,6 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, TactileLearner, sensors
@@ -11,7 +10,9 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
-from scroll_tactile.pipelines.metrics import accuracy, auroc, calibration_error, confusion_counts, mean_and_spread
+from scroll_tactile.pipelines.drawing import confusion_counts
+from scroll_tactile.pipelines.memories import open_memory
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 
 
@@ -29,26 +30,12 @@ class TestMetrics:
         assert calibration_error([1.0, 1.0], [1, 1]) == 0.0
         assert calibration_error([0.0], [0]) == 0.0
 
-    def test_auroc_counts_ties_half(self) -> None:
-        assert auroc([3, 2], [1, 0]) == 1.0
-        assert auroc([0], [1]) == 0.0
-        assert auroc([1, 1], [1, 1]) == 0.5
-        assert auroc([math.inf, 1], [1, 0]) == pytest.approx(3.5 / 4)
-
-    @pytest.mark.parametrize("seed", range(5))
-    def test_auroc_is_scikit_learns(self, seed: int) -> None:
-        metrics = pytest.importorskip("sklearn.metrics")
-        random = np.random.default_rng(seed)
-        scores = random.integers(0, 20, 200) / 7  # many ties
-        labels = random.random(200) < 0.3
-        assert auroc(scores[labels], scores[~labels]) == pytest.approx(metrics.roc_auc_score(labels, scores))
-
     def test_mean_and_spread(self) -> None:
         assert mean_and_spread([1.0, 3.0]) == (2.0, pytest.approx(math.sqrt(2)))
         assert mean_and_spread([0.5]) == (0.5, 0.0)
 
     def test_nothing_to_measure_is_refused(self) -> None:
-        for call in (lambda: accuracy([], []), lambda: auroc([], [1]), lambda: calibration_error([0.5], [])):
+        for call in (lambda: accuracy([], []), lambda: calibration_error([0.5], [])):
             with pytest.raises(InputError):
                 call()
         with pytest.raises(InputError, match="probabilities"):

@@ -19,21 +19,12 @@ from examples.paper.runs.cached import Cached
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
-from scroll_tactile import Embedding
+from examples.paper.studies.schedules import ScheduleName, arrange, part_ends
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.continual import (
-    Points,
-    ScheduleName,
-    accuracy_of,
-    arrange,
-    curve,
-    forgetting_of,
-    part_ends,
-    tally,
-)
+from scroll_tactile.pipelines.continual import Points, accuracy_of, curve, forgetting_of, tally
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
-from scipy.special import logsumexp, softmax
+from scipy.special import softmax
 
 from examples.paper.studies.peers import ContinualPeer
 from scroll_tactile.errors import InputError
 
-__all__ = ["GDumb", "Replaying", "fit_softmax"]
+__all__ = ["GDumb", "Replaying"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,13 +47,17 @@ class GDumb(ContinualPeer):
         rows.append(features)
 
     def scores(self, features: FloatArray) -> FloatArray:
-        """Logits of the softmax."""
+        """Log-probabilities of the softmax. Needs scikit-learn."""
+        from sklearn.linear_model import LogisticRegression
+
         rows = np.stack([row for held in self._buffer.values() for row in held])
         places = np.array([place for place, held in self._buffer.items() for _ in held])
         mean, spread = rows.mean(axis=0), rows.std(axis=0)
         spread[spread < 1e-9] = 1.0
-        weights = fit_softmax((rows - mean) / spread, places, len(self.materials))
-        logits: FloatArray = (features - mean) / spread @ weights[:-1] + weights[-1]
+        if len(self.materials) == 1:
+            return np.zeros((len(features), 1))
+        model = LogisticRegression(tol=1e-6, max_iter=5000).fit((rows - mean) / spread, places)
+        logits: FloatArray = model.predict_log_proba((features - mean) / spread)
         return logits
 
 
@@ -118,25 +121,3 @@ class Replaying(ContinualPeer):
         """Logits of the softmax."""
         logits: FloatArray = self._standardised(features) @ self._weights
         return logits
-
-
-def fit_softmax(rows: FloatArray, places: npt.NDArray[np.int64], classes: int) -> FloatArray:
-    """The softmax with the least Σ_i log-loss_i + |W|²/2, the bias unpenalised, shape (d + 1, C), bias last.
-
-    rows: features of shape (N, d). places: the class of each, shape (N,). scikit-learn's LogisticRegression has this
-    optimum; scipy's L-BFGS finds it without the dependency.
-    """
-    targets = np.eye(classes)[places]
-
-    def loss(flat: FloatArray) -> tuple[float, FloatArray]:
-        weights = flat.reshape(-1, classes)
-        logits = rows @ weights[:-1] + weights[-1]
-        errors = softmax(logits, axis=1) - targets
-        value = (logsumexp(logits, axis=1) - (logits * targets).sum(axis=1)).sum() + np.square(weights[:-1]).sum() / 2
-        slope = np.concatenate([rows.T @ errors + weights[:-1], errors.sum(axis=0, keepdims=True)])
-        return float(value), slope.ravel()
-
-    start = np.zeros((rows.shape[1] + 1) * classes)
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 300})
-    weights: FloatArray = found.x.reshape(-1, classes)
-    return weights

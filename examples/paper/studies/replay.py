@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile import Kernels
+from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, ask, hold_out, observe_all
-from scroll_tactile.pipelines.continual import ScheduleName, arrange
-from scroll_tactile.pipelines.metrics import auroc, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 
@@ -158,7 +157,10 @@ class _ReplayFold:
         return learner.digest()
 
     def _novelty(self) -> float:
-        """Mean AUROC over five rotations, a fifth of the materials held out in each."""
+        """Mean AUROC over five rotations, a fifth of the materials held out in each. Needs scikit-learn."""
+        from scipy.stats import rankdata
+        from sklearn.metrics import roc_auc_score
+
         names = sorted({name for name, _ in self.lessons}, key=_number)
         areas = []
         for rotation in range(_ROTATIONS):
@@ -169,7 +171,7 @@ class _ReplayFold:
             answers = ask(learner, self.exam)
             novelty = np.array([prediction.novelty for prediction in answers.predictions])
             new = np.array([name in out for name in answers.truth])
-            areas.append(auroc(novelty[new], novelty[~new]))
+            areas.append(roc_auc_score(new, rankdata(novelty)))  # ranks: a novelty may be infinite
         return float(np.mean(areas))
 
     def _teach(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:

@@ -24,16 +24,45 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
 from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
-from scroll_tactile.pipelines.robustness import STUDIES
+from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["NAMES", "PAPER", "SESSION", "Learned", "Make", "Robustness", "TestedSystem", "ours", "summary", "worst"]
+__all__ = ["NAMES", "PAPER", "PERTURBED", "SESSION", "Learned", "Make", "Robustness", "TestedSystem", "ours", "summary"]
 
-SESSION = "session"
-NAMES = (*STUDIES, SESSION)
+
+@dataclass(frozen=True)
+class Perturbation:
+    """A way in which test touches differ, and how strongly.
+
+    perturb: makes a stream of a stream, a strength and a seed. strengths: those of a full study. quick: of a quick one.
+    """
+
+    perturb: Callable[[Stream, float, int], Stream]
+    strengths: tuple[float, ...]
+    quick: tuple[float, ...]
+
+    def of(self, sensor: Sensor, *, quick: bool = False) -> tuple[float, ...]:
+        """The strengths for a sensor: of lengths those below the usual one, and then it."""
+        chosen = self.quick if quick else self.strengths
+        if self.perturb is not length:
+            return chosen
+        return (*(seconds for seconds in chosen if seconds < sensor.duration), sensor.duration)
+
+
+PERTURBED = {
+    "length": Perturbation(length, (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0), (0.3,)),
+    "speed": Perturbation(speed, (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0), (0.5, 1.0, 2.0)),
+    "noise": Perturbation(noise, (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0), (0.0, 0.5)),
+    "dead": Perturbation(dead, (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5), (0.0, 0.2)),
+    "drift": Perturbation(drift, (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, 0.05)),
+}
+"""Study → how its test touches differ."""
+
+SESSION = "session"  # folds of successive repetitions; nothing is perturbed
+NAMES = (*PERTURBED, SESSION)
 """The names of the studies."""
 
 PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
@@ -164,7 +193,7 @@ class Robustness:
         return [
             (study, strength, fold)
             for study in self.studies
-            for strength in ((0.0,) if study == SESSION else STUDIES[study].of(sensor, quick=self.quick))
+            for strength in ((0.0,) if study == SESSION else PERTURBED[study].of(sensor, quick=self.quick))
         ]
 
     def _require_settings(self, notes: RunFile, name: str) -> None:
@@ -207,7 +236,7 @@ class Robustness:
             yield about | notes.notes[key]
 
     def _perturbed(self, exam: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
-        perturb = STUDIES[study].perturb
+        perturb = PERTURBED[study].perturb
         return [(material, perturb(stream, strength, self.seed)) for material, stream in exam]
 
     def _split(self, fold: int, session: bool) -> tuple[list[Labelled], list[Labelled]]:
@@ -227,16 +256,3 @@ def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
         rows.append(about | {"mean": mean, "sd": spread, "folds": len(values)})
     return rows
-
-
-def worst(
-    rows: Sequence[Mapping[str, Any]], study: str, system: str, augmented: bool, least: float, most: float
-) -> Any:
-    """The lowest mean of `summary`'s rows among strengths from least to most; None where none was measured."""
-    among = [
-        row["mean"]
-        for row in rows
-        if (row["study"], row["system"], row["augmented"]) == (study, system, augmented)
-        and least <= row["strength"] <= most
-    ]
-    return min(among, default=None)

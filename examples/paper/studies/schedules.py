@@ -1,4 +1,4 @@
-"""The proof that the order in which touches are learned makes no difference, to the bit."""
+"""The order of a pass, and the proof that the order in which touches are learned makes no difference, to the bit."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -17,7 +18,57 @@ from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["Trial", "try_schedules"]
+__all__ = ["SCHEDULES", "ScheduleName", "Trial", "arrange", "part_ends", "try_schedules"]
+
+
+ScheduleName = Literal["class-by-class", "reversed", "shuffled", "batches", "interleaved"]
+SCHEDULES: tuple[ScheduleName, ...] = get_args(ScheduleName)
+
+_BATCH = 4  # materials in a batch: five batches of twenty, the usual split of continual learning
+
+
+def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list[int]:
+    """The order in which N touches are learned: a permutation of 0 … N − 1.
+
+    materials: of each touch, N names. seed: 0 or more.
+    "class-by-class": all touches of one material, then of the next, materials in a drawn order; "reversed": the
+    same backwards; "shuffled": at random; "batches": four materials at a time, shuffled among themselves;
+    "interleaved": one touch of every material, then the next of every one.
+
+    Raises InputError for another schedule.
+    """
+    if schedule not in SCHEDULES:
+        raise InputError(f"expected a schedule, one of {', '.join(SCHEDULES)}; came {schedule!r}")
+    random = np.random.default_rng(seed)
+    names = sorted(set(materials))
+    turn = {names[place]: at for at, place in enumerate(random.permutation(len(names)))}
+    draw = random.permutation(len(materials))
+    seen: dict[str, int] = {}
+    repetition = []
+    for name in materials:
+        repetition.append(seen.get(name, 0))
+        seen[name] = repetition[-1] + 1
+    places = range(len(materials))
+    if schedule == "shuffled":
+        return [int(at) for at in draw]
+    if schedule == "batches":
+        return sorted(places, key=lambda at: (turn[materials[at]] // _BATCH, draw[at]))
+    if schedule == "interleaved":
+        return sorted(places, key=lambda at: (repetition[at], turn[materials[at]]))
+    order = sorted(places, key=lambda at: (turn[materials[at]], repetition[at]))
+    return order[::-1] if schedule == "reversed" else order
+
+
+def part_ends(schedule: ScheduleName, materials: Sequence[str]) -> list[int]:
+    """After how many touches each part of a pass ends; a pass has as many parts as materials.
+
+    materials: of each touch, in the order in which they are learned. Where they come one by one a part is a
+    material; else the parts are equally long: of twenty materials, twentieths.
+    """
+    total, kinds = len(materials), len(set(materials))
+    if schedule in ("class-by-class", "reversed"):
+        return [at for at in range(1, total + 1) if at == total or materials[at] != materials[at - 1]]
+    return [round(total * part / kinds) for part in range(1, kinds + 1)]
 
 
 @dataclass(frozen=True)

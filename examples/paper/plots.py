@@ -62,8 +62,8 @@ def draw_efficiency(path: Path, curves: Rows) -> None:
             mine = [curve for curve in curves if curve["dataset"] == dataset]
             for panel, by in ((left, "epochs"), (right, "streams")):
                 for curve in (curve for curve in mine if curve["by"] == by):
-                    at, mean, spread = np.asarray(curve["points"], dtype=float).T
-                    panel.errorbar(at, 100 * mean, 100 * spread, marker=".", capsize=2, label=curve["system"])
+                    place, mean, spread = np.asarray(curve["points"], dtype=float).T
+                    panel.errorbar(place, 100 * mean, 100 * spread, marker=".", capsize=2, label=curve["system"])
                 panel.grid(alpha=0.3)
                 if panel.get_legend_handles_labels()[0]:
                     panel.legend(fontsize=8)

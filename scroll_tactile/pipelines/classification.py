@@ -16,70 +16,72 @@ from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Answers", "Labelled", "ask", "hold_out", "missing", "observe_all"]
+__all__ = ["Answers", "Labelled", "evaluate", "hold_out", "missing", "observe_all"]
 
 Labelled = tuple[str, Stream]
-"""A material and how it felt."""
+"""A material and a touch of it."""
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What a learner said to streams of known origin: N materials, and N predictions."""
+    """A learner's answers to streams of known material: N materials, and N predictions."""
 
     truth: list[str]
     predictions: list[Prediction]
 
     @property
-    def said(self) -> list[str | None]:
+    def predicted(self) -> list[str | None]:
         """The material of each prediction."""
         return [prediction.material for prediction in self.predictions]
 
     @property
     def accuracy(self) -> float:
         """The share of right answers."""
-        return accuracy(self.truth, self.said)
+        return accuracy(self.truth, self.predicted)
 
     def of(self, material: str) -> Answers:
         """The answers to streams of one material."""
-        places = [at for at, name in enumerate(self.truth) if name == material]
-        return Answers([material] * len(places), [self.predictions[at] for at in places])
+        places = [i for i, name in enumerate(self.truth) if name == material]
+        return Answers([material] * len(places), [self.predictions[i] for i in places])
 
     def confusions(self) -> list[tuple[str, str, int]]:
-        """(truth, said, count) of what was taken for something else, the most frequent first."""
+        """(truth, predicted, count) of what was taken for something else, the most frequent first."""
         pairs = Counter(
-            (truth, said) for truth, said in zip(self.truth, self.said, strict=True) if said and said != truth
+            (truth, predicted)
+            for truth, predicted in zip(self.truth, self.predicted, strict=True)
+            if predicted and predicted != truth
         )
         return [(*pair, count) for pair, count in sorted(pairs.items(), key=lambda entry: (-entry[1], entry[0]))]
 
 
 def hold_out(recordings: Recordings, tested: npt.NDArray[np.bool_]) -> tuple[list[Labelled], list[Labelled]]:
-    """The touches that are learned, and those that are held out to be asked about: of N, bool of shape (N,)."""
+    """The touches that are learned, and those that are held out for the test: of N, bool of shape (N,)."""
     touches = list(zip(recordings.materials, recordings.streams, tested.tolist(), strict=True))
     learned = [(name, stream) for name, stream, out in touches if not out]
     return learned, [(name, stream) for name, stream, out in touches if out]
 
 
-def ask(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: float | None = None) -> Answers:
+def evaluate(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: float | None = None) -> Answers:
     """Predict every touch, or its first `seconds` only."""
     cut = [(name, stream if seconds is None else stream.first(seconds)) for name, stream in touches]
     return Answers([name for name, _ in cut], [learner.predict(stream) for _, stream in cut])
 
 
-def missing(touches: Sequence[Labelled], felt: Mapping[str, int]) -> list[Labelled]:
-    """Those of `touches` that a memory has still to observe, given how many of each material it has felt.
+def missing(touches: Sequence[Labelled], observed: Mapping[str, int]) -> list[Labelled]:
+    """Those of `touches` that a memory has still to observe, given how many of each material it has observed.
 
     A memory that was filled in this very order and interrupted holds the first few of every material.
 
     Raises InputError where it holds more than these touches: it is another pass's.
     """
     planned = Counter(name for name, _ in touches)
-    extra = {name: count for name, count in felt.items() if count > planned[name]}
+    extra = {name: count for name, count in observed.items() if count > planned[name]}
     if extra:
         raise InputError(
-            f"expected a memory that this run began; it holds more than the run would teach it: {extra}. "
+            f"expected a memory that this run began; it holds more than the run would train it on: {extra}. "
             "Take another folder"
         )
-    left = dict(felt)
+    left = dict(observed)
     remaining = []
     for name, stream in touches:
         if left.get(name, 0):

@@ -24,11 +24,11 @@ Points = dict[str, Point]
 def forgetting(shares: Sequence[Mapping[str, float]]) -> float | None:
     """Mean over materials of the best earlier accuracy less the final one (Chaudhry et al. 2018, arXiv 1801.10112).
 
-    F = mean_j (max_{l < k} a_{l,j} − a_{k,j}), over all materials j that were asked about before the last moment k:
+    F = mean_j (max_{l < k} a_{l,j} − a_{k,j}), over all materials j that were tested before the last moment k:
     class by class all but the last. Below 0 where what was learned later helped.
 
-    shares: material → accuracy on it, from 0 to 1, at successive moments. None where no material was asked about
-    earlier. Raises InputError where a material is no longer asked about at the last moment, or there is no moment.
+    shares: material → accuracy on it, from 0 to 1, at successive moments. None where no material was tested
+    earlier. Raises InputError where a material is no longer tested at the last moment, or there is no moment.
     """
     if not shares:
         raise InputError("expected accuracies at one moment at least; came none")
@@ -44,12 +44,12 @@ def forgetting(shares: Sequence[Mapping[str, float]]) -> float | None:
     return sum(share - final[material] for material, share in best.items()) / len(best)
 
 
-def tally(truth: Sequence[str], said: Sequence[str | None]) -> Point:
+def tally(truth: Sequence[str], predicted: Sequence[str | None]) -> Point:
     """Count right answers by material. Raises InputError where there are not as many answers as truths."""
-    if len(truth) != len(said):
-        raise InputError(f"expected as many answers as truths; came {len(said)} and {len(truth)}")
+    if len(truth) != len(predicted):
+        raise InputError(f"expected as many answers as truths; came {len(predicted)} and {len(truth)}")
     point: Point = {}
-    for name, answer in zip(truth, said, strict=True):
+    for name, answer in zip(truth, predicted, strict=True):
         counts = point.setdefault(name, [0, 0])
         counts[0] += answer == name
         counts[1] += 1
@@ -76,7 +76,7 @@ def summary(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row for each method and size of the buffer: means and standard deviations over the folds.
 
     folds: what `Continual.run` yields. A row has the method, its size (None: it has no buffer), accuracy and forgetting
-    as {"mean", "sd"} (None: not measured), and the mean curve. Rows of `f*` also tell how many folds kept theirs, and
+    as {"mean", "sd"} (None: not measured), and the mean curve. Rows of `f*` also hold how many folds kept theirs, and
     the mean seconds of a fine-tune, exemplars, and bytes of one.
     """
     if not folds:

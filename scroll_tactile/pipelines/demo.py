@@ -10,7 +10,7 @@ from typing import Any
 from scroll_tactile import Kernels
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Answers, Labelled, ask, observe_all
+from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
@@ -54,7 +54,7 @@ class Demo:
     """A demonstration: a sensor, a seed, and how many materials and touches.
 
     sensor: any but a camera. seed: of the scene. materials: how many, at most twenty. touches: learned of each.
-    held_out: touches of each that are only evaluated. features: of the embedding; the usual 1008 take three times
+    held_out: touches of each that are only tested. features: of the embedding; the usual 1008 take three times
     as long to fit a readout to, and here twenty are fitted. folder: where the memory is kept, None for nowhere.
     """
 
@@ -70,10 +70,10 @@ class Demo:
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", Scene(self.sensor, self.seed))
 
-    def run(self, tell: Callable[[Step], object] = lambda step: None) -> Outcome:
-        """Learn and evaluate; `tell` is called with each material once it is learned, again after a restart.
+    def run(self, report: Callable[[Step], object] = lambda step: None) -> Outcome:
+        """Learn and test; `report` receives every material when it is learned, those of an interrupted run first.
 
-        A run with a folder that was interrupted, in whatever way, goes on where it was.
+        A run with a folder that was interrupted, in whatever way, resumes where it was.
 
         Raises InputError for a folder of something else, and what the learner and the store raise.
         """
@@ -86,7 +86,7 @@ class Demo:
         }
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
         with self._open() as learner:
-            return self._learn(learner, notes, tell)
+            return self._learn(learner, notes, report)
 
     def _open(self) -> TactileLearner:
         embedding = Kernels(dimension=self.features)
@@ -94,7 +94,7 @@ class Demo:
             return TactileLearner(sensor=self.sensor, embedding=embedding)
         return TactileLearner.open(self.folder / "memory", sensor=self.sensor, embedding=embedding)
 
-    def _learn(self, learner: TactileLearner, notes: RunFile, tell: Callable[[Step], object]) -> Outcome:
+    def _learn(self, learner: TactileLearner, notes: RunFile, report: Callable[[Step], object]) -> Outcome:
         steps: list[Step] = []
         train: list[Labelled] = []
         test: list[Labelled] = []
@@ -106,18 +106,18 @@ class Demo:
             kept = notes.notes.get(name)
             if kept is None:
                 observed += observe_all(learner, train)
-                answers = ask(learner, test)
+                answers = evaluate(learner, test)
                 kept = {"own": answers.of(name).accuracy, "all": answers.accuracy}
                 notes.note(name, kept)
             steps.append(Step(name, kept["own"], kept["all"]))
-            tell(steps[-1])
+            report(steps[-1])
         if len(answers.truth) < len(test):  # a finished run was started again
             observed += observe_all(learner, train)
-            answers = ask(learner, test)
+            answers = evaluate(learner, test)
         return Outcome(answers, steps, self._novel(learner), self._short(learner), observed, learner.digest())
 
     def _touches(self, name: str, first: int, count: int) -> list[Labelled]:
-        return [(name, self.scene.touch(name, at)) for at in range(first, first + count)]
+        return [(name, self.scene.touch(name, i)) for i in range(first, first + count)]
 
     def _novel(self, learner: TactileLearner) -> dict[str, Prediction]:
         other = Scene(self.sensor, self.seed + 1)
@@ -126,4 +126,4 @@ class Demo:
     def _short(self, learner: TactileLearner) -> Answers:
         repetition = self.touches + self.held_out
         touches = [(name, self.scene.touch(name, repetition)) for name in self.scene.materials[: self.materials]]
-        return ask(learner, touches, seconds=0.3)
+        return evaluate(learner, touches, seconds=0.3)

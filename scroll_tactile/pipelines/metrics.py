@@ -16,13 +16,13 @@ from scroll_tactile.errors import InputError
 __all__ = ["accuracy", "calibration_error", "mean_and_spread"]
 
 
-def accuracy(truth: Sequence[str | None], said: Sequence[str | None]) -> float:
+def accuracy(truth: Sequence[str | None], predicted: Sequence[str | None]) -> float:
     """The share of answers that are right: Σ_i [said_i = truth_i] / N.
 
-    truth, said: N materials each. Raises InputError where N differs or is 0.
+    truth, predicted: N materials each. Raises InputError where N differs or is 0.
     """
-    _require_pairs(len(truth), len(said))
-    return sum(one == other for one, other in zip(truth, said, strict=True)) / len(truth)
+    _require_pairs(len(truth), len(predicted))
+    return sum(true == guess for true, guess in zip(truth, predicted, strict=True)) / len(truth)
 
 
 def calibration_error(probability: npt.ArrayLike, right: npt.ArrayLike, bins: int = 15) -> float:

@@ -43,13 +43,13 @@ def test_each_image_excites_its_own_unit_more_than_noise_does(net, images):
 def test_the_seed_decides_and_nothing_else_is_touched(net, images):
     weights = {name: tensor.clone() for name, tensor in net.state_dict().items()}
     state = torch.random.get_rng_state()
-    told = []
-    again = maximise(net, seed=1, steps=8, size=24, told=lambda done, of: told.append((done, of)))
+    report = []
+    again = maximise(net, seed=1, steps=8, size=24, report=lambda done, of: report.append((done, of)))
     assert again.tobytes() == images.tobytes()
     assert maximise(net, seed=2, steps=1, size=24).tobytes() != maximise(net, seed=1, steps=1, size=24).tobytes()
     assert torch.equal(torch.random.get_rng_state(), state)
     assert all(torch.equal(tensor, weights[name]) for name, tensor in net.state_dict().items())
-    assert told == [(step, 8) for step in range(1, 9)]
+    assert report == [(step, 8) for step in range(1, 9)]
 
 
 @pytest.mark.parametrize("stem", ["torchvision", "universal"])
@@ -98,7 +98,7 @@ def test_filters_that_moved_the_same_way_are_told_from_those_that_did_not(net):
         "b": moved(net, ways[1], 0.1),
         "other": ResNet.random(9),
     }
-    images = [np.random.default_rng(at).uniform(-1, 1, (19, 60)).astype(np.float32) for at in range(3)]
+    images = [np.random.default_rng(i).uniform(-1, 1, (19, 60)).astype(np.float32) for i in range(3)]
     found = {(pair.one, pair.two): pair for pair in compare(networks, images, start="start")}
     assert len(found) == 10
     assert math.isnan(found["start", "a"].moved)

@@ -17,8 +17,8 @@ from scroll_tactile.signals.augmentation import Augmentation
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 SCENE = Scene(PATCH, seed=0)
 NAMES = SCENE.materials[:3]
-LESSONS = [(name, SCENE.touch(name, at)) for name in NAMES for at in range(12)]
-EXAM = [(name, SCENE.touch(name, at)) for name in NAMES for at in range(12, 18)]
+LESSONS = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12)]
+EXAM = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12, 18)]
 
 
 def quiet(what: str, done: int, of: int) -> None:
@@ -26,11 +26,11 @@ def quiet(what: str, done: int, of: int) -> None:
 
 
 def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatch):
-    taught, held = [], []
+    trained, held = [], []
     fit = Svm.fit
 
     def watched(self, streams, materials, validation, *more):
-        taught.append(list(streams))
+        trained.append(list(streams))
         held.append([stream for _, stream in validation])
         fit(self, streams, materials, validation, *more)
 
@@ -40,13 +40,13 @@ def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatc
         make(LESSONS, augmented, quiet)
     assert settings["augmentation"]["copies"] == COPIES
     felt = {stream.key for _, stream in LESSONS}
-    for streams, validation in zip(taught, held, strict=True):
+    for streams, validation in zip(trained, held, strict=True):
         assert {stream.key for stream in validation} <= felt
         assert len(validation) == 3
         assert not {stream.key for stream in validation} & {stream.key for stream in streams}
-    assert {stream.key for stream in taught[0]} == felt - {stream.key for stream in held[0]}
-    assert len(taught[1]) == len(taught[0]) * (1 + COPIES)
-    assert len({stream.key for stream in taught[1]}) > 1.5 * len(taught[0])
+    assert {stream.key for stream in trained[0]} == felt - {stream.key for stream in held[0]}
+    assert len(trained[1]) == len(trained[0]) * (1 + COPIES)
+    assert len({stream.key for stream in trained[1]}) > 1.5 * len(trained[0])
 
 
 def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
@@ -64,12 +64,12 @@ def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
 def test_some_touches_stay_as_they_were_felt():
     stream = SCENE.touch("felt", 0)
 
-    def same(one):
-        return len(one) == len(stream) and np.allclose(one.readings, stream.readings, rtol=0, atol=1e-3)
+    def same(item):
+        return len(item) == len(stream) and np.allclose(item.readings, stream.readings, rtol=0, atol=1e-3)
 
     for share, (least, most) in {0.0: (1, 1), 0.3: (0.5, 0.9), 1.0: (0, 0)}.items():
         made = Sometimes(share=share).streams([stream] * 60, np.random.default_rng(0))
-        assert least <= np.mean([same(one) for one in made]) <= most
+        assert least <= np.mean([same(item) for item in made]) <= most
 
 
 def test_the_validation_is_drawn_by_the_seed_alone():

@@ -34,7 +34,7 @@ def biotac():
     scene = Scene(BIOTAC)
     names = [name for name in ("felt", "denim") for _ in range(6)]
     number = np.tile(np.arange(6), 2)
-    streams = [scene.touch(name, at, seconds=1) for name, at in zip(names, number.tolist(), strict=True)]
+    streams = [scene.touch(name, i, seconds=1) for name, i in zip(names, number.tolist(), strict=True)]
     return Recordings("BioTac-20", BIOTAC, streams, names, number, number % 3, ordered=True)
 
 
@@ -94,13 +94,13 @@ class TestRows:
         study, results = whole
         assert study.folder is not None
         again = Contactile(fabrics, ("least-squares-biotac",), weights, biotac, **SMALL, folder=study.folder)
-        told = []
+        reported = []
         notes = json.loads((study.folder / "contactile.json").read_text())
         first = notes["notes"].pop(results[1][0].key)
         (study.folder / "contactile.json").write_text(json.dumps(notes))
-        (_, figures), *_ = again.run(["hand"], lambda what, done, of: told.append(what))
+        (_, figures), *_ = again.run(["hand"], lambda what, done, of: reported.append(what))
         assert figures | {"seconds": 0} == first | {"seconds": 0}
-        assert not any("training" in what for what in told)
+        assert not any("training" in what for what in reported)
         (study.folder / "biotac.npz").write_bytes(b"half")
         notes["notes"].pop(results[1][0].key, None)
         (study.folder / "contactile.json").write_text(json.dumps(notes))
@@ -114,7 +114,7 @@ class TestWhatIsUnknown:
         known["fabric03"] = dict.fromkeys(known["fabric03"])
         some = replace(fabrics, compositions=known)
         study = Contactile(some, ("kernels",))
-        assert {name for name, _ in study.split(HAND).exam} == set(known) - {"fabric03"}
+        assert {name for name, _ in study.split(HAND).test} == set(known) - {"fabric03"}
         assert "fabric03" in study.split(HAND).materials
         (_, figures), *_ = study.run(["held-out"])
         assert figures["tested"] == 8 and figures["score"] == 1
@@ -134,15 +134,15 @@ class TestWhatIsUnknown:
         rng = np.random.default_rng(0)
         features = rng.standard_normal((60, 5))
         there = features[:, 0] > 0
-        names = ["yes" if one else "no" for one in there]
+        names = ["yes" if fraction else "no" for fraction in there]
         names[:20] = ["what"] * 20
         shares = Shares(("a", "b"), {"yes": {"a": 1, "b": 0}, "no": {"a": 0, "b": 1}, "what": {"a": None, "b": None}})
-        told = Heads(features[:50], features[50:], shares, names[:50], names[50:])(features)
-        assert ((told.presence[:, 0] > 0.5) == there)[20:].mean() > 0.9
-        assert np.allclose(told.share.sum(axis=1), 1)
+        reported = Heads(features[:50], features[50:], shares, names[:50], names[50:])(features)
+        assert ((reported.presence[:, 0] > 0.5) == there)[20:].mean() > 0.9
+        assert np.allclose(reported.share.sum(axis=1), 1)
         nothing = Shares(("a", "b"), {name: {"a": 1.0 * (name == "yes"), "b": None} for name in ("yes", "no", "what")})
-        told = Heads(features[:50], features[50:], nothing, names[:50], names[50:])(features)
-        assert np.isnan(told.presence[:, 1]).all() and np.isfinite(told.presence[:, 0]).all()
+        reported = Heads(features[:50], features[50:], nothing, names[:50], names[50:])(features)
+        assert np.isnan(reported.presence[:, 1]).all() and np.isfinite(reported.presence[:, 0]).all()
 
     def test_the_loss_leaves_out_what_is_unknown(self):
         logits = torch.tensor([[2.0, -1.0], [0.5, 3.0]], requires_grad=True)
@@ -157,7 +157,7 @@ class TestWhatIsUnknown:
 
 class TestRefusals:
     @pytest.mark.parametrize(
-        ("settings", "said"),
+        ("settings", "message"),
         [
             ({"rows": ("svm",)}, "expected rows"),
             ({"rows": ()}, "expected rows"),
@@ -169,8 +169,8 @@ class TestRefusals:
             ({"device": "abacus"}, "a device"),
         ],
     )
-    def test_settings_that_cannot_be(self, fabrics, settings, said):
-        with pytest.raises(InputError, match=said):
+    def test_settings_that_cannot_be(self, fabrics, settings, message):
+        with pytest.raises(InputError, match=message):
             Contactile(fabrics, **({"rows": ("kernels",)} | settings))
 
     def test_one_protocol_alone_and_other_parts(self, fabrics):
@@ -184,10 +184,10 @@ class TestCommand:
     def test_it_tells_writes_and_goes_on(self, tmp_path):
         words = ["fabric", "contactile", "--simulated", "--size", "5,6,2", "--rows", "resnet,kernels", "--epochs", "1"]
         words += ["--every", "24", "--run", tmp_path / "run", "--json", tmp_path / "out.json"]
-        told = run(*words)
-        assert told.exit_code == 0, told.output
-        assert "simulated fabrics, protocol 1 → 2" in told.output and "76.3 %" in told.output
-        assert "of real fabrics" in told.output and "1 epochs (the paper has 50)" in told.output
+        reported = run(*words)
+        assert reported.exit_code == 0, reported.output
+        assert "simulated fabrics, protocol 1 → 2" in reported.output and "76.3 %" in reported.output
+        assert "of real fabrics" in reported.output and "1 epochs (the paper has 50)" in reported.output
         result = json.loads((tmp_path / "out.json").read_text())
         assert result["simulated"] is True and len(result["cells"]) == 4
         assert "--parts hand,held-out --simulated --size 5,6,2" in result["command"]
@@ -198,15 +198,15 @@ class TestCommand:
     def test_a_published_set_is_read_from_its_folder(self, tmp_path):
         FabricScene(count=4).write(tmp_path / "set", robot=5, hand=1)
         words = ["fabric", "contactile", "--data", tmp_path / "set", "--rows", "ratios", "--parts", "hand"]
-        told = run(*words, "--limits=-2,2")
-        assert told.exit_code == 0, told.output
-        assert "set, protocol 1 → 2" in told.output and "of real fabrics" not in told.output
+        reported = run(*words, "--limits=-2,2")
+        assert reported.exit_code == 0, reported.output
+        assert "set, protocol 1 → 2" in reported.output and "of real fabrics" not in reported.output
         assert "Give the limits" in refused(*words, "--limits=-0.1,0.1")
         (tmp_path / "set" / "compositions.csv").write_text("fabric,cotton,linen\nfabric01,0,90\n")
         assert "sum to 100; they sum to 90" in refused(*words)
 
     @pytest.mark.parametrize(
-        ("words", "said"),
+        ("words", "message"),
         [
             ([], "--simulated, and not both"),
             (["--simulated", "--data", "x"], "--simulated, and not both"),
@@ -218,5 +218,5 @@ class TestCommand:
             (["--data", "nowhere", "--rows", "kernels"], "there is none"),
         ],
     )
-    def test_what_cannot_be_is_one_red_line(self, words, said):
-        assert said in refused("fabric", "contactile", *words)
+    def test_what_cannot_be_is_one_red_line(self, words, message):
+        assert message in refused("fabric", "contactile", *words)

@@ -91,7 +91,10 @@ class TestTouches:
             rows = wanted.T if "of channels" in layout else wanted
             lines = [",".join(f"{value:.3f}" for value in row) for row in rows]
             if "time" in layout:
-                lines = ["time," + ",".join(f"c{n}" for n in range(27)), *(f"{n},{one}" for n, one in enumerate(lines))]
+                lines = [
+                    "time," + ",".join(f"c{n}" for n in range(27)),
+                    *(f"{n},{item}" for n, item in enumerate(lines)),
+                ]
             (place / "0.csv").write_text("\n".join(lines) + "\n")
         streams = load(folder).recordings.streams
         assert np.allclose(streams[2].readings, wanted, atol=1e-6)
@@ -103,7 +106,7 @@ class TestTouches:
         assert np.bincount(ours[:10]).tolist() == [2] * 5
 
     @pytest.mark.parametrize(
-        ("spoil", "said"),
+        ("spoil", "message"),
         [
             (lambda file: np.save(file, np.zeros((599, 26))), r"shape \(T, 27\).*\(599, 26\)"),
             (lambda file: np.save(file, np.zeros((27, 27))), r"\(27, 27\)"),
@@ -114,10 +117,10 @@ class TestTouches:
             (lambda file: file.write_bytes(b""), "may be damaged"),
         ],
     )
-    def test_a_spoilt_file_is_named(self, tmp_path, spoil, said):
+    def test_a_spoilt_file_is_named(self, tmp_path, spoil, message):
         folder = folder_of(tmp_path, USUAL)
         spoil(folder / USUAL[3])
-        with pytest.raises(DatasetError, match=said) as caught:
+        with pytest.raises(DatasetError, match=message) as caught:
             load(folder)
         assert USUAL[3] in str(caught.value).replace("\\", "/")
 
@@ -193,7 +196,7 @@ class TestCompositions:
             self.read(tmp_path, text, ["silk"])
 
     @pytest.mark.parametrize(
-        ("text", "said"),
+        ("text", "message"),
         [
             ("", "empty"),
             ("fabric\nfelt\n", "expected constituents"),
@@ -212,8 +215,8 @@ class TestCompositions:
             ("fabric,a,b\nx,1,0,0\n", "at most 3 cells in line 2"),
         ],
     )
-    def test_what_is_no_composition_is_named_with_its_line(self, tmp_path, text, said):
-        with pytest.raises(DatasetError, match=said) as caught:
+    def test_what_is_no_composition_is_named_with_its_line(self, tmp_path, text, message):
+        with pytest.raises(DatasetError, match=message) as caught:
             self.read(tmp_path, text)
         assert str(tmp_path / "compositions.csv") in str(caught.value)
 
@@ -243,7 +246,7 @@ class TestRatios:
 
 
 def test_every_layout_says_the_same_two_things():
-    assert all("(?P<fabric>" in one and "(?P<protocol>" in one for one in contactile.LAYOUTS)
+    assert all("(?P<fabric>" in item and "(?P<protocol>" in item for item in contactile.LAYOUTS)
 
 
 def test_pandas_names_of_nameless_columns_are_no_reading(tmp_path):

@@ -29,7 +29,7 @@ def recordings() -> Recordings:
     return Recordings(
         name="simulated",
         sensor=scene.sensor,
-        streams=[scene.touch(name, at) for name in names for at in range(8)],
+        streams=[scene.touch(name, i) for name in names for i in range(8)],
         materials=[name for name in names for _ in range(8)],
         repetition=np.tile(np.arange(8), 4),
         fold=np.tile(np.arange(8) % 2, 4),
@@ -130,22 +130,22 @@ class TestContinual:
         self, recordings: Recordings, whole: list[dict[str, Any]], tmp_path: Path
     ) -> None:
         task = Continual(recordings, Kernels(dimension=64), **SMALL, folder=tmp_path / "kept")
-        told: list[str] = []
+        reported: list[str] = []
         for stop in ("f: learning", "fine-tuning", "RanPAC"):
 
             def interrupt(what: str, done: int, of: int, stop: str = stop) -> None:
-                told.append(what)
+                reported.append(what)
                 if stop in what and (stop != "f: learning" or done == 10):
                     raise KeyboardInterrupt
 
             with pytest.raises(KeyboardInterrupt):
                 list(task.run([0, 1], interrupt))
-        resumed = list(task.run([0, 1], lambda what, done, of: told.append(what)))
+        resumed = list(task.run([0, 1], lambda what, done, of: reported.append(what)))
         assert figures(resumed) == figures(whole)
-        assert told.count("offline: learning") == 2 * 16  # once in each fold
-        told.clear()
-        assert figures(list(task.run([0, 1], lambda what, done, of: told.append(what)))) == figures(whole)
-        assert told == []
+        assert reported.count("offline: learning") == 2 * 16  # once in each fold
+        reported.clear()
+        assert figures(list(task.run([0, 1], lambda what, done, of: reported.append(what)))) == figures(whole)
+        assert reported == []
         with pytest.raises(InputError, match="seed 0 there, 1 here"):
             list(Continual(recordings, Kernels(dimension=64), seed=1, **SMALL, folder=tmp_path / "kept").run([0]))
 

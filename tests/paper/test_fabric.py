@@ -21,8 +21,8 @@ SIX = [f"part{number}" for number in range(6)]
 class TestScore:
     def test_each_false_positive_or_negative_costs_a_sixth(self):
         truth = [[1, 0, 0, 1, 0, 0]] * 2
-        said = [[0.9, 0.2, 0.1, 0.8, 0.4, 0.0], [0.9, 0.7, 0.1, 0.3, 0.4, 0.0]]
-        figures = score(SIX, truth, said)
+        predicted = [[0.9, 0.2, 0.1, 0.8, 0.4, 0.0], [0.9, 0.7, 0.1, 0.3, 0.4, 0.0]]
+        figures = score(SIX, truth, predicted)
         assert figures["score"] == pytest.approx((1 + 4 / 6) / 2)
         assert figures["exact"] == 0.5
         assert figures["always"] == 1.0
@@ -38,16 +38,16 @@ class TestScore:
     def test_it_agrees_with_scikit_learn(self):
         metrics = pytest.importorskip("sklearn.metrics")
         rng = np.random.default_rng(0)
-        truth, said = rng.uniform(size=(40, 3)) < 0.4, rng.uniform(size=(40, 3))
+        truth, predicted = rng.uniform(size=(40, 3)) < 0.4, rng.uniform(size=(40, 3))
         shares = rng.uniform(size=(2, 40, 3))
-        figures = score("abc", truth, said, (shares[0], shares[1]))
-        assert figures["score"] == pytest.approx(1 - metrics.hamming_loss(truth, said > 0.5))
-        assert figures["exact"] == pytest.approx(metrics.accuracy_score(truth, said > 0.5))
+        figures = score("abc", truth, predicted, (shares[0], shares[1]))
+        assert figures["score"] == pytest.approx(1 - metrics.hamming_loss(truth, predicted > 0.5))
+        assert figures["exact"] == pytest.approx(metrics.accuracy_score(truth, predicted > 0.5))
         assert figures["share_error"] == pytest.approx(metrics.mean_absolute_error(shares[0], shares[1]))
-        precision, recall, *_ = metrics.precision_recall_fscore_support(truth, said > 0.5, average=None)
-        for at, name in enumerate("abc"):
-            assert figures["constituents"][name]["precision"] == pytest.approx(precision[at])
-            assert figures["constituents"][name]["recall"] == pytest.approx(recall[at])
+        precision, recall, *_ = metrics.precision_recall_fscore_support(truth, predicted > 0.5, average=None)
+        for i, name in enumerate("abc"):
+            assert figures["constituents"][name]["precision"] == pytest.approx(precision[i])
+            assert figures["constituents"][name]["recall"] == pytest.approx(recall[i])
 
     def test_what_was_not_said_counts_as_not_there_and_is_counted(self):
         figures = score(["a", "b"], [[1, 0]] * 4, [[np.nan, 0.1]] * 4)
@@ -55,18 +55,21 @@ class TestScore:
         assert figures["calibration_error"] == pytest.approx(0.1)
         assert score(["a"], [[1]], [[np.nan]])["calibration_error"] is None
 
-    @pytest.mark.parametrize(("truth", "said"), [([[1, 0]], [[0.5]]), ([], []), ([1, 0], [0.5, 0.5])])
-    def test_other_shapes_are_refused(self, truth, said):
+    @pytest.mark.parametrize(("truth", "presence"), [([[1, 0]], [[0.5]]), ([], []), ([1, 0], [0.5, 0.5])])
+    def test_other_shapes_are_refused(self, truth, presence):
         with pytest.raises(InputError):
-            score(["a", "b"], truth, said)
+            score(["a", "b"], truth, presence)
 
     def test_of_compositions_shares_are_compared_where_there_are_any(self):
         feels = Prediction("x", 1.0, (("x", 1.0),), 0.0, True, 1.0)
 
-        def said(*values):
-            return Composition(tuple(Constituent(*one, ()) for one in values), 0.1, feels)
+        def predicted(*values):
+            return Composition(tuple(Constituent(*value, ()) for value in values), 0.1, feels)
 
-        answers = [said(("silk", 0.9, 0.5), ("wool", 0.8, 0.5)), said(("silk", None, None), ("wool", 0.2, 0.9))]
+        answers = [
+            predicted(("silk", 0.9, 0.5), ("wool", 0.8, 0.5)),
+            predicted(("silk", None, None), ("wool", 0.2, 0.9)),
+        ]
         figures = score_compositions(["silk", "wool"], [{"silk": 0.25, "wool": 0.75}, {"wool": True}], answers)
         assert figures["share_error"] == pytest.approx(0.25)
         assert figures["score"] == pytest.approx(3 / 4)
@@ -79,10 +82,10 @@ def press(letter, number):
     rng = np.random.default_rng([number, *letter.encode()])
     image = np.zeros((40, *GRID))
     row, column = rng.integers(0, 4), rng.integers(0, 4)
-    for at, (dot, there) in enumerate(dots_of(letter).items()):
+    for i, (dot, there) in enumerate(dots_of(letter).items()):
         if there:
-            assert dot == DOTS[at]
-            image[8:, row + 2 * (at % 3), column + 3 * (at // 3)] = rng.uniform(500, 900)
+            assert dot == DOTS[i]
+            image[8:, row + 2 * (i % 3), column + 3 * (i // 3)] = rng.uniform(500, 900)
     # A taxel that is not pressed sends nothing, and stays at rest.
     noise = rng.uniform(0, 30, image.shape) * (image > 0)
     return validate((image + noise).reshape(40, -1), NUSKIN)
@@ -124,8 +127,8 @@ def slides():
         for force in (120, 150, 210, 250):
             for speed in (-150, -10, 20, 120):
                 count = 200 if abs(speed) > 50 else 400
-                at = np.linspace(0, 49, count)
-                values = np.stack([np.interp(at, np.arange(50), column) for column in shape.T], axis=1)
+                i = np.linspace(0, 49, count)
+                values = np.stack([np.interp(i, np.arange(50), column) for column in shape.T], axis=1)
                 readings = np.clip(values, 0.2, 2) * force + rng.normal(0, 2, (count, 16))
                 names, forces, speeds = [*names, name], [*forces, force], [*speeds, speed]
                 streams.append(validate(readings, CPM_FINGER))
@@ -148,16 +151,16 @@ def test_the_commands_tell_write_and_go_on(letters, slides, tmp_path, monkeypatc
     monkeypatch.setattr("scroll_tactile.datasets.letter_spike.load", lambda data, seed: letters)
     monkeypatch.setattr("scroll_tactile.datasets.fabric_slide.load", lambda data, seed: slides)
     common = ["--data", tmp_path, "--run", tmp_path / "run", "--json", tmp_path / "out.json"]
-    told = run("fabric", "letters", *common, "--folds", "1", "--groups", "2", "--cosines", "128")
-    assert told.exit_code == 0, told.output
-    assert "mean score per dot" in told.output
+    reported = run("fabric", "letters", *common, "--folds", "1", "--groups", "2", "--cosines", "128")
+    assert reported.exit_code == 0, reported.output
+    assert "mean score per dot" in reported.output
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["means"]["known"]["score"]["mean"] > 0.7
     assert set(result["parts"][0]["constituents"]) == set(DOTS)
     assert result["command"].startswith("python -m examples.paper fabric letters --data")
-    told = run("fabric", "slide", "--data", tmp_path, "--json", tmp_path / "slide.json")
-    assert told.exit_code == 0, told.output
-    assert "slow → fast" in told.output
+    reported = run("fabric", "slide", "--data", tmp_path, "--json", tmp_path / "slide.json")
+    assert reported.exit_code == 0, reported.output
+    assert "slow → fast" in reported.output
     assert len(json.loads((tmp_path / "slide.json").read_text())["parts"]) == 9
 
 

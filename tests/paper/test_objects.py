@@ -18,20 +18,20 @@ from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.statistics import Statistics
 
 GEL = Gel()
-FINE = {name: {"grain": at % 3, "depth": at // 2} for at, name in enumerate(GEL.materials)}
+FINE = {name: {"grain": i % 3, "depth": i // 2} for i, name in enumerate(GEL.materials)}
 
 
 def recordings(videos=4):
     """Videos of simulated frames in contact, each in a fold of its own."""
-    marks = [(name, at) for name in GEL.materials for at in range(videos)]
-    touches = [GEL.touch(name, at).readings[2:4] for name, at in marks]
+    marks = [(name, i) for name in GEL.materials for i in range(videos)]
+    touches = [GEL.touch(name, i).readings[2:4] for name, i in marks]
     return Recordings(
         name="simulated",
         sensor=SMALL,
         streams=[Stream(SMALL, readings) for readings in touches],
         materials=[name for name, _ in marks],
-        repetition=np.array([at for _, at in marks]),
-        fold=np.array([at for _, at in marks]),
+        repetition=np.array([i for _, i in marks]),
+        fold=np.array([i for _, i in marks]),
         ordered=False,
     )
 
@@ -43,27 +43,27 @@ def results():
 
 
 def test_known_objects_are_told_by_video_by_vote_and_by_frame(results):
-    known = [one for one in results if one["part"] == "known, counts"]
-    assert [one["tested"] for one in known] == [6]
-    assert all(one["learned"] == 18 for one in known)
-    assert np.mean([one["video"] for one in known]) >= 0.75
-    for one in known:
-        assert {round(one[name] * 6, 6) % 1 for name in ("video", "vote", "trees", "trees' vote")} == {0}
-        assert round(one["frame"] * 12, 6) % 1 == 0
+    known = [item for item in results if item["part"] == "known, counts"]
+    assert [item["tested"] for item in known] == [6]
+    assert all(item["learned"] == 18 for item in known)
+    assert np.mean([item["video"] for item in known]) >= 0.75
+    for item in known:
+        assert {round(item[name] * 6, 6) % 1 for name in ("video", "vote", "trees", "trees' vote")} == {0}
+        assert round(item["frame"] * 12, 6) % 1 == 0
 
 
 def test_attributes_are_told_of_objects_left_out(results):
-    new = [one for one in results if one["part"] == "never touched"]
-    assert sorted(name for one in new for name in one["objects"]) == sorted(GEL.materials)
-    assert all(one["tested"] == 4 * len(one["objects"]) == 24 - one["learned"] for one in new)
-    assert all(one["attributes"].keys() == {"grain", "depth"} for one in new)
-    for one in new:
-        for told in one["attributes"].values():
-            assert told.keys() == {"right", "composed", "always", "trees", "penalty", "gamma"}
-            assert all(0 <= told[name] <= 1 for name in ("right", "composed", "always", "trees"))
+    new = [item for item in results if item["part"] == "never touched"]
+    assert sorted(name for item in new for name in item["objects"]) == sorted(GEL.materials)
+    assert all(item["tested"] == 4 * len(item["objects"]) == 24 - item["learned"] for item in new)
+    assert all(item["attributes"].keys() == {"grain", "depth"} for item in new)
+    for item in new:
+        for reported in item["attributes"].values():
+            assert reported.keys() == {"right", "composed", "always", "trees", "penalty", "gamma"}
+            assert all(0 <= reported[name] <= 1 for name in ("right", "composed", "always", "trees"))
     means = summary(results)
     assert means["known, counts"]["video"]["mean"] == np.mean(
-        [one["video"] for one in results if one["part"] == "known, counts"]
+        [item["video"] for item in results if item["part"] == "known, counts"]
     )
     assert "grain, always" in means["never touched"]
 
@@ -87,10 +87,10 @@ def test_settings_that_cannot_be_are_refused():
 
 
 def test_groups_share_the_names_out():
-    groups = object_groups([str(at) for at in range(23)], 4, 1)
+    groups = object_groups([str(i) for i in range(23)], 4, 1)
     assert sorted(map(len, groups)) == [5, 6, 6, 6]
-    assert groups == object_groups([str(at) for at in range(23)], 4, 1)
-    assert groups != object_groups([str(at) for at in range(23)], 4, 2)
+    assert groups == object_groups([str(i) for i in range(23)], 4, 1)
+    assert groups != object_groups([str(i) for i in range(23)], 4, 2)
     assert most_often(["b", "a", "b", "a", "c"]) == "a"
 
 
@@ -99,21 +99,21 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     rng = np.random.default_rng(0)
     statistics, shown = Statistics(6, (1,)), {}
     centres = rng.uniform(-0.5, 0.5, (30, 6))
-    for at, centre in enumerate(centres):
+    for i, centre in enumerate(centres):
         rows = centre + 0.05 * rng.standard_normal((5, 6))
-        statistics.add(f"m{at:02}", at % 3, {1: to_codes(rows, 1.0)})
-        shown[f"m{at:02}"] = {"bright": int(centre[0] > 0)}
+        statistics.add(f"m{i:02}", i % 3, {1: to_codes(rows, 1.0)})
+        shown[f"m{i:02}"] = {"bright": int(centre[0] > 0)}
     known = {name: value for name, value in shown.items() if name < "m20"}
     head = fit_heads(statistics, 1, known, ["bright"])["bright"]
-    told = [head(in_units(centre, 1.0)) for centre in centres[20:]]
-    assert np.mean([one == shown[f"m{at + 20}"]["bright"] for at, one in enumerate(told)]) >= 0.8
+    reported = [head(in_units(centre, 1.0)) for centre in centres[20:]]
+    assert np.mean([item == shown[f"m{i + 20}"]["bright"] for i, item in enumerate(reported)]) >= 0.8
     # Leaving one out by the formula is leaving it out of the system.
     gram = head.readout.gram[np.ix_(head.places, head.places)]
     inverse = solve(gram, head.gamma).inverse
     by_formula = head.weights[3] / inverse[3, 3]
     others = np.delete(np.arange(21), 3)
     system = np.linalg.inv(inverse)
-    targets = np.array([[known[f"m{at:02}"]["bright"] == value for value in head.values] for at in range(20)], float)
+    targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)
     left = np.linalg.solve(system[np.ix_(others, others)], np.append(np.delete(targets, 3, axis=0), [[0, 0]], axis=0))
     assert targets[3] - system[3, others] @ left == pytest.approx(by_formula)
     with pytest.raises(InputError, match="felt was 1"):
@@ -125,16 +125,21 @@ class TestCommand:
     def folder(self, tmp_path: Path) -> Path:
         image = pytest.importorskip("PIL.Image")
         rng = np.random.default_rng(0)
-        for at, name in enumerate(("apple", "rug", "pen")):
+        for i, name in enumerate(("apple", "rug", "pen")):
             (tmp_path / "physiclear" / name).mkdir(parents=True)
             for video in range(2):
                 for frame in range(4):
                     pixels = rng.normal(100, 2, (240, 320, 3))
-                    pixels[:, np.arange(320) // (4 << at) % 2 == 0] += 60  # stripes
+                    pixels[:, np.arange(320) // (4 << i) % 2 == 0] += 60  # stripes
                     path = tmp_path / "physiclear" / name / f"{name}_{video}_{frame}.jpg"
                     image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
-        told = {"apple": 2, "rug": 0, "pen": 1, "skin": 1}
-        kinds = {"hardness": told, "roughness": told, "texture": told | {"pen": 2}, "materials": {"apple": "food"}}
+        reported = {"apple": 2, "rug": 0, "pen": 1, "skin": 1}
+        kinds = {
+            "hardness": reported,
+            "roughness": reported,
+            "texture": reported | {"pen": 2},
+            "materials": {"apple": "food"},
+        }
         (tmp_path / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
         return tmp_path
 
@@ -149,17 +154,17 @@ class TestCommand:
 
     def test_it_runs_from_the_data_to_the_figures(self, folder, tmp_path):
         words = ("fabric", "gelsight", "--data", folder, "--folds", "0", "--groups", "3", "--trees", "0")
-        said = run(*words, "--json", tmp_path / "g.json").output
-        assert all(name in said for name in physiclear.ATTRIBUTES)
+        predicted = run(*words, "--json", tmp_path / "g.json").output
+        assert all(name in predicted for name in physiclear.ATTRIBUTES)
         result = json.loads((tmp_path / "g.json").read_text())
         assert result["command"].startswith("python -m examples.paper fabric gelsight --data")
         assert result["attributes"].keys() == {"apple", "pen", "rug"}
         assert result["means"]["known, counts"]["video"]["mean"] == 1.0
         assert len(result["parts"]) == 4
 
-    @pytest.mark.parametrize("told", ["", "{}", '{"hardness": {"apple": 5}, "roughness": {}, "texture": {}}'])
-    def test_attributes_that_cannot_be_read_are_named(self, folder, told):
-        (folder / "physiclear" / "attributes.json").write_text(told)
+    @pytest.mark.parametrize("reported", ["", "{}", '{"hardness": {"apple": 5}, "roughness": {}, "texture": {}}'])
+    def test_attributes_that_cannot_be_read_are_named(self, folder, reported):
+        (folder / "physiclear" / "attributes.json").write_text(reported)
         with pytest.raises(DatasetError, match=r"attributes\.json"):
             physiclear.read_attributes(folder)
         assert "attributes.json" in refused("fabric", "gelsight", "--data", folder)

@@ -24,16 +24,16 @@ def blobs(count: int = 10, dimension: int = 6, seed: int = 0) -> tuple[np.ndarra
     return rows, [name for name in NAMES for _ in range(count)]
 
 
-def taught(peer: ContinualPeer, rows: np.ndarray, names: list[str]) -> ContinualPeer:
-    for at, (row, name) in enumerate(zip(rows, names, strict=True)):
+def trained(peer: ContinualPeer, rows: np.ndarray, names: list[str]) -> ContinualPeer:
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
         peer.observe(row, name)
-        if at + 1 == len(names) or names[at + 1] != name:
+        if i + 1 == len(names) or names[i + 1] != name:
             peer.boundary()
     return peer
 
 
-def share(said: list[str], names: list[str]) -> float:
-    return float(np.mean([one == other for one, other in zip(said, names, strict=True)]))
+def share(predicted: list[str], names: list[str]) -> float:
+    return float(np.mean([true == guess for true, guess in zip(predicted, names, strict=True)]))
 
 
 class TestNearestMean:
@@ -44,10 +44,10 @@ class TestNearestMean:
         unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
         truth = neighbors.NearestCentroid().fit(unit, names)
         expected = truth.predict(fresh / np.linalg.norm(fresh, axis=1, keepdims=True))
-        assert taught(NearestMean(), rows, names).predict(fresh) == expected.tolist()
+        assert trained(NearestMean(), rows, names).predict(fresh) == expected.tolist()
 
     def test_by_hand(self) -> None:
-        peer = taught(NearestMean(), np.array([[2.0, 0.0], [0.0, 5.0]]), ["felt", "silk"])
+        peer = trained(NearestMean(), np.array([[2.0, 0.0], [0.0, 5.0]]), ["felt", "silk"])
         assert peer.predict(np.array([[3.0, 1.0], [0.1, 0.2], [0.0, 0.0]])) == ["felt", "silk", "felt"]
 
 
@@ -72,14 +72,14 @@ class TestStreamingLDA:
         np.testing.assert_allclose(peer.scores(fresh), truth, rtol=1e-8)
 
     def test_one_touch_is_enough_to_be_asked(self) -> None:
-        peer = taught(StreamingLDA(), np.ones((1, 3)), ["felt"])
+        peer = trained(StreamingLDA(), np.ones((1, 3)), ["felt"])
         assert peer.predict(np.zeros((2, 3))) == ["felt", "felt"]
 
 
 class TestRanPAC:
     def test_the_weights_are_ridge_on_all_tasks(self) -> None:
         rows, names = blobs()
-        peer = taught(RanPAC(seed=3, size=20), rows, names)
+        peer = trained(RanPAC(seed=3, size=20), rows, names)
         projection = np.random.default_rng([3, 1]).standard_normal((6, 20))
         lifted = np.maximum(rows @ projection, 0)
         targets = np.eye(4)[[NAMES.index(name) for name in names]]
@@ -88,7 +88,7 @@ class TestRanPAC:
 
     def test_the_penalty_is_of_the_last_task_alone(self) -> None:
         rows, names = blobs()
-        peer = taught(RanPAC(seed=3, size=20), rows, names)
+        peer = trained(RanPAC(seed=3, size=20), rows, names)
         lifted = np.maximum(rows[30:] @ np.random.default_rng([3, 1]).standard_normal((6, 20)), 0)
         targets = np.zeros((10, 4))
         targets[:, 3] = 1
@@ -105,8 +105,8 @@ class TestGDumb:
     def test_the_buffer_is_balanced_and_never_too_large(self) -> None:
         rows, names = blobs()
         peer = GDumb(10)
-        for at in range(len(rows)):
-            peer.observe(rows[at], names[at])
+        for i in range(len(rows)):
+            peer.observe(rows[i], names[i])
             assert sum(peer.held.values()) <= 10
         assert sorted(peer.held.values()) == [2, 2, 3, 3]
 
@@ -118,21 +118,21 @@ class TestGDumb:
 class TestReplaying:
     def test_without_a_buffer_it_forgets_and_with_one_less(self) -> None:
         rows, names = blobs(count=30, dimension=20)
-        naive = share(taught(Replaying(0), rows, names).predict(rows), names)
-        replaying = share(taught(Replaying(40), rows, names).predict(rows), names)
+        naive = share(trained(Replaying(0), rows, names).predict(rows), names)
+        replaying = share(trained(Replaying(40), rows, names).predict(rows), names)
         assert naive < replaying
         assert replaying > 0.5
 
     def test_the_reservoir_keeps_its_size(self) -> None:
         rows, names = blobs()
-        peer = taught(Replaying(7), rows, names)
+        peer = trained(Replaying(7), rows, names)
         assert isinstance(peer, Replaying)
         assert len(peer._buffer) == 7
 
     def test_a_seed_repeats_and_the_global_generator_is_left_alone(self) -> None:
         rows, names = blobs()
         before = np.random.get_state()[1].tolist()  # noqa: NPY002 (what must not be touched)
-        scores = [taught(make(5, 1), rows, names).scores(rows) for make in (Replaying, Replaying, GDumb, GDumb)]
+        scores = [trained(make(5, 1), rows, names).scores(rows) for make in (Replaying, Replaying, GDumb, GDumb)]
         assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
         np.testing.assert_array_equal(scores[0], scores[1])
         np.testing.assert_array_equal(scores[2], scores[3])
@@ -152,14 +152,14 @@ def touches() -> tuple[np.ndarray, np.ndarray]:
     """Features of six touches to learn and three to test, of each material."""
     scene = Scene(sensors.ROBOSKIN)
     embedding = Kernels(dimension=128)
-    learned = [scene.touch(name, at) for name in NAMES for at in range(6)]
-    tested = [scene.touch(name, at) for name in NAMES for at in range(6, 9)]
+    learned = [scene.touch(name, i) for name in NAMES for i in range(6)]
+    tested = [scene.touch(name, i) for name in NAMES for i in range(6, 9)]
     return touch_features(embedding, learned), touch_features(embedding, tested)
 
 
 @pytest.mark.parametrize("make", PEERS.values(), ids=PEERS)
 def test_peers_beat_chance_on_touches(make, touches) -> None:
-    peer = taught(make(), touches[0], [name for name in NAMES for _ in range(6)])
+    peer = trained(make(), touches[0], [name for name in NAMES for _ in range(6)])
     assert share(peer.predict(touches[1]), [name for name in NAMES for _ in range(3)]) > 0.5
 
 
@@ -173,7 +173,7 @@ def test_a_touch_is_the_mean_of_its_widest_windows() -> None:
     scene, embedding = Scene(sensors.ROBOSKIN), Kernels(dimension=64)
     whole, short = scene.touch("silk", 0), scene.touch("silk", 0, seconds=0.3)
     image = tactile_image(whole)
-    windows = [embedding.embed(np.ascontiguousarray(image[:, at : at + 56])) for at in (0, 9, 18)]
+    windows = [embedding.embed(np.ascontiguousarray(image[:, i : i + 56])) for i in (0, 9, 18)]
     ours = touch_features(embedding, [whole, short])
     np.testing.assert_allclose(ours[0], np.mean(windows, axis=0, dtype=np.float64), rtol=1e-6)
     np.testing.assert_array_equal(ours[1], embedding.embed_windows(tactile_image(short), {56: [0]})[56][0])
@@ -186,7 +186,7 @@ class TestCached:
         calls = []
         plain = Kernels.embed_windows
         monkeypatch.setattr(Kernels, "embed_windows", lambda *words: calls.append(1) or plain(*words))
-        images = [tactile_image(Scene(sensors.BIOTAC).touch("silk", at)) for at in range(2)]
+        images = [tactile_image(Scene(sensors.BIOTAC).touch("silk", i)) for i in range(2)]
         for _ in range(3):
             for image in images:
                 for windows in ({30: [0, 5], 300: [0]}, {30: [0]}):

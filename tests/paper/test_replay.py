@@ -22,7 +22,7 @@ def recordings() -> Recordings:
     return Recordings(
         name="simulated",
         sensor=scene.sensor,
-        streams=[scene.touch(name, at) for name in names for at in range(10)],
+        streams=[scene.touch(name, i) for name in names for i in range(10)],
         materials=[name for name in names for _ in range(10)],
         repetition=np.tile(np.arange(10), 5),
         fold=np.tile(np.arange(10) % 2, 5),

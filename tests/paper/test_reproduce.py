@@ -35,7 +35,7 @@ def recorded(name: str = "RoboSkin-20", seed: int = 0, ordered: bool = False) ->
     return Recordings(
         name=name,
         sensor=scene.sensor,
-        streams=[scene.touch(material, at) for material in names for at in range(12)],
+        streams=[scene.touch(material, i) for material in names for i in range(12)],
         materials=[material for material in names for _ in range(12)],
         repetition=np.tile(np.arange(12), 3),
         fold=np.tile(np.arange(12) % 3, 3),
@@ -51,44 +51,44 @@ def recordings() -> Recordings:
 def figures(value: Any) -> Any:
     """Without the times."""
     if isinstance(value, dict):
-        return {key: figures(one) for key, one in value.items() if not key.endswith("seconds")}
-    return [figures(one) for one in value] if isinstance(value, (list, tuple)) else value
+        return {key: figures(item) for key, item in value.items() if not key.endswith("seconds")}
+    return [figures(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 class TestSplit:
     def test_every_touch_is_learned_or_held_or_tested(self, recordings: Recordings):
         parts = split(recordings, 1, seed=0)
-        assert (len(parts.streams), len(parts.validation), len(parts.exam)) == (21, 3, 12)
+        assert (len(parts.streams), len(parts.validation), len(parts.test)) == (21, 3, 12)
         assert {name for name, _ in parts.validation} == set(recordings.materials)
-        keys = [one.key for one in parts.streams] + [one.key for _, one in [*parts.validation, *parts.exam]]
+        keys = [item.key for item in parts.streams] + [item.key for _, item in [*parts.validation, *parts.test]]
         assert sorted(keys) == sorted(stream.key for stream in recordings.streams)
         assert len(set(parts.touch)) == 12
 
     def test_the_seed_draws_the_validation_only(self, recordings: Recordings):
-        held = [{one.key for _, one in split(recordings, 0, seed).validation} for seed in (0, 0, 1)]
+        held = [{item.key for _, item in split(recordings, 0, seed).validation} for seed in (0, 0, 1)]
         assert held[0] == held[1] != held[2]
 
     def test_a_quick_one_learns_every_second(self, recordings: Recordings):
         parts = split(recordings, 0, seed=0, every=2)
-        assert (len(parts.streams), len(parts.validation), len(parts.exam)) == (9, 3, 12)
+        assert (len(parts.streams), len(parts.validation), len(parts.test)) == (9, 3, 12)
 
     def test_frames_of_a_video_are_not_parted(self):
         sets = recorded()
         # Four frames to a recording, three recordings of each material, each its own fold.
         video = np.tile(np.repeat(np.arange(3), 4), 3)
         parts = split(Recordings(sets.name, PATCH, sets.streams, sets.materials, video, video, False), 2, seed=0)
-        assert len(parts.exam) == 12 and len(set(parts.touch)) == 3
+        assert len(parts.test) == 12 and len(set(parts.touch)) == 3
         assert len(parts.validation) == 0  # two recordings are too few to hold one out
         more = np.tile(np.repeat(np.arange(6), 2), 3)
         parts = split(Recordings(sets.name, PATCH, sets.streams, sets.materials, more, more // 2, False), 2, seed=0)
-        held = {one.key for _, one in parts.validation}
-        pairs = [{sets.streams[at].key, sets.streams[at + 1].key} for at in range(0, 36, 2)]
+        held = {item.key for _, item in parts.validation}
+        pairs = [{sets.streams[i].key, sets.streams[i + 1].key} for i in range(0, 36, 2)]
         assert len(held) == 6 and all(pair <= held or not pair & held for pair in pairs)
 
     def test_materials_that_no_other_fold_teaches_are_named(self, recordings: Recordings):
         fold = np.repeat([0, 1, 2], 12)
         alone = Recordings("odd", PATCH, recordings.streams, recordings.materials, recordings.repetition, fold, False)
-        with pytest.raises(InputError, match=r"'bark'.*never taught"):
+        with pytest.raises(InputError, match=r"'bark'.*never trained on"):
             split(alone, 0, seed=0)
         with pytest.raises(InputError, match=r"out of \[0, 1, 2\]; came 7"):
             split(recordings, 7, seed=0)
@@ -182,7 +182,7 @@ class TestTable1:
             list(Table1([recorded(seed=1)], ("svm-spikes",), folder=folder).run(folds))
 
     @pytest.mark.parametrize(
-        ("wrong", "said"),
+        ("wrong", "message"),
         [
             ({"systems": ("cnn",)}, "came cnn"),
             ({"systems": ("vision-lda",)}, "need the weights"),
@@ -190,8 +190,8 @@ class TestTable1:
             ({"systems": ("svm",), "seed": -1}, "seed"),
         ],
     )
-    def test_studies_that_cannot_be_are_refused(self, recordings: Recordings, wrong: dict[str, Any], said: str):
-        with pytest.raises(InputError, match=said):
+    def test_studies_that_cannot_be_are_refused(self, recordings: Recordings, wrong: dict[str, Any], message: str):
+        with pytest.raises(InputError, match=message):
             SystemStudy([recordings], **wrong)
         with pytest.raises(InputError, match="different names"):
             SystemStudy([recordings, recordings], ("svm",))
@@ -201,9 +201,9 @@ class TestTable1:
         with pytest.raises(WeightsError, match="there is no file"):
             _ = SystemStudy([recordings], ("svm",), weights=str(file)).plan
         file.write_bytes(b"one")
-        one = SystemStudy([recordings], ("svm",), weights=str(file)).plan
+        item = SystemStudy([recordings], ("svm",), weights=str(file)).plan
         file.write_bytes(b"other")
-        assert SystemStudy([recordings], ("svm",), weights=str(file)).plan != one
+        assert SystemStudy([recordings], ("svm",), weights=str(file)).plan != item
         assert SystemStudy([recordings], ("svm",), weights="resnet18").plan["weights"] == "resnet18"
 
 
@@ -228,9 +228,9 @@ class TestEfficiency:
 
     def test_more_touches_contain_fewer(self, recordings: Recordings):
         parts = split(recordings, 0, seed=0)
-        one, two = first_touches(parts, 1, 0), first_touches(parts, 2, 0)
-        assert (len(one), len(two)) == (3, 6)
-        assert {stream.key for _, stream in one} < {stream.key for _, stream in two}
+        item, two = first_touches(parts, 1, 0), first_touches(parts, 2, 0)
+        assert (len(item), len(two)) == (3, 6)
+        assert {stream.key for _, stream in item} < {stream.key for _, stream in two}
 
 
 @pytest.fixture
@@ -310,7 +310,7 @@ class TestCommand:
         assert "73.0 %" in result.output and "80.0 %" in result.output
         kept = json.loads(file.read_text())
         assert kept["command"].startswith("python -m examples.paper robustness noise --data DATA --sets biotac-20,")
-        means = {(one["dataset"], one["strength"], one["system"], one["augmented"]): one for one in kept["means"]}
+        means = {(item["dataset"], item["strength"], item["system"], item["augmented"]): item for item in kept["means"]}
         assert len(means) == 16
         assert means["RoboSkin-20", 0.0, "svm", False]["mean"] > 0.5  # of three materials
         assert kept["sets"]["RoboSkin-20"]["settings"]["conv-lstm"]["epochs"] == 1
@@ -340,7 +340,7 @@ class TestCommand:
         made = {file.name for file in tmp_path.iterdir() if file.is_file()}
         pictures = {f"robustness-{name}.png" for name in ("biotac-20", "roboskin-20")}
         assert made == {"table1.json", "efficiency.json", "efficiency.png", "robustness.json", *pictures}
-        studies = {one["study"] for one in json.loads((tmp_path / "robustness.json").read_text())["means"]}
+        studies = {item["study"] for item in json.loads((tmp_path / "robustness.json").read_text())["means"]}
         assert studies == {"length", "speed", "noise"}
 
     def test_what_is_not_there_is_named(self, tmp_path: Path):

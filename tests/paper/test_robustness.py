@@ -23,9 +23,9 @@ MATERIALS = ("dull", "loud", "lost")
 def recordings(*, ordered=True):
     rng = np.random.default_rng(0)
     streams, names = [], []
-    for at, name in enumerate(MATERIALS):
+    for i, name in enumerate(MATERIALS):
         for _ in range(20):
-            rhythm = np.sin(np.arange(100)[:, None] * (at + 1) / 5 + rng.uniform(0, 6, (1, 10)))
+            rhythm = np.sin(np.arange(100)[:, None] * (i + 1) / 5 + rng.uniform(0, 6, (1, 10)))
             streams.append(validate(2 + rhythm + 0.1 * rng.standard_normal((100, 10)), PAD))
             names.append(name)
     repetition = np.tile(np.arange(20), 3)
@@ -37,9 +37,9 @@ class Loudest:
 
     made = 0
 
-    def __init__(self, lessons, augmented, progress):
+    def __init__(self, train, augmented, progress):
         type(self).made += 1
-        self.means = {name: np.mean([s.readings.std() for m, s in lessons if m == name]) for name in MATERIALS}
+        self.means = {name: np.mean([s.readings.std() for m, s in train if m == name]) for name in MATERIALS}
 
     def predict(self, streams):
         return [min(self.means, key=lambda m: abs(self.means[m] - s.readings.std())) for s in streams]
@@ -54,23 +54,23 @@ def test_a_system_is_taught_once_a_fold_for_all_studies_and_once_for_another_sit
     task = study(augmented=(False,))
     (records,) = task.run([0])
     assert Loudest.made == 2
-    assert [one["study"] for one in records if one["strength"] == 0] == ["noise", "dead", "drift", "session"]
-    assert {one["tested"] for one in records} == {30}
-    assert all(0 <= one["accuracy"] <= 1 for one in records)
+    assert [item["study"] for item in records if item["strength"] == 0] == ["noise", "dead", "drift", "session"]
+    assert {item["tested"] for item in records} == {30}
+    assert all(0 <= item["accuracy"] <= 1 for item in records)
 
 
 def test_records_are_of_the_perturbed_touches_of_their_fold():
     task = study(studies=["noise"], augmented=(False,))
     (records,) = task.run([1])
-    lessons, exam = task._split(1, False)
-    assert len(lessons) + len(exam) == 60
-    system = Loudest(lessons, False, print)
+    train, test = task._split(1, False)
+    assert len(train) + len(test) == 60
+    system = Loudest(train, False, print)
     for record in records:
-        asked = task._perturbed(exam, "noise", record["strength"])
-        said = system.predict([stream for _, stream in asked])
-        right = np.mean([name == one for (name, _), one in zip(asked, said, strict=True)])
+        asked = task._perturbed(test, "noise", record["strength"])
+        predicted = system.predict([stream for _, stream in asked])
+        right = np.mean([name == item for (name, _), item in zip(asked, predicted, strict=True)])
         assert record["accuracy"] == right
-    assert task._perturbed(exam, "noise", 0.5)[0][1] != exam[0][1]
+    assert task._perturbed(test, "noise", 0.5)[0][1] != test[0][1]
 
 
 def test_an_interrupted_run_goes_on(tmp_path):
@@ -102,7 +102,7 @@ def test_a_run_is_not_gone_on_with_other_touches(tmp_path):
 
 def test_a_cameras_frames_are_refused():
     gel = Gel()
-    streams = [gel.touch(name, at) for name in gel.materials[:2] for at in range(4)]
+    streams = [gel.touch(name, i) for name in gel.materials[:2] for i in range(4)]
     within = np.tile(np.arange(4), 2)
     frames = Recordings("gel", streams[0].sensor, streams, [*"aaaabbbb"], within, within % 2, ordered=False)
     with pytest.raises(InputError, match="of camera 'gelsight'"):
@@ -123,7 +123,7 @@ def test_ours_learns_with_its_copies_and_without():
     assert settings["augmentation"]["copies"] == 2
     task = Robustness(recordings(), {"ours": make}, {"ours": settings}, studies=["dead"], quick=True)
     (records,) = task.run([0])
-    found = {(one["strength"], one["augmented"]): one["accuracy"] for one in records}
+    found = {(item["strength"], item["augmented"]): item["accuracy"] for item in records}
     assert found[0.0, False] == 1
     assert found[0.0, True] == 1
     assert found[0.2, True] >= found[0.2, False]
@@ -160,7 +160,7 @@ def test_the_command_on_real_touches(real_data, tmp_path):
     words = ["robustness", "dead", "--sets", "roboskin-20", "--data", real_data, "--quick", "--materials", 2]
     result = run(*words, "--json", tmp_path / "r.json", "--plot", tmp_path / "r.png", "--run", tmp_path / "run")
     assert result.exit_code == 0, result.output
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert {row["strength"] for row in told["means"]} == {0.0, 0.2}
-    assert min(row["mean"] for row in told["means"]) > 0.8
+    reported = json.loads((tmp_path / "r.json").read_text())
+    assert {row["strength"] for row in reported["means"]} == {0.0, 0.2}
+    assert min(row["mean"] for row in reported["means"]) > 0.8
     assert run(*words, "--run", tmp_path / "run").exit_code == 0

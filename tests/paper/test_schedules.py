@@ -14,7 +14,7 @@ NAMES = [f"m{number}" for number in range(8) for _ in range(3)]
 def test_random_schedules_give_one_memory(sensor: sensors.Sensor) -> None:
     scene = Scene(sensor)
     names = scene.materials[:5]
-    touches = [(name, scene.touch(name, at)) for name in names for at in range(4)]
+    touches = [(name, scene.touch(name, i)) for name in names for i in range(4)]
     probes = [(name, scene.touch(name, 9, seconds=seconds)) for name in names for seconds in (0.2, 0.5, None)]
     trials = try_schedules(sensor, touches, probes, count=6, seed=1, features=128)
     assert len({trial.digest for trial in trials}) == 1
@@ -27,7 +27,7 @@ def test_random_schedules_give_one_memory(sensor: sensors.Sensor) -> None:
 def test_split_learners_share_a_pool_that_overflows() -> None:
     # More touches than the pool holds: which are in it must not depend on who felt them.
     scene = Scene(sensors.ROBOSKIN)
-    touches = [(name, scene.touch(name, at)) for name in scene.materials[:3] for at in range(90)]
+    touches = [(name, scene.touch(name, i)) for name in scene.materials[:3] for i in range(90)]
     trials = try_schedules(sensors.ROBOSKIN, touches, touches[:3], count=3, features=64)
     assert trials[2].split
     assert len({trial.digest for trial in trials}) == 1
@@ -43,16 +43,16 @@ def test_a_schedule_is_a_permutation_drawn_from_its_seed(schedule: ScheduleName)
 
 
 def test_class_by_class_finishes_each_material() -> None:
-    order = [NAMES[at] for at in arrange("class-by-class", NAMES, 3)]
+    order = [NAMES[i] for i in arrange("class-by-class", NAMES, 3)]
     assert all(len(set(order[first : first + 3])) == 1 for first in range(0, len(NAMES), 3))
     assert arrange("reversed", NAMES, 3) == arrange("class-by-class", NAMES, 3)[::-1]
 
 
 def test_batches_hold_four_materials_and_interleaved_all() -> None:
-    batches = [NAMES[at] for at in arrange("batches", NAMES, 0)]
+    batches = [NAMES[i] for i in arrange("batches", NAMES, 0)]
     assert [len(set(batches[:12])), len(set(batches[12:]))] == [4, 4]
     assert len(set(batches[:3])) > 1  # shuffled within a batch
-    interleaved = [NAMES[at] for at in arrange("interleaved", NAMES, 0)]
+    interleaved = [NAMES[i] for i in arrange("interleaved", NAMES, 0)]
     assert all(len(set(interleaved[first : first + 8])) == 8 for first in range(0, len(NAMES), 8))
 
 

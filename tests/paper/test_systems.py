@@ -43,7 +43,7 @@ def felt(material: str, repetition: int, readings: int = 60) -> Stream:
 
 
 def touches(first: int, after: int, **kind: Any) -> list[Labelled]:
-    return [(name, felt(name, at, **kind)) for name in NAMES for at in range(first, after)]
+    return [(name, felt(name, i, **kind)) for name in NAMES for i in range(first, after)]
 
 
 TAUGHT, HELD, EXAM = touches(0, 8), touches(8, 9), touches(10, 13)
@@ -61,9 +61,9 @@ def fit(system: System, seed: int = 0, **more: Any) -> System:
     return system
 
 
-def share(system: System, exam: list[Labelled] = EXAM) -> float:
-    said = system.predict([stream for _, stream in exam])
-    return float(np.mean([name == answer for (name, _), answer in zip(exam, said, strict=True)]))
+def share(system: System, test: list[Labelled] = EXAM) -> float:
+    predicted = system.predict([stream for _, stream in test])
+    return float(np.mean([name == answer for (name, _), answer in zip(test, predicted, strict=True)]))
 
 
 class TestSpikes:
@@ -193,14 +193,14 @@ def test_the_validation_chooses_and_is_learned_then():
     levels = [("outer", 60), ("inner", 128), ("outer", 190)] * 4
     held = [(name, validate(np.full((60, 6), level), PATCH)) for name, level in levels[:3]]
     system = Svm("svm", choices=(("linear", 10.0), ("rbf", 10.0)))
-    system.fit([validate(np.full((60, 6), at), PATCH) for _, at in levels], [name for name, _ in levels], held, 0)
+    system.fit([validate(np.full((60, 6), i), PATCH) for _, i in levels], [name for name, _ in levels], held, 0)
     assert system.chosen == ("rbf", 10.0)
     assert system.predict([stream for _, stream in held]) == ["outer", "inner", "outer"]
     squares = LeastSquares("squares", Vision(None, seed=0, stages=(1, 2)))
     fit(squares)
-    heard: list[int] = []
-    fit(squares, progress=lambda what, done, of: heard.append(done))
-    assert not heard  # features of the touches met before are kept
+    received: list[int] = []
+    fit(squares, progress=lambda what, done, of: received.append(done))
+    assert not received  # features of the touches met before are kept
     assert squares.penalty in PENALTIES
 
 
@@ -245,14 +245,14 @@ class TestTraining:
             "net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=4, batch=8)
         )
         shares: list[float] = []
-        heard: list[tuple[int, int]] = []
+        received: list[tuple[int, int]] = []
         fit(
             system,
             watch=lambda: shares.append(share(system)),
-            progress=lambda what, done, of: heard.append((done, of)),
+            progress=lambda what, done, of: received.append((done, of)),
         )
         assert len(shares) == len(system.epochs) == 4
-        assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]
+        assert received == [(1, 4), (2, 4), (3, 4), (4, 4)]
         assert system.epochs[-1].loss < system.epochs[0].loss
         assert system.epochs[0].validation_loss is not None
 
@@ -272,7 +272,7 @@ class TestTraining:
 
     def test_the_rate_falls_on_a_plateau_and_the_best_epoch_stays(self):
         images = torch.randn(12, 2, generator=torch.Generator().manual_seed(0))
-        taught = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())
+        batches = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())
         # The validation says the opposite: each epoch is worse than the one before.
         held = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] <= 0).long())
         kept: list[torch.Tensor] = []
@@ -280,7 +280,7 @@ class TestTraining:
             net = nn.Linear(2, 2)
             epochs = descend(
                 net,
-                taught,
+                batches,
                 held,
                 Course(epochs=4, patience=0),
                 np.random.default_rng(0),
@@ -300,13 +300,13 @@ class TestTraining:
 
     def test_a_loss_that_is_not_finite_stops_it(self):
         images = torch.full((4, 2), torch.nan)
-        taught = Batches(lambda places: images[torch.from_numpy(places)], torch.zeros(4, dtype=torch.long))
+        batches = Batches(lambda places: images[torch.from_numpy(places)], torch.zeros(4, dtype=torch.long))
         with pytest.raises(TrainingError, match="nan in epoch 1"):
-            descend(nn.Linear(2, 2), taught, None, Course(epochs=2), np.random.default_rng(0), silent, unwatched)
+            descend(nn.Linear(2, 2), batches, None, Course(epochs=2), np.random.default_rng(0), silent, unwatched)
 
     def test_bfloat16_rounds_products_and_keeps_weights_and_answers_float32(self):
         images = torch.randn(16, 3, generator=torch.Generator().manual_seed(0))
-        taught = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())
+        batches = Batches(lambda places: images[torch.from_numpy(places)], (images[:, 0] > 0).long())
         seen: set[torch.dtype] = set()
 
         def train(precision: Precision) -> tuple[float, nn.Module]:
@@ -314,7 +314,7 @@ class TestTraining:
                 net = nn.Linear(3, 2)
                 net.register_forward_hook(lambda module, inputs, output: seen.add(output.dtype))
                 course = Course(epochs=40, rate=0.1, precision=precision)
-                epochs = descend(net, taught, None, course, np.random.default_rng(0), silent, unwatched)
+                epochs = descend(net, batches, None, course, np.random.default_rng(0), silent, unwatched)
             return epochs[-1].loss, net
 
         full, half = train("float32"), train("bfloat16")

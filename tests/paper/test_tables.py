@@ -68,7 +68,7 @@ def test_a_row_of_each_element_and_the_commands_behind(room):
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         ({"head": ["x"], "rows": [["{two:x}"]]}, "expected a result two.json; there are one"),
         ({"head": ["x"], "rows": [["{one:all/y}"]]}, "expected something at {one:all/y}"),
@@ -77,8 +77,8 @@ def test_a_row_of_each_element_and_the_commands_behind(room):
         ({"head": ["x"], "rows": [["{one:all|%}"]]}, "table 't'"),
     ],
 )
-def test_tables_that_cannot_be_made_are_named(room, table, said):
-    with pytest.raises(InputError, match=re.escape(said)):
+def test_tables_that_cannot_be_made_are_named(room, table, message):
+    with pytest.raises(InputError, match=re.escape(message)):
         made("t", {"t": table}, [room])
 
 

@@ -15,7 +15,13 @@ from examples.paper.transfer import tasks as transfer
 from examples.paper.transfer.across_sensors import ALONE, WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
-from examples.paper.transfer.few_touches import WidestFeatures, WidestReadout, draw_touches, feeler_maker, few_touches
+from examples.paper.transfer.few_touches import (
+    WidestFeatures,
+    WidestReadout,
+    candidate_maker,
+    draw_touches,
+    few_touches,
+)
 from examples.paper.transfer.shared_features import SharedFeatures
 from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, some_frames
 from scroll_tactile import Kernels, Vision
@@ -39,8 +45,8 @@ CYCLES = {"slow": 2.0, "middle": 5.0, "fast": 11.0}  # a second
 def felt(sensor, material, number, shift=0.0):
     """A wave of the material's own frequency under all channels, with noise; the same whatever the sensor."""
     random = np.random.default_rng([sensor.channels, [*CYCLES].index(material), number])
-    at = np.arange(60)[:, None] / sensor.rate
-    wave = np.sin(2 * np.pi * (CYCLES[material] * at + random.uniform(0, 1) + 0.05 * np.arange(sensor.channels)))
+    i = np.arange(60)[:, None] / sensor.rate
+    wave = np.sin(2 * np.pi * (CYCLES[material] * i + random.uniform(0, 1) + 0.05 * np.arange(sensor.channels)))
     half = sensor.high / 2
     return validate(half * (1 + shift + 0.5 * wave + random.normal(0, 0.03, wave.shape)), sensor)
 
@@ -48,7 +54,7 @@ def felt(sensor, material, number, shift=0.0):
 def recorded(sensor, each=10, shift=0.0, name=None):
     names = [material for material in CYCLES for _ in range(each)]
     numbers = np.tile(np.arange(each), len(CYCLES))
-    streams = [felt(sensor, material, at, shift) for material, at in zip(names, numbers.tolist(), strict=True)]
+    streams = [felt(sensor, material, i, shift) for material, i in zip(names, numbers.tolist(), strict=True)]
     return Recordings(name or sensor.name, sensor, streams, names, numbers, numbers % 5, ordered=True)
 
 
@@ -64,20 +70,20 @@ class TestFewTouches:
         vision = Vision(None, seed=1, stages=(1,))
         readout, learner = WidestReadout(WidestFeatures(PATCH, vision)), TactileLearner(sensor=PATCH, embedding=vision)
         for material in CYCLES:
-            for at in range(3):
-                readout.observe(material, felt(PATCH, material, at))
-                learner.observe(material, felt(PATCH, material, at))
-        asked = [felt(PATCH, material, at, 0.3) for material in CYCLES for at in range(10, 16)]
-        said = [readout.name_of(stream) for stream in asked]
-        assert said == [learner.predict(stream).material for stream in asked]
-        assert len(set(said)) > 1
+            for i in range(3):
+                readout.observe(material, felt(PATCH, material, i))
+                learner.observe(material, felt(PATCH, material, i))
+        asked = [felt(PATCH, material, i, 0.3) for material in CYCLES for i in range(10, 16)]
+        predicted = [readout.name_of(stream) for stream in asked]
+        assert predicted == [learner.predict(stream).material for stream in asked]
+        assert len(set(predicted)) > 1
 
     def test_an_embedding_that_other_scales_have_a_say_in_is_read_by_a_learner(self):
         with pytest.raises(InputError, match="widest scale alone"):
             WidestFeatures(PATCH, Kernels(dimension=64))
-        feeler = feeler_maker(PATCH, Kernels(dimension=64))()
-        feeler.observe("slow", felt(PATCH, "slow", 0))
-        assert feeler.name_of(felt(PATCH, "fast", 0)) == "slow"
+        candidate = candidate_maker(PATCH, Kernels(dimension=64))()
+        candidate.observe("slow", felt(PATCH, "slow", 0))
+        assert candidate.name_of(felt(PATCH, "fast", 0)) == "slow"
         with pytest.raises(InputError, match="45 readings or more"):
             WidestFeatures(PATCH, Vision(None, seed=1))(felt(PATCH, "slow", 0).first(0.5))
 
@@ -88,17 +94,17 @@ class TestFewTouches:
         assert {name: [len(group) for group in own] for name, own in drawn.items()} == {name: [5] for name in CYCLES}
         first, again, other = (draw_touches(touches, 2, 0, draw) for draw in (0, 0, 1))
         assert first == again != other
-        assert all(touches.fold[at] != 2 for own in first.values() for group in own for at in group)
+        assert all(touches.fold[i] != 2 for own in first.values() for group in own for i in group)
         assert [len(own) for own in first.values()] == [8, 8, 8]
         with pytest.raises(InputError, match="expected a fold of patch"):
             draw_touches(touches, 7, 0, 0)
 
     def test_each_count_adds_to_the_one_before(self):
-        told = []
+        reported = []
 
         class Spy:
             def observe(self, material, stream):
-                told.append((material, stream.key))
+                reported.append((material, stream.key))
 
             def name_of(self, stream):
                 return "slow"
@@ -110,9 +116,9 @@ class TestFewTouches:
             "right": {"0": [2], "1": [2], "2": [2], "5": [2]},
             "learned": {"0": 0, "1": 1, "2": 2, "5": 5},
         }
-        assert len(told) == len(set(told)) == 15
-        kept = {touches.streams[at].key for at in np.flatnonzero(touches.fold == 0)}
-        assert not kept & {key for _, key in told}
+        assert len(reported) == len(set(reported)) == 15
+        kept = {touches.streams[i].key for i in np.flatnonzero(touches.fold == 0)}
+        assert not kept & {key for _, key in reported}
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +216,7 @@ class TestTasks:
         streams = [validate(frame, HALF_SIZE) for frame in frames]
         video = np.repeat(np.arange(3), 4)
         camera = Recordings("frames", HALF_SIZE, streams, ["cup"] * 12, video, video % 2, ordered=False)
-        assert [stream.key for stream in some_frames(camera, 2).streams] == [
-            streams[at].key for at in (0, 1, 4, 5, 8, 9)
-        ]
+        assert [stream.key for stream in some_frames(camera, 2).streams] == [streams[i].key for i in (0, 1, 4, 5, 8, 9)]
         assert some_frames(camera, 9).repetition.tolist() == video.tolist()
         touches = recorded(PATCH)
         assert some_frames(touches, 1) is touches
@@ -233,13 +237,13 @@ class TestAligning:
 
     @pytest.fixture
     def streams(self):
-        return [felt(PATCH, name, at) for name in CYCLES for at in range(12)]
+        return [felt(PATCH, name, i) for name in CYCLES for i in range(12)]
 
-    def share(self, feeler, streams, taught, names):
-        for at in taught:
-            feeler.observe(names[at], streams[at])
-        asked = [at for at in range(len(streams)) if at not in taught]
-        return np.mean([feeler.name_of(streams[at]) == names[at] for at in asked])
+    def share(self, candidate, streams, trained, names):
+        for i in trained:
+            candidate.observe(names[i], streams[i])
+        asked = [i for i in range(len(streams)) if i not in trained]
+        return np.mean([candidate.name_of(streams[i]) == names[i] for i in asked])
 
     def features(self, streams, found):
         return {stream.key: row for stream, row in zip(streams, found, strict=True)}
@@ -282,10 +286,10 @@ class TestAligning:
         found, names = vectors(2, each=3)
         made = self.features(streams[:9], found)
         prior = SharesPrior(lambda stream: made[stream.key], self.known(streams), likeness=0.0)
-        for at in range(9):
-            prior.observe(names[at], streams[at])
+        for i in range(9):
+            prior.observe(names[i], streams[i])
         scaled = (found - found.mean(axis=0)) / found.std(axis=0)
-        means = np.stack([scaled[at : at + 3].mean(axis=0) for at in (6, 3, 0)])  # fast, middle, slow
+        means = np.stack([scaled[i : i + 3].mean(axis=0) for i in (6, 3, 0)])  # fast, middle, slow
         rest = scaled - np.repeat(means[::-1], 3, axis=0)
         drawn = means / (1 + 0.3 / 3)
         weights = np.linalg.solve(rest.T @ rest / 9 + 0.03 * np.eye(8), drawn.T)
@@ -295,12 +299,12 @@ class TestAligning:
     def test_nothing_learned_is_said_to_be_nothing(self, streams):
         found, _ = vectors(2)
         made = self.features(streams, found)
-        for feeler in (
+        for candidate in (
             OneReadout(lambda s: made[s.key], None),
             MapsAcross(lambda s: made[s.key], self.known(streams), turned=False),
         ):
             with pytest.raises(InputError, match="Call observe first"):
-                feeler.name_of(streams[0])
+                candidate.name_of(streams[0])
 
 
 @pytest.fixture(scope="module")
@@ -312,11 +316,11 @@ class TestSensors:
     def test_features_that_do_not_know_the_sensor(self, pair):
         shared = SharedFeatures((PATCH, STRIP))
         assert (shared.rate, shared.columns) == (50.0, 30)
-        one, other = (shared.spectra(recordings.streams[0]) for recordings in pair)
-        assert one.shape == other.shape
-        assert np.isfinite([one, other]).all()
+        item, other = (shared.spectra(recordings.streams[0]) for recordings in pair)
+        assert item.shape == other.shape
+        assert np.isfinite([item, other]).all()
         moved = validate(pair[0].streams[0].readings[:, ::-1], PATCH)
-        assert shared.spectra(moved) == pytest.approx(one)
+        assert shared.spectra(moved) == pytest.approx(item)
         short = pair[1].streams[0].first(0.2)
         assert np.isfinite(shared.spectra(short)).all()
         assert shared.resampled(Kernels(dimension=64))(pair[1].streams[0]).shape == (64,)
@@ -338,17 +342,17 @@ class TestSensors:
             assert [*shares[direction, "scatter"]] == ["1", "2"]
             assert shares[direction, "standardised"]["0"]["gain"] is None
         agreement = study.agreement()
-        assert all(-1 <= one["correlation"] <= 1 and one["chance"] > 0 for one in agreement.values())
+        assert all(-1 <= item["correlation"] <= 1 and item["chance"] > 0 for item in agreement.values())
         steps = []
         assert list(study.run(lambda *step: steps.append(step))) == results
         assert steps == []
 
     def test_what_cannot_be_is_refused(self, pair):
-        one, other = pair
+        item, other = pair
         with pytest.raises(InputError, match="touched the same materials"):
-            SensorTransfer((one, one))
+            SensorTransfer((item, item))
         with pytest.raises(InputError, match="2 of them the same"):
-            SensorTransfer((one, replace(other, materials=["new" if m == "fast" else m for m in other.materials])))
+            SensorTransfer((item, replace(other, materials=["new" if m == "fast" else m for m in other.materials])))
         for change in ({"ways": ("magic",)}, {"ways": ()}, {"counts": (-1,)}, {"draws": 0}, {"folds": ()}):
             with pytest.raises(InputError):
                 SensorTransfer(pair, **change)

@@ -8,7 +8,7 @@ from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.statistics.moments import SecondMoment
 
 SCENE = Scene(sensor=sensors.ROBOSKIN, seed=2)
-TOUCHES = [(name, SCENE.touch(name, at)) for at in range(3) for name in SCENE.materials[:2]]
+TOUCHES = [(name, SCENE.touch(name, i)) for i in range(3) for name in SCENE.materials[:2]]
 
 
 def small(path):

@@ -42,7 +42,7 @@ class TestMetrics:
             calibration_error([1.5], [1])
 
 
-TOUCHES = [(name, Scene(sensors.BIOTAC).touch(name, at)) for name in ("silk", "wool") for at in range(3)]
+TOUCHES = [(name, Scene(sensors.BIOTAC).touch(name, i)) for name in ("silk", "wool") for i in range(3)]
 
 
 class TestMissing:

@@ -36,7 +36,7 @@ Weights = Annotated[
     str | None, typer.Option(help="Of a trained ResNet: a file, or resnet18. Without, rows are left out.")
 ]
 Rows = Annotated[str | None, typer.Option("--rows", help=f"Which rows, of {', '.join(ROWS)}.")]
-Parts = Annotated[str | None, typer.Option(help=f"What is tested, of {', '.join(PARTS)}; both, where it is not said.")]
+Parts = Annotated[str | None, typer.Option(help=f"What is tested, of {', '.join(PARTS)}; both unless given.")]
 Epochs = Annotated[int | None, typer.Option(min=1, help=f"Of the networks on fabrics; the paper has {PAPER_EPOCHS}.")]
 BioTacEpochs = Annotated[int | None, typer.Option(min=1, help="Of the network on BioTac.")]
 Every = Annotated[
@@ -86,7 +86,7 @@ def contactile(
         if data is None:
             fabrics = _simulate(size, seed)
         else:
-            names = None if constituents is None else [one.strip() for one in constituents.split(",")]
+            names = None if constituents is None else [item.strip() for item in constituents.split(",")]
             fabrics = published.load(data, seed, pattern=pattern, limits=_limits(limits), constituents=names)
         touched = None
         if biotac is not None and any(key in NEED_BIOTAC for key in wanted):

@@ -100,7 +100,7 @@ def continual(
         )
         chosen = parse_folds(folds or "all", recordings)
         results: list[dict[str, Any]] = []
-        for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
+        for done in task.run(chosen, lambda what, i, of: progress(f"fold {chosen[len(results)]}: {what}", i, of)):
             results.append(done)
     published = PUBLISHED.get(recordings.name) if materials == 20 else None
     _show(recordings, results, published)

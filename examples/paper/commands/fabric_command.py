@@ -85,9 +85,9 @@ def slide(
         task = SlideTransfer(slides, folder=run)
         results = list(task.run(progress))
     table = Table("part", "learned", "tested", "right", "called unknown", title="FabricSlide, four balanced fabrics")
-    for one in results:
-        shown = (percent(one["accuracy"]), percent(one["unknown"]))
-        table.add_row(one["part"], str(one["learned"]), str(one["tested"]), *shown)
+    for result in results:
+        shown = (percent(result["accuracy"]), percent(result["unknown"]))
+        table.add_row(result["part"], str(result["learned"]), str(result["tested"]), *shown)
     console().print(table)
     if json is not None:
         command = command_line("fabric", "slide", data="DATA", seed=seed)
@@ -119,8 +119,8 @@ def attributes(
             results = list(task.run(progress))
             found[name] = task.plan | {"means": summary_of_attributes(results), "parts": results}
     table = Table("set", "attribute", *_WAYS.values(), title="grades right, of materials held out (standard error)")
-    for name, one in found.items():
-        for attribute, means in one["means"].items():
+    for name, result in found.items():
+        for attribute, means in result["means"].items():
             cells = [f"{percent(means[way]['mean'])} ({percent(means[way]['error'])})" for way in _WAYS]
             table.add_row(name, attribute, *cells)
     console().print(table)
@@ -163,24 +163,24 @@ def gelsight(
 
 
 def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
-    def told(figure: Mapping[str, float] | None) -> str:
+    def shown(figure: Mapping[str, float] | None) -> str:
         return "" if figure is None else f"{percent(figure['mean'])} ({percent(figure['sd'])})"
 
     counts, network = means.get("known, counts", {}), means.get("known, network", {})
     head = ("counts", "network", "trees")
     table = Table("GelSight, objects that were touched", *head, title="right by video (sd over folds)")
-    table.add_row("frames together", *map(told, (counts.get("video"), network.get("video"), counts.get("trees"))))
+    table.add_row("frames together", *map(shown, (counts.get("video"), network.get("video"), counts.get("trees"))))
     table.add_row(
-        "majority of frames", *map(told, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
+        "majority of frames", *map(shown, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
     )
-    table.add_row("a single frame", *map(told, (counts.get("frame"), network.get("frame"), None)))
+    table.add_row("a single frame", *map(shown, (counts.get("frame"), network.get("frame"), None)))
     console().print(table)
     new = means.get("never touched", {})
     table = Table(
         "GelSight, objects never touched", "heads", "compose", "trees", "always the commonest", title="right by video"
     )
     for name in physiclear.ATTRIBUTES:
-        table.add_row(name, *(told(new.get(name + what)) for what in ("", ", composed", ", trees", ", always")))
+        table.add_row(name, *(shown(new.get(name + what)) for what in ("", ", composed", ", trees", ", always")))
     console().print(table)
 
 
@@ -189,14 +189,14 @@ def _show_letters(results: Sequence[Mapping[str, Any]]) -> None:
     table = Table("figure", *means, title="letter-spike, mean over touches (sd over folds or groups of letters)")
     for name in FIGURES:
         cells = [means[kind].get(name) for kind in means]
-        told = [percent(cell["mean"]) + f" ({percent(cell['sd'])})" if cell else "" for cell in cells]
-        table.add_row(_LABELS[name], *told)
+        shown = [percent(cell["mean"]) + f" ({percent(cell['sd'])})" if cell else "" for cell in cells]
+        table.add_row(_LABELS[name], *shown)
     console().print(table)
     dots = Table("dot", "there", *(f"{kind}: {what}" for kind in means for what in ("correct", "precision", "recall")))
     for dot in DOTS:
         row = [dot, percent(_mean(results, dot, "there"))]
         for kind in means:
-            those = [one for one in results if one["part"] == kind]
+            those = [result for result in results if result["part"] == kind]
             row += [percent(_mean(those, dot, what)) for what in ("correct", "precision", "recall")]
         dots.add_row(*row)
     console().print(dots)
@@ -204,7 +204,7 @@ def _show_letters(results: Sequence[Mapping[str, Any]]) -> None:
 
 def _mean(results: Sequence[Mapping[str, Any]], dot: str, what: str) -> float:
     """Over touches; parts where a precision or a recall has no meaning are left out."""
-    told = [(one["constituents"][dot][what], one["tested"]) for one in results]
-    told = [one for one in told if one[0] is not None]
-    total = sum(tested for _, tested in told)
-    return sum(value * tested for value, tested in told) / total if total else 0.0
+    shown = [(result["constituents"][dot][what], result["tested"]) for result in results]
+    shown = [result for result in shown if result[0] is not None]
+    total = sum(tested for _, tested in shown)
+    return sum(value * tested for value, tested in shown) / total if total else 0.0

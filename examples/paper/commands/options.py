@@ -78,7 +78,7 @@ Quick = Annotated[
 ]
 Run = Annotated[
     Path | None,
-    typer.Option("--run", help="Note finished parts in this folder; the same command goes on from them."),
+    typer.Option("--run", help="Note finished parts in this folder; the same command resumes from them."),
 ]
 Json = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
 Plot = Annotated[Path | None, typer.Option(help="Draw the figure into this file.")]

@@ -91,7 +91,7 @@ def table1(
     found = rows(results)
     for recordings in read:
         _show_table(recordings.name, found, study)
-    if any(one.sensor.camera for one in read):
+    if any(item.sensor.camera for item in read):
         say(
             "GelSight frames are those of PhysiCLeAR, split by video: the paper's GelSight-45 is not public, and its "
             "figures stand beside nothing of ours: "
@@ -131,9 +131,9 @@ def efficiency(
     found = curves(results)
     for recordings in read:
         mine = [curve for curve in found if curve["dataset"] == recordings.name]
-        _show_curves(f"{recordings.name}: after so many epochs", [one for one in mine if one["by"] == "epochs"])
+        _show_curves(f"{recordings.name}: after so many epochs", [item for item in mine if item["by"] == "epochs"])
         title = f"{recordings.name}: one pass, after so many touches of each material"
-        _show_curves(title, [one for one in mine if one["by"] == "streams"])
+        _show_curves(title, [item for item in mine if item["by"] == "streams"])
     close(study, results, json, {"curves": found}, sets, folds)
     draw_into(plot, lambda file: draw_efficiency(file, found))
 
@@ -166,7 +166,7 @@ def activation(
         study = ActivationStudy(
             read, ("resnet-pretrained",), weights, few, device.value, seed, quick, run, precision.value
         )
-        results = list(study.run({one.name: [0] for one in read}, progress))
+        results = list(study.run({item.name: [0] for item in read}, progress))
         networks = study.networks()
         likeness = study.likeness(networks)
         images = study.looks(networks, progress) if plot is not None else {}
@@ -235,9 +235,9 @@ def _show_curves(title: str, found: Sequence[Mapping[str, Any]]) -> None:
         return
     places = sorted({int(point[0]) for curve in found for point in curve["points"]})
     if found[0]["by"] == "epochs":
-        places = sorted({at for at in places if at in EPOCH_COLUMNS} | {places[-1]})
+        places = sorted({i for i in places if i in EPOCH_COLUMNS} | {places[-1]})
     table = Table("system", *map(str, places), "folds", title=title)
     for curve in found:
-        shares = {int(at): percent(mean) for at, mean, _ in curve["points"]}
-        table.add_row(curve["system"], *(shares.get(at, "") for at in places), str(curve["folds"]))
+        shares = {int(i): percent(mean) for i, mean, _ in curve["points"]}
+        table.add_row(curve["system"], *(shares.get(i, "") for i in places), str(curve["folds"]))
     console().print(table)

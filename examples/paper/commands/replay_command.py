@@ -55,7 +55,7 @@ def replay(
     schedule: Annotated[Schedule, typer.Option(help="The order in which touches are learned.")] = Schedule.CLASSES,
     seed: Seed = 0,
     folds: Folds = "all",
-    readout: Annotated[ReadoutChoice, typer.Option(help="How materials are told apart.")] = ReadoutChoice.LDA,
+    readout: Annotated[ReadoutChoice, typer.Option(help="How materials are classified.")] = ReadoutChoice.LDA,
     blocked: Annotated[
         bool, typer.Option("--blocked", help="Folds of successive repetitions (BioTac only): a harder test.")
     ] = False,
@@ -81,7 +81,7 @@ def replay(
         task = Replay(recordings, schedule.value, seed, readout.value, blocked, novelty, folder=run)
         chosen = parse_folds(folds or "all", recordings)
         results: list[dict[str, Any]] = []
-        for done in task.run(chosen, lambda what, at, of: progress(f"fold {chosen[len(results)]}: {what}", at, of)):
+        for done in task.run(chosen, lambda what, i, of: progress(f"fold {chosen[len(results)]}: {what}", i, of)):
             results.append(done)
     _show(recordings, results, compared=materials == 20)
     if json is not None:

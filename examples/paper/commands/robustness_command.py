@@ -186,7 +186,7 @@ def _draw(plot: Path | None, sets: Sequence[str], means: Sequence[Mapping[str, A
     if plot is None:
         return
     for name in sets:
-        # One picture a set: lines of two sensors in one panel cannot be told apart.
+        # One picture a set: lines of two sensors in one panel cannot be distinguished.
         file = plot if len(sets) == 1 else plot.with_stem(f"{plot.stem}-{name.lower()}")
         rows = [row for row in means if row["dataset"] == name]
         if not draw_into(file, partial(draw_robustness, rows=rows, title=f"{name}, trained on clean touches")):

@@ -1,4 +1,4 @@
-"""What the commands share: the recorded sets, which folds, the noted command, and what a result says of its making."""
+"""What the commands share: the recorded sets, which folds, the noted command, and how a result notes its making."""
 
 from __future__ import annotations
 

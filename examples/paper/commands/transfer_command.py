@@ -37,15 +37,15 @@ from scroll_tactile.errors import DatasetError, InputError
 
 __all__ = ["transfer"]
 
-transfer = typer.Typer(
-    cls=Commands, no_args_is_help=True, help="Learn with one task or sensor, and be asked with another."
-)
+transfer = typer.Typer(cls=Commands, no_args_is_help=True, help="Train with one task or sensor, test with another.")
 
 
 def _slides(data: Path, seed: int) -> Recordings:
-    """FabricSlide over distance, as ratios: how fast and how hard it was slid would tell nothing of the fabric."""
+    """FabricSlide over distance, as ratios: how fast and how hard it was slid is no property of the fabric."""
     slides = fabric_slide.load(data, seed=seed).recordings
-    return replace(slides, sensor=fabric_slide.CPM_RATIOS, streams=[fabric_slide.ratios(one) for one in slides.streams])
+    return replace(
+        slides, sensor=fabric_slide.CPM_RATIOS, streams=[fabric_slide.ratios(item) for item in slides.streams]
+    )
 
 
 SETS: dict[str, Callable[[Path, int], Recordings]] = {
@@ -88,7 +88,7 @@ def tasks(
     stops = _counts(counts)
     with progress_bar() as progress:
         progress("reading", 0, 1)
-        by_name = {name: some_frames(one, frames) for name, one in _read(sets, data, seed, quick).items()}
+        by_name = {name: some_frames(item, frames) for name, item in _read(sets, data, seed, quick).items()}
         read = [*by_name.values()]
         study = TaskTransfer(
             read,
@@ -126,7 +126,7 @@ def sensors(
     run: Run = None,
     json: Json = None,
 ) -> None:
-    """Learn twenty materials with BioTac and be asked with RoboSkin, and the reverse, after few touches or none."""
+    """Learn twenty materials with BioTac and be tested with RoboSkin, and the reverse, after few touches or none."""
     require_folders(json)
     with progress_bar() as progress:
         progress("reading", 0, 1)
@@ -176,18 +176,18 @@ def _read(asked: str | None, data: Path, seed: int, quick: bool) -> dict[str, Re
 def _show_tasks(
     study: TaskTransfer, results: Sequence[tuple[Cell, Figures]], found: Sequence[Mapping[str, Any]]
 ) -> None:
-    for one in study.sets:
-        mine = [row for row in found if row["dataset"] == one.name]
+    for item in study.sets:
+        mine = [row for row in found if row["dataset"] == item.name]
         counts = list(mine[0]["points"])
-        title = f"{one.name}: right, after so many touches of each material; {study.draws} draws, folds {study.folds}"
+        title = f"{item.name}: right, after so many touches of each material; {study.draws} draws, folds {study.folds}"
         table = Table("embedding", *counts, title=title)
         for row in mine:
-            mark = " (its own)" if row["tuned on"] == one.name else ""
+            mark = " (its own)" if row["tuned on"] == item.name else ""
             table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
         console().print(table)
     trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
-    told = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
-    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {told}")
+    text = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
+    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {text}")
 
 
 def _show_sensors(
@@ -201,9 +201,9 @@ def _show_sensors(
                 points = [row["points"].get(str(count)) for count in study.counts]
                 table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
         console().print(table)
-    told = ", ".join(f"{one['correlation']:+.2f} in {kind} ({one['chance']:.2f})" for kind, one in agreement.items())
+    text = ", ".join(f"{item['correlation']:+.2f} in {kind} ({item['chance']:.2f})" for kind, item in agreement.items())
     say(
-        f"chance: {percent(study.chance)}. Which materials feel alike, one sensor against the other: {told} (by chance)"
+        f"chance: {percent(study.chance)}. Which materials feel alike, one sensor against the other: {text} (by chance)"
     )
 
 

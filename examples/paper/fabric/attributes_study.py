@@ -1,7 +1,7 @@
 """Attributes of materials never touched before, such as stiffness, by heads over those that were.
 
-A grade, 0, 1 or 2, is told by two constituents, "at least 1" and "at least 2" (Frank and Hall 2001): what lies between
-is between. Each material is left out in turn, with all its touches.
+A grade, 0, 1 or 2, is graded by two constituents, "at least 1" and "at least 2" (Frank and Hall 2001): what lies
+between is between. Each material is left out in turn, with all its touches.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from scroll_tactile.results import Composition
 __all__ = ["FIGURES", "Attributes", "summary"]
 
 FIGURES = ("ours", "inferred", "trees", "always")
-"""Shares of touches whose grade is right: ours, told that the material is new; ours, not told; of trees on simple
+"""Shares of touches whose grade is right: ours, given that the material is new; ours, inferring it; of trees on simple
 features; and of always saying the grade that most of the materials learned have."""
 
 TREES = 100
@@ -42,10 +42,10 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Attributes:
-    """Each material left out, and its grades told by what was learned of the others.
+    """Each material left out, and its grades predicted from what was learned of the others.
 
     recordings: of any sensor. grades: attribute → material → grade from 0, for every material. dimension: of the
-    kernels. seed: of the trees. folder: where finished parts are noted, so that an interrupted run goes on; or None.
+    kernels. seed: of the trees. folder: where finished parts are noted, so that an interrupted run resumes; or None.
 
     Raises InputError for a material without a grade, fewer than three materials, or an attribute of one grade.
     """
@@ -94,28 +94,32 @@ class Attributes:
         recordings, names = self.recordings, self.recordings.materials
         what = f"{recordings.name} without {out}"
         learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=0)
-        lessons = [at for at, name in enumerate(names) if name != out]
-        exam = [at for at, name in enumerate(names) if name == out]
-        for done, at in enumerate(lessons):
-            learner.observe(names[at], recordings.streams[at])
+        train = [i for i, name in enumerate(names) if name != out]
+        test = [i for i, name in enumerate(names) if name == out]
+        for done, i in enumerate(train):
+            learner.observe(names[i], recordings.streams[i])
             progress(what, done + 1, len(names))
         for name in learner.materials:
             learner.describe(name, self._steps(name))
-        told = [learner.compose(recordings.streams[at], unfamiliar=1.0) for at in exam]
-        untold = [learner.compose(recordings.streams[at]) for at in exam]
+        given = [learner.compose(recordings.streams[i], unfamiliar=1.0) for i in test]
+        inferred = [learner.compose(recordings.streams[i]) for i in test]
         progress(what, len(names), len(names))
         figures: dict[str, Any] = {}
         for attribute, of in self.grades.items():
             usual = Counter(of[name] for name in learner.materials)
             # Ties go to the lower grade.
             always = min(usual, key=lambda grade: (-usual[grade], grade))
-            trees = _forest(plain[lessons], [of[names[at]] for at in lessons], plain[exam], self.seed)
-            said = {"ours": self._said(attribute, told), "inferred": self._said(attribute, untold), "trees": trees}
-            right = {way: float(np.mean(np.asarray(grades) == of[out])) for way, grades in said.items()}
+            trees = _forest(plain[train], [of[names[i]] for i in train], plain[test], self.seed)
+            predicted = {
+                "ours": self._predict(attribute, given),
+                "inferred": self._predict(attribute, inferred),
+                "trees": trees,
+            }
+            right = {way: float(np.mean(np.asarray(grades) == of[out])) for way, grades in predicted.items()}
             figures[attribute] = {**right, "always": float(always == of[out])}
         return {
-            "learned": len(lessons),
-            "tested": len(exam),
+            "learned": len(train),
+            "tested": len(test),
             "attributes": figures,
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
@@ -128,7 +132,7 @@ class Attributes:
             for grade in range(1, max(of.values()) + 1)
         }
 
-    def _said(self, attribute: str, answers: Sequence[Composition]) -> list[int]:
+    def _predict(self, attribute: str, answers: Sequence[Composition]) -> list[int]:
         """The grade of each answer: how many steps are more likely there than not."""
         steps = [_step(attribute, grade) for grade in range(1, max(self.grades[attribute].values()) + 1)]
         return [sum((answer[step].presence or 0.0) > 0.5 for step in steps) for answer in answers]
@@ -146,7 +150,7 @@ def _simple(readings: npt.NDArray[np.float32]) -> FloatArray:
 
 
 def _forest(rows: FloatArray, grades: Sequence[int], asked: FloatArray, seed: int) -> npt.NDArray[np.int64]:
-    """The grades that extremely randomised trees (Geurts et al. 2006) tell."""
+    """The grades that extremely randomised trees (Geurts et al. 2006) predict."""
     try:
         from sklearn.ensemble import ExtraTreesClassifier
     except ImportError as error:
@@ -154,8 +158,8 @@ def _forest(rows: FloatArray, grades: Sequence[int], asked: FloatArray, seed: in
             "trees to compare with need scikit-learn, which is not installed: pip install 'scroll-tactile[bench]'"
         ) from error
     forest = ExtraTreesClassifier(TREES, random_state=seed)
-    told: npt.NDArray[np.int64] = forest.fit(rows, np.asarray(grades)).predict(asked)
-    return told
+    given: npt.NDArray[np.int64] = forest.fit(rows, np.asarray(grades)).predict(asked)
+    return given
 
 
 def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
@@ -165,10 +169,10 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         for figure in FIGURES:
             values = [float(result["attributes"][attribute][figure]) for result in results]
             mean, spread = mean_and_spread(values)
-            told = {
+            given = {
                 "mean": mean,
                 "error": spread / len(values) ** 0.5,
                 "materials": float(sum(v > 0.5 for v in values)),
             }
-            means.setdefault(attribute, {})[figure] = told
+            means.setdefault(attribute, {})[figure] = given
     return means

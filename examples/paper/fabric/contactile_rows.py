@@ -10,7 +10,7 @@ from examples.paper.fabric.ratios import ratios
 from examples.paper.runs.cached import Cached
 from examples.paper.systems.constituent_memory import ConstituentMemory
 from examples.paper.systems.constituent_nets import ConstituentNet
-from examples.paper.systems.constituent_squares import ConstituentSquares, Shares, Teller
+from examples.paper.systems.constituent_squares import ConstituentSquares, ConstituentSystem, Shares
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
@@ -75,8 +75,8 @@ class RowMaker:
     _kept: tuple[ResNet, float] | None = field(default=None, init=False, repr=False)
     _squares_of_tuned: LeastSquares | None = field(default=None, init=False, repr=False)
 
-    def make(self, key: str, progress: Progress) -> Teller:
-        """A new system of ROWS that has learned nothing; progress: told of the training on BioTac, which comes first.
+    def make(self, key: str, progress: Progress) -> ConstituentSystem:
+        """A new system of ROWS that has learned nothing; progress: receives the training on BioTac, which comes first.
 
         Raises KeyError for another key, and what that training raises.
         """

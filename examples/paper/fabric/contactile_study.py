@@ -1,4 +1,4 @@
-"""The paper's third task: what fabrics are made of, learned from a robot's touches and asked about a hand's.
+"""The paper's third task: what fabrics are made of, trained on a robot's touches and tested on a hand's.
 
 Every row of the paper's Table III, and ours: on a published set of fabrics, or on the simulated one, which is named so.
 """
@@ -22,7 +22,7 @@ from examples.paper.fabric.pretraining import Pretraining
 from examples.paper.fabric.simulated import LIMITS, FabricScene
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
 from examples.paper.runs.study import weights_digest
-from examples.paper.systems.constituent_memory import ConstituentMemory, told_of
+from examples.paper.systems.constituent_memory import ConstituentMemory, estimates_of
 from examples.paper.systems.constituent_nets import ConstituentNet
 from examples.paper.systems.constituent_squares import ConstituentSquares, Shares
 from examples.paper.systems.descent import Course
@@ -37,7 +37,7 @@ __all__ = ["HAND", "HELD_OUT", "PARTS", "Contactile", "rows", "simulated"]
 
 HAND, HELD_OUT = "protocol 1 → 2", "protocol 1 → 1, held out"
 PARTS = {"hand": HAND, "held-out": HELD_OUT}
-"""Key, as on the command line → what is learned and what is asked about: all touches of the robot, and the hand's; or
+"""Key, as on the command line → what is trained on and what is tested: all touches of the robot, and the hand's; or
 four fifths of the robot's, and the fifth that is left."""
 
 
@@ -54,14 +54,14 @@ def simulated(seed: int = 0, count: int = 32, robot: int = 40, hand: int = 10) -
 
 @dataclass(frozen=True)
 class Contactile:
-    """The study of some rows on a set of fabrics; each row is learned and asked about in two parts (`PARTS`).
+    """The study of some rows on a set of fabrics; each row is trained and tested in two parts (`PARTS`).
 
     rows: keys of ROWS. weights: of a trained ResNet, for those in NEED_WEIGHTS. biotac: recordings of BioTac's
     materials, for those in NEED_BIOTAC. epochs: of the networks on fabrics, and biotac_epochs: on BioTac. device: of
     all networks but ours. seed: of all that is drawn. every: columns that the images of the paper's rows are averaged
-    over. take: learn one of so many touches. folder: where finished cells are noted, so that a run goes on; or None.
+    over. take: learn one of so many touches. folder: where finished cells are noted, so that a run resumes; or None.
 
-    A fabric of which nothing is known is learned, and not asked about; a constituent that all fabrics have, or none, is
+    A fabric of which nothing is known is trained on, and not tested; a constituent that all fabrics have, or none, is
     learned and not scored. Raises InputError for unknown rows, what a row needs and was not given, settings that cannot
     be, fabrics without touches under protocol 1 or 2, or no constituent that some fabrics have and others have not.
     """
@@ -147,7 +147,7 @@ class Contactile:
         yield from run_cells(notes, cells, self._measure, progress)
 
     def split(self, part: str) -> Split:
-        """The touches of HAND or HELD_OUT; those asked about are of fabrics of which something is known."""
+        """The touches of HAND or HELD_OUT; those tested are of fabrics of which something is known."""
         whole, by_hand = self.fabrics.recordings, self.fabrics.protocol == 2
         if part == HAND:
             recordings = replace(whole, fold=np.where(by_hand, 0, 1))
@@ -156,16 +156,18 @@ class Contactile:
             recordings = Recordings(
                 whole.name,
                 whole.sensor,
-                [whole.streams[at] for at in keep],
-                [whole.materials[at] for at in keep],
+                [whole.streams[i] for i in keep],
+                [whole.materials[i] for i in keep],
                 whole.repetition[keep],
                 whole.fold[keep],
                 whole.ordered,
             )
         touches = split(recordings, 0, self.seed, every=self.take)
-        told = np.isfinite(self._truth(touches.truth)).any(axis=1)
-        exam = [one for one, known in zip(touches.exam, told, strict=True) if known]
-        return replace(touches, exam=exam, touch=[at for at, known in zip(touches.touch, told, strict=True) if known])
+        described = np.isfinite(self._truth(touches.truth)).any(axis=1)
+        test = [item for item, known in zip(touches.test, described, strict=True) if known]
+        return replace(
+            touches, test=test, touch=[i for i, known in zip(touches.touch, described, strict=True) if known]
+        )
 
     @cached_property
     def _maker(self) -> RowMaker:
@@ -187,27 +189,29 @@ class Contactile:
         touches, system = self.split(cell.dataset), self._maker.make(cell.system, progress)
         system.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
         truth, masses = self._truth(touches.truth), self.shares.masses(touches.truth)[:, self._columns]
-        told = system.tell(touches.asked, progress)
+        described = system.estimate(touches.test_streams, progress)
         figures: Figures = {"learned": len(touches.streams), "validation": len(touches.validation)}
-        figures |= score(self.scored, truth, told.presence[:, self._columns], (masses, told.share[:, self._columns]))
+        figures |= score(
+            self.scored, truth, described.presence[:, self._columns], (masses, described.share[:, self._columns])
+        )
         if isinstance(system, ConstituentMemory):
             figures |= self._otherwise(system, touches, truth, progress)
         if isinstance(system, ConstituentSquares):
             figures["chosen"] = system.chosen
         if isinstance(system, ConstituentNet):
-            figures["epochs"] = [[one.loss, one.validation_loss, one.rate] for one in system.epochs]
+            figures["epochs"] = [[item.loss, item.validation_loss, item.rate] for item in system.epochs]
         if cell.system in NEED_BIOTAC:
             figures["accuracy on BioTac"] = self._maker.accuracy
         return figures
 
     def _otherwise(self, system: ConstituentMemory, touches: Split, truth: Any, progress: Progress) -> Figures:
-        """Ours, not told that every fabric was touched; told that none was, so by heads alone; and fabrics."""
+        """Ours with novelty inferred; by heads alone, as if no fabric were known; and which fabric."""
         found: Figures = {}
         for name, unfamiliar in (("inferred", 0.5), ("heads", 1.0)):
-            said = system.compositions(touches.asked, unfamiliar, progress)
-            found[name] = score(self.scored, truth, told_of(self.scored, said).presence)["score"]
-        fabrics = [one.prediction.material for one in said]
-        found["fabric"] = float(np.mean([one == true for one, true in zip(fabrics, touches.truth, strict=True)]))
+            predicted = system.compositions(touches.test_streams, unfamiliar, progress)
+            found[name] = score(self.scored, truth, estimates_of(self.scored, predicted).presence)["score"]
+        fabrics = [item.prediction.material for item in predicted]
+        found["fabric"] = float(np.mean([item == true for item, true in zip(fabrics, touches.truth, strict=True)]))
         return found
 
 

@@ -1,7 +1,7 @@
 """What it is made of, on real data that stand in for the paper's fabrics, each named for what it is.
 
 Letter-spike: Braille letters, whose six dots are constituents that are there or not; known letters in five folds, and
-letters never touched, left out in groups. FabricSlide: fabrics learned at one force or speed and asked about at
+letters never touched, left out in groups. FabricSlide: fabrics trained on at one force or speed and tested at
 another, the paper's change of protocol.
 """
 
@@ -31,8 +31,8 @@ from scroll_tactile.pipelines.runfile import RunFile
 __all__ = ["FIGURES", "Letters", "SlideTransfer", "directions", "summary"]
 
 FIGURES = ("score", "exact", "accuracy", "likeliest", "inferred", "always", "calibration_error")
-"""Of each fold: mean score per constituent, exact matches, materials told; the score of saying the dots of the
-likeliest letter (all right wherever the letter is), that where it is not said beforehand whether the touches are of
+"""Of each fold: mean score per constituent, exact matches, materials right; the score of saying the dots of the
+likeliest letter (all right wherever the letter is), that where novelty is inferred, not given: the touches are of
 letters never touched, and that of always saying what is more common among the letters learned; and expected calibration
 error of the presences."""
 
@@ -45,8 +45,8 @@ class Letters:
 
     recordings: of `letter_spike`, or any whose materials are its letters. groups: into which the letters are dealt, one
     of which is never touched; seed: deals them.
-    cosines: features that tell known letters apart. Letters never touched are told by the maps alone (see `Maps`).
-    folder: where finished parts are noted, so that an interrupted run goes on; or None.
+    cosines: features by which known letters are classified. Letters held out are composed by the maps alone (see
+    `Maps`). folder: where finished parts are noted, so that an interrupted run resumes; or None.
     """
 
     recordings: Recordings
@@ -76,16 +76,16 @@ class Letters:
             ("known", f"fold {fold}", fold, self.recordings.fold == fold) for fold in folds
         ]
         groups = letter_folds(self.groups, self.seed)
-        parts += [("never touched", " ".join(group), at, np.isin(names, group)) for at, group in enumerate(groups)]
-        # With the embedding: whether the touches asked about are of letters never touched, which whoever asks knows.
+        parts += [("never touched", " ".join(group), i, np.isin(names, group)) for i, group in enumerate(groups)]
+        # With the embedding: whether the tested touches are of letters held out, which the caller knows.
         settings: dict[str, tuple[Embedding, float]] = {
             "known": (Cached(Maps(layout=GRID, parts=4, views=["as-felt", "corner"], cosines=self.cosines)), 0.0),
             "never touched": (Cached(Maps(layout=GRID, parts=1, views=["corner"])), 1.0),
         }
-        for kind, title, at, tested in parts:
-            name = f"{kind} {at}"
+        for kind, title, i, tested in parts:
+            name = f"{kind} {i}"
             if name not in notes.notes and tested.any():
-                result = {"part": kind, "number": at, "tested on": title}
+                result = {"part": kind, "number": i, "tested on": title}
                 notes.note(name, result | self._part(*settings[kind], tested, f"{kind}, {title}", progress))
             if name in notes.notes:
                 yield notes.notes[name]
@@ -97,38 +97,38 @@ class Letters:
         recordings = self.recordings
         learner = TactileLearner(sensor=recordings.sensor, embedding=embedding, exemplars=0)
         total = len(recordings)
-        for done, at in enumerate(np.flatnonzero(~tested).tolist()):
-            learner.observe(recordings.materials[at], recordings.streams[at])
+        for done, i in enumerate(np.flatnonzero(~tested).tolist()):
+            learner.observe(recordings.materials[i], recordings.streams[i])
             progress(what, done + 1, total)
         for letter in learner.materials:
             learner.describe(letter, dots_of(letter))
-        exam = np.flatnonzero(tested).tolist()
-        said, untold = [], []
-        for done, at in enumerate(exam):
-            said.append(learner.compose(recordings.streams[at], unfamiliar=unfamiliar))
-            untold.append(learner.compose(recordings.streams[at]))
-            progress(what, total - len(exam) + done + 1, total)
-        truth = [recordings.materials[at] for at in exam]
+        test = np.flatnonzero(tested).tolist()
+        predicted, inferred = [], []
+        for done, i in enumerate(test):
+            predicted.append(learner.compose(recordings.streams[i], unfamiliar=unfamiliar))
+            inferred.append(learner.compose(recordings.streams[i]))
+            progress(what, total - len(test) + done + 1, total)
+        truth = [recordings.materials[i] for i in test]
         dots = [dots_of(letter) for letter in truth]
-        figures = score_compositions(DOTS, dots, said)
-        there = [[one[dot] for dot in DOTS] for one in dots]
-        likeliest = [dots_of(one.prediction.material or "space") for one in said]
-        often = np.mean([list(dots_of(recordings.materials[at]).values()) for at in np.flatnonzero(~tested)], axis=0)
+        figures = score_compositions(DOTS, dots, predicted)
+        there = [[answer[dot] for dot in DOTS] for answer in dots]
+        likeliest = [dots_of(answer.prediction.material or "space") for answer in predicted]
+        often = np.mean([list(dots_of(recordings.materials[i]).values()) for i in np.flatnonzero(~tested)], axis=0)
         return {
             "learned": int((~tested).sum()),
-            "accuracy": accuracy(truth, [one.prediction.material for one in said]),
-            "unfamiliar": float(np.mean([one.unfamiliar for one in untold])),
+            "accuracy": accuracy(truth, [answer.prediction.material for answer in predicted]),
+            "unfamiliar": float(np.mean([answer.unfamiliar for answer in inferred])),
             **figures,
-            "likeliest": score(DOTS, there, [[one[dot] for dot in DOTS] for one in likeliest])["score"],
-            "always": score(DOTS, there, np.tile(often, (len(exam), 1)))["score"],
-            "inferred": score_compositions(DOTS, dots, untold)["score"],
+            "likeliest": score(DOTS, there, [[answer[dot] for dot in DOTS] for answer in likeliest])["score"],
+            "always": score(DOTS, there, np.tile(often, (len(test), 1)))["score"],
+            "inferred": score_compositions(DOTS, dots, inferred)["score"],
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
         }
 
 
 def directions(slides: Slides) -> dict[str, tuple[Mask, Mask]]:
-    """What is learned from and what is asked about, by name: masks of shape (N,).
+    """What is trained on and what is tested, by name: masks of shape (N,).
 
     Slow is up to 50 mm/s and fast from 100 on, which parts the six speeds; low is a force of up to 150 and high of 210
     or more, with 180 on neither side.
@@ -146,7 +146,7 @@ def directions(slides: Slides) -> dict[str, tuple[Mask, Mask]]:
 
 @dataclass(frozen=True)
 class SlideTransfer:
-    """Fabrics learned at one force or speed and asked about at another.
+    """Fabrics trained on at one force or speed and tested at another.
 
     slides: of `fabric_slide`. parts: of a slide, whose mean ratios are the features. folder: as for `Letters`.
     """
@@ -170,35 +170,35 @@ class SlideTransfer:
         embedding = Cached(Maps(layout=(CPM_RATIOS.channels,), parts=self.parts))
         splits = directions(self.slides)
         splits |= {f"fold {fold}": (recordings.fold != fold, recordings.fold == fold) for fold in range(5)}
-        for name, (taught, tested) in splits.items():
+        for name, (trained, tested) in splits.items():
             if name not in notes.notes:
-                if not taught.any() or not tested.any():
+                if not trained.any() or not tested.any():
                     raise InputError(f"expected slides on both sides of {name}; there are none on one")
-                notes.note(name, {"part": name} | self._part(embedding, streams, taught, tested, name, progress))
+                notes.note(name, {"part": name} | self._part(embedding, streams, trained, tested, name, progress))
             yield notes.notes[name]
 
     def _part(
-        self, embedding: Embedding, streams: Sequence[Any], taught: Mask, tested: Mask, what: str, progress: Progress
+        self, embedding: Embedding, streams: Sequence[Any], trained: Mask, tested: Mask, what: str, progress: Progress
     ) -> dict[str, Any]:
         begun = time.perf_counter()
         names = self.slides.recordings.materials
         learner = TactileLearner(sensor=CPM_RATIOS, embedding=embedding, exemplars=0)
-        lessons, exam = np.flatnonzero(taught).tolist(), np.flatnonzero(tested).tolist()
-        for done, at in enumerate(lessons):
-            learner.observe(names[at], streams[at])
-            progress(what, done + 1, len(lessons))
-        said = [learner.predict(streams[at]) for at in exam]
-        truth = [names[at] for at in exam]
-        right = [one == prediction.material for one, prediction in zip(truth, said, strict=True)]
+        train, test = np.flatnonzero(trained).tolist(), np.flatnonzero(tested).tolist()
+        for done, i in enumerate(train):
+            learner.observe(names[i], streams[i])
+            progress(what, done + 1, len(train))
+        predicted = [learner.predict(streams[i]) for i in test]
+        truth = [names[i] for i in test]
+        right = [answer == prediction.material for answer, prediction in zip(truth, predicted, strict=True)]
         return {
-            "learned": len(lessons),
-            "tested": len(exam),
+            "learned": len(train),
+            "tested": len(test),
             "accuracy": float(np.mean(right)),
             "of each": {
-                name: float(np.mean([hit for hit, one in zip(right, truth, strict=True) if one == name]))
+                name: float(np.mean([hit for hit, answer in zip(right, truth, strict=True) if answer == name]))
                 for name in sorted(set(truth))
             },
-            "unknown": float(np.mean([not one.known for one in said])),
+            "unknown": float(np.mean([not answer.known for answer in predicted])),
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
         }

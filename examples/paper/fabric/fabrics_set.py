@@ -136,7 +136,7 @@ _WANTED = (
 
 def _patterns(pattern: str | None) -> list[re.Pattern[str]]:
     try:
-        made = [re.compile(one, re.IGNORECASE) for one in ([pattern] if pattern is not None else LAYOUTS)]
+        made = [re.compile(expression, re.IGNORECASE) for expression in ([pattern] if pattern is not None else LAYOUTS)]
     except re.error as error:
         raise InputError(f"expected a regular expression as the pattern; {pattern!r} is none: {error}") from error
     missing = {"fabric", "protocol"} - set(made[0].groupindex)
@@ -164,14 +164,14 @@ def _named(
         if path.suffix.lower() not in (".npy", ".csv") or path.resolve() == table.resolve():
             continue
         below = path.relative_to(folder).with_suffix("").as_posix()
-        found = next((match for one in patterns if (match := one.fullmatch(below))), None)
+        found = next((match for expression in patterns if (match := expression.fullmatch(below))), None)
         if found is None or not found["fabric"] or not found["protocol"]:
             raise DatasetError(
                 f"expected the path of {path} to say fabric and protocol, such as protocol1/FABRIC/00.npy, "
                 "FABRIC/protocol1/00.npy or FABRIC_protocol1_00.npy. Move it, or give a pattern of your own"
             )
-        said = found["protocol"].lower()
-        protocol = 1 if said == "robot" else 2 if said == "hand" else int(said[-1]) if said[-1:] in ("1", "2") else 0
+        side = found["protocol"].lower()
+        protocol = 1 if side == "robot" else 2 if side == "hand" else int(side[-1]) if side[-1:] in ("1", "2") else 0
         if not protocol:
             raise DatasetError(
                 f"expected {path} to be of protocol 1 (robot) or 2 (hand); it says {found['protocol']!r}"
@@ -232,7 +232,7 @@ def _cells(path: Path) -> npt.NDArray[np.float64]:
             rows = [row for row in csv.reader(file) if row]
         timed = bool(rows) and rows[0][0].strip().lower() in ("t", "time", "timestamp")
         # A line of names, or of pandas' names for columns without any: 0, 1, 2 …
-        if rows and (not _number(rows[0][-1]) or rows[0][timed:] == [str(at) for at in range(len(rows[0]) - timed)]):
+        if rows and (not _number(rows[0][-1]) or rows[0][timed:] == [str(i) for i in range(len(rows[0]) - timed)]):
             rows = rows[1:]
         return np.array([row[timed:] for row in rows], dtype=np.float64)
     except (OSError, ValueError, UnicodeDecodeError, csv.Error) as error:

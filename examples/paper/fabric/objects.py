@@ -1,9 +1,9 @@
 """Everyday objects under a camera: which of them it is, and what those are like that were never touched before.
 
-PhysiCLeAR's videos of a GelSight, each a stream of four frames in contact. Objects that were touched are told in folds
-of their videos. Attributes (hardness, roughness, texture, each of three values) are told of objects never touched: they
-are left out in groups, and told by heads over the others (`unseen`); beside it, by `compose`, to which each value is a
-constituent that the others were described to have or not.
+PhysiCLeAR's videos of a GelSight, each a stream of four frames in contact. Objects that are known are classified in
+folds of their videos. Attributes (hardness, roughness, texture, each of three values) are graded of objects held out:
+they are left out in groups, and graded by heads over the others (`unseen`); beside it, by `compose`, to which each
+value is a constituent that the others were described to have or not.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Mask = npt.NDArray[np.bool_]
 VALUES = (0, 1, 2)
 """Of every attribute."""
 COSINES = 700
-"""Of the surface's counts, by which attributes are told."""
+"""Of the surface's counts, by which attributes are graded."""
 TREES = 100
 """Of the baseline, scikit-learn's extremely randomised trees on the counts and the light of each frame."""
 
@@ -54,10 +54,10 @@ class Objects:
     """Objects in folds of their videos, and attributes of objects in groups that are left out.
 
     recordings: whole videos, see `physiclear.videos`. attributes: object → attribute → value, of those that are known.
-    weights: of a trained ResNet, by which objects that were touched are told, too; None: by `Frames`' counts alone.
-    Attributes are told by cosines of the counts. groups: into which the objects with attributes are
+    weights: of a trained ResNet, by which objects that are known are classified, too; None: by `Frames`' counts alone.
+    Attributes are graded by cosines of the counts. groups: into which the objects with attributes are
     dealt, one of which is never touched; seed: deals them, and grows the trees. trees: of the baseline; 0: none.
-    folder: where finished parts are noted, so that an interrupted run goes on; or None.
+    folder: where finished parts are noted, so that an interrupted run resumes; or None.
 
     Raises InputError for fewer groups than two, or more than objects.
     """
@@ -81,7 +81,7 @@ class Objects:
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
         settings = {"groups": self.groups, "seed": self.seed, "trees": self.trees, "cosines": COSINES}
-        known = {"attributes": {name: dict(one) for name, one in self.attributes.items()}}
+        known = {"attributes": {name: dict(answer) for name, answer in self.attributes.items()}}
         weights = None if self.weights is None else weights_digest(self.weights)
         data = {"dataset": self.recordings.name, "data": data_digest(self.recordings)}
         return {"run": "objects", "weights": weights} | data | settings | known
@@ -100,9 +100,9 @@ class Objects:
                 if (name := f"{by}, fold {fold}") not in notes.notes:
                     notes.note(name, {"part": f"known, {by}", "number": fold} | self._known(by, fold, name, progress))
                 yield notes.notes[name]
-        for at, group in enumerate(object_groups(sorted(self.attributes), self.groups, self.seed)):
-            if (name := f"group {at}") not in notes.notes:
-                result = {"part": "never touched", "number": at, "objects": group}
+        for i, group in enumerate(object_groups(sorted(self.attributes), self.groups, self.seed)):
+            if (name := f"group {i}") not in notes.notes:
+                result = {"part": "never touched", "number": i, "objects": group}
                 notes.note(name, result | self._unknown(group, name, progress))
             yield notes.notes[name]
 
@@ -126,94 +126,96 @@ class Objects:
     def _counts(self) -> FloatArray:
         """Of every frame what the trees read: `Frames` without a network, (videos, frames, d)."""
         plain = self._embeddings["counts"]
-        return np.stack([self._read(plain, at) for at in range(len(self.recordings))]).astype(np.float64)
+        return np.stack([self._read(plain, i) for i in range(len(self.recordings))]).astype(np.float64)
 
     @property
     def _width(self) -> int:
         """Columns of a frame in its tactile image, the one scale of a camera's memory."""
         return min(FRAMES, self.recordings.sensor.shape[1])
 
-    def _read(self, embedding: Embedding, at: int) -> npt.NDArray[np.floating]:
+    def _read(self, embedding: Embedding, i: int) -> npt.NDArray[np.floating]:
         """Features of each frame of a video, (frames, d)."""
-        image, width = image_of(self.recordings.streams[at], None), self._width
+        image, width = image_of(self.recordings.streams[i], None), self._width
         return embed_windows(embedding, image, {width: list(range(0, image.shape[1], width))})[width]
 
-    def _taught(self, embedding: Embedding, taught: Mask, what: str, progress: Progress) -> TactileLearner:
+    def _trained(self, embedding: Embedding, trained: Mask, what: str, progress: Progress) -> TactileLearner:
         learner = TactileLearner(sensor=self.recordings.sensor, embedding=embedding, exemplars=0)
-        lessons = np.flatnonzero(taught).tolist()
-        for done, at in enumerate(lessons, start=1):
-            learner.observe(self.recordings.materials[at], self.recordings.streams[at])
-            progress(what, done, len(lessons))
+        train = np.flatnonzero(trained).tolist()
+        for done, i in enumerate(train, start=1):
+            learner.observe(self.recordings.materials[i], self.recordings.streams[i])
+            progress(what, done, len(train))
         return learner
 
     def _known(self, by: str, fold: int, what: str, progress: Progress) -> dict[str, Any]:
         begun = time.perf_counter()
         tested = self.recordings.fold == fold
-        learner = self._taught(self._embeddings[by], ~tested, what, progress)
-        streams = [self.recordings.streams[at] for at in np.flatnonzero(tested)]
+        learner = self._trained(self._embeddings[by], ~tested, what, progress)
+        streams = [self.recordings.streams[i] for i in np.flatnonzero(tested)]
         truth = self._names[tested].tolist()
-        said = [learner.predict(stream) for stream in streams]
-        of_frames = [[str(learner.predict(one).material) for one in _frames(stream)] for stream in streams]
+        predicted = [learner.predict(stream) for stream in streams]
+        of_frames = [[str(learner.predict(answer).material) for answer in _frames(stream)] for stream in streams]
         votes = [most_often(answers) for answers in of_frames]
         figures = {
             "learned": int((~tested).sum()),
             "tested": len(truth),
-            "video": accuracy(truth, [one.material for one in said]),
+            "video": accuracy(truth, [answer.material for answer in predicted]),
             "frame": float(
-                np.mean([one == name for name, those in zip(truth, of_frames, strict=True) for one in those])
+                np.mean([answer == name for name, answers in zip(truth, of_frames, strict=True) for answer in answers])
             ),
             "vote": accuracy(truth, votes),
-            "called unknown": float(np.mean([not one.known for one in said])),
+            "called unknown": float(np.mean([not answer.known for answer in predicted])),
             "digest": learner.digest(),
         }
         if self.trees and by == "counts":  # they read nothing else
             progress(f"{what}: trees", 0, 1)
             chances, classes = self._grown(~tested, tested, self._names)
             figures["trees"] = accuracy(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
-            told = [most_often(one.tolist()) for one in classes[chances.argmax(axis=2)]]
-            figures["trees' vote"] = accuracy(truth, told)
+            graded = [most_often(answer.tolist()) for answer in classes[chances.argmax(axis=2)]]
+            figures["trees' vote"] = accuracy(truth, graded)
         return figures | {"seconds": time.perf_counter() - begun}
 
     def _unknown(self, group: Sequence[str], what: str, progress: Progress) -> dict[str, Any]:
         begun = time.perf_counter()
         tested = np.isin(self._names, group)
-        learner = self._taught(self._waves, ~tested, what, progress)
+        learner = self._trained(self._waves, ~tested, what, progress)
         for name, values in self.attributes.items():
             if name not in group:
-                learner.describe(name, {_constituent(key, v): one == v for key, one in values.items() for v in VALUES})
-        exam = np.flatnonzero(tested).tolist()
-        said = [learner.compose(self.recordings.streams[at], unfamiliar=1.0) for at in exam]
+                learner.describe(
+                    name, {_constituent(key, v): answer == v for key, answer in values.items() for v in VALUES}
+                )
+        test = np.flatnonzero(tested).tolist()
+        predicted = [learner.compose(self.recordings.streams[i], unfamiliar=1.0) for i in test]
         keys = list(next(iter(self.attributes.values())))
-        taught = {name: values for name, values in self.attributes.items() if name not in group}
-        heads = fit_heads(learner.memory.statistics, Scale("window", self._width), taught, keys)
-        means = [in_units(self._read(self._waves, at), self._waves.bound).mean(axis=0) for at in exam]
-        told: dict[str, dict[str, Any]] = {}
+        trained = {name: values for name, values in self.attributes.items() if name not in group}
+        heads = fit_heads(learner._memory.statistics, self._width, trained, keys)
+        means = [in_units(self._read(self._waves, i), self._waves.bound).mean(axis=0) for i in test]
+        graded: dict[str, dict[str, Any]] = {}
         for key in keys:
-            truth = [self.attributes[self.recordings.materials[at]][key] for at in exam]
-            composed = [_likeliest(one, key) for one in said]
-            told[key] = {
+            truth = [self.attributes[self.recordings.materials[i]][key] for i in test]
+            composed = [_likeliest(answer, key) for answer in predicted]
+            graded[key] = {
                 "right": _share(truth, [heads[key](mean) for mean in means]),
                 "composed": _share(truth, composed),
                 "penalty": heads[key].readout.penalty,
                 "gamma": heads[key].gamma,
                 **self._baselines(key, truth, tested, progress),
             }
-        figures = {"learned": int((~tested).sum()), "tested": len(exam), "attributes": told}
+        figures = {"learned": int((~tested).sum()), "tested": len(test), "attributes": graded}
         return figures | {"digest": learner.digest(), "seconds": time.perf_counter() - begun}
 
     def _baselines(self, key: str, truth: Sequence[int], tested: Mask, progress: Progress) -> dict[str, float]:
         """Saying always what most videos of the others have; and the trees."""
         values = np.array([self.attributes.get(name, {}).get(key, -1) for name in self.recordings.materials])
-        taught = ~tested & (values >= 0)
-        often = most_often(values[taught].tolist())
+        trained = ~tested & (values >= 0)
+        often = most_often(values[trained].tolist())
         figures = {"always": _share(truth, [often] * len(truth))}
         if self.trees:
             progress(f"trees of {key}", 0, 1)
-            chances, classes = self._grown(taught, tested, values)
+            chances, classes = self._grown(trained, tested, values)
             figures["trees"] = _share(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
         return figures
 
-    def _grown(self, taught: Mask, tested: Mask, targets: npt.NDArray[Any]) -> tuple[FloatArray, npt.NDArray[Any]]:
+    def _grown(self, trained: Mask, tested: Mask, targets: npt.NDArray[Any]) -> tuple[FloatArray, npt.NDArray[Any]]:
         """Probabilities of each frame of the tested videos, (videos, frames, classes), and the classes."""
         try:
             from sklearn.ensemble import ExtraTreesClassifier
@@ -224,7 +226,7 @@ class Objects:
             ) from error
         rows, frames = self._counts, self._counts.shape[1]
         forest = ExtraTreesClassifier(self.trees, random_state=self.seed)
-        forest.fit(rows[taught].reshape(-1, rows.shape[2]), np.repeat(targets[taught], frames))
+        forest.fit(rows[trained].reshape(-1, rows.shape[2]), np.repeat(targets[trained], frames))
         chances: FloatArray = forest.predict_proba(rows[tested].reshape(-1, rows.shape[2]))
         return chances.reshape(-1, frames, chances.shape[1]), forest.classes_
 
@@ -232,12 +234,12 @@ class Objects:
 def object_groups(names: Sequence[str], groups: int, seed: int) -> list[list[str]]:
     """Names dealt into groups of nearly equal size; the same arguments give the same groups."""
     dealt = np.random.default_rng([seed, groups]).permutation(len(names)) % groups
-    return [[name for name, own in zip(names, dealt.tolist(), strict=True) if own == at] for at in range(groups)]
+    return [[name for name, own in zip(names, dealt.tolist(), strict=True) if own == i] for i in range(groups)]
 
 
-def most_often(said: Sequence[Any]) -> Any:
-    """What is said most often; of equals the first in order."""
-    return max(sorted(set(said)), key=list(said).count)
+def most_often(predicted: Sequence[Any]) -> Any:
+    """What is reported most often; of equals the first in order."""
+    return max(sorted(set(predicted)), key=list(predicted).count)
 
 
 def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
@@ -247,10 +249,10 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
     """
     means: dict[str, dict[str, dict[str, float]]] = {}
     for kind in dict.fromkeys(result["part"] for result in results):
-        those = [(_flat(result), result["tested"]) for result in results if result["part"] == kind]
-        weights = [tested for _, tested in those]
-        for name in those[0][0]:
-            values = [figures[name] for figures, _ in those]
+        answers = [(_flat(result), result["tested"]) for result in results if result["part"] == kind]
+        weights = [tested for _, tested in answers]
+        for name in answers[0][0]:
+            values = [figures[name] for figures, _ in answers]
             _, spread = mean_and_spread(values)
             means.setdefault(kind, {})[name] = {"mean": float(np.average(values, weights=weights)), "sd": spread}
     return means
@@ -258,10 +260,10 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
 
 def _flat(result: Mapping[str, Any]) -> dict[str, float]:
     figures = {name: result[name] for name in ("video", "vote", "frame", "trees", "trees' vote") if name in result}
-    for key, one in result.get("attributes", {}).items():
+    for key, answer in result.get("attributes", {}).items():
         figures |= {
             key if what == "right" else f"{key}, {what}": value
-            for what, value in one.items()
+            for what, value in answer.items()
             if what not in ("penalty", "gamma")
         }
     return figures
@@ -271,15 +273,15 @@ def _constituent(attribute: str, value: int) -> str:
     return f"{attribute} {value}"
 
 
-def _share(truth: Sequence[int], said: Sequence[int]) -> float:
-    return float(np.mean([one == other for one, other in zip(truth, said, strict=True)]))
+def _share(truth: Sequence[int], predicted: Sequence[int]) -> float:
+    return float(np.mean([true == guess for true, guess in zip(truth, predicted, strict=True)]))
 
 
-def _likeliest(said: Composition, attribute: str) -> int:
-    """The value of the largest presence; one without a head, which no or every object has, is never said."""
-    chances = [said[_constituent(attribute, value)].presence for value in VALUES]
+def _likeliest(predicted: Composition, attribute: str) -> int:
+    """The value of the largest presence; one without a head, which no or every object has, is never reported."""
+    chances = [predicted[_constituent(attribute, value)].presence for value in VALUES]
     return int(np.argmax([-1.0 if chance is None else chance for chance in chances]))
 
 
 def _frames(stream: Stream) -> list[Stream]:
-    return [Stream(stream.sensor, stream.readings[at : at + 1]) for at in range(len(stream))]
+    return [Stream(stream.sensor, stream.readings[i : i + 1]) for i in range(len(stream))]

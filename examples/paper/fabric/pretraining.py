@@ -27,11 +27,11 @@ __all__ = ["Pretraining"]
 
 @dataclass(frozen=True)
 class Pretraining:
-    """A trained ResNet, fine-tuned to tell the materials of some recordings, four folds of them.
+    """A trained ResNet, fine-tuned to classify the materials of some recordings, four folds of them.
 
     recordings: of materials. weights: what it begins with. course: of the training. device: where. every: columns that
     images are averaged over. seed: of all that is drawn. file: where the network is kept, an .npz of its tensors, so
-    that a run that goes on does not train it again; or None.
+    that a resumed run does not train it again; or None.
     """
 
     recordings: Recordings
@@ -56,15 +56,15 @@ class Pretraining:
 
         name = f"fine-tuned on {self.recordings.name}"
         system = TrainedNetwork(name, make, lambda image: average_columns(image, self.every), self.course, self.device)
-        told = f"{name}: "
+        label = f"{name}: "
         system.fit(
             part.streams,
             part.materials,
             part.validation,
             self.seed,
-            lambda what, done, of: progress(told + what, done, of),
+            lambda what, done, of: progress(label + what, done, of),
         )
-        right = accuracy(part.truth, [*system.predict(part.asked)])
+        right = accuracy(part.truth, [*system.predict(part.test_streams)])
         network = system.network
         assert isinstance(network, ResNetClassifier)
         net = network.net.cpu().eval()

@@ -55,7 +55,7 @@ def ratios(stream: Stream) -> Stream:
 def _around(values: npt.NDArray[np.float64], span: int) -> npt.NDArray[np.float64]:
     """Means over `span` readings around each of T, fewer at the ends, of values (T, n)."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    at = np.arange(len(values))
-    first, after = np.maximum(at - span // 2, 0), np.minimum(at + span // 2 + 1, len(values))
+    i = np.arange(len(values))
+    first, after = np.maximum(i - span // 2, 0), np.minimum(i + span // 2 + 1, len(values))
     means: npt.NDArray[np.float64] = (total[after] - total[first]) / (after - first)[:, None]
     return means

@@ -1,8 +1,8 @@
 """Simulated fabrics under a simulated Contactile-like array, for the tests, the demo and `fabric contactile`.
 
 It is no model of any real fabric: the constituents' figures are made up, in the order in which textile handbooks put
-them, and the weaves are drawn. Nothing measured on it says how real fabrics would be told. What it keeps of them is the
-task: a constituent shows only through the yarn that it is a part of, under two protocols of touching.
+them, and the weaves are drawn. Nothing measured on it says how real fabrics would be classified. What it keeps of them
+is the task: a constituent shows only through the yarn that it is a part of, under two protocols of touching.
 
 >>> from examples.paper.fabric.simulated import FabricScene
 >>> scene = FabricScene(seed=0, count=4)
@@ -133,7 +133,7 @@ class FabricScene:
     @cached_property
     def compositions(self) -> dict[str, dict[str, float]]:
         """Fabric → constituent → its share by mass; those that are not named are absent."""
-        return {name: _recipe(self.seed, at) for at, name in enumerate(self.fabrics)}
+        return {name: _recipe(self.seed, i) for i, name in enumerate(self.fabrics)}
 
     def touch(self, fabric: str, protocol: int, repetition: int) -> Stream:
         """A touch of (599, 27) N, channels pillar by pillar, x, y and z of each; a function of its arguments.
@@ -147,10 +147,10 @@ class FabricScene:
             raise InputError(
                 f"expected protocol {ROBOT} or {HAND} and a repetition of 0 or more; came {protocol}, {repetition}"
             )
-        at = self.fabrics.index(fabric)
-        random = np.random.default_rng([_TOUCH, self.seed, at, protocol, repetition])
+        i = self.fabrics.index(fabric)
+        random = np.random.default_rng([_TOUCH, self.seed, i, protocol, repetition])
         times = np.arange(CONTACTILE.readings) / CONTACTILE.rate
-        cloth = _cloth(self.seed, at)
+        cloth = _cloth(self.seed, i)
         path = _robot(times, random) if protocol == ROBOT else _hand(times, random)
         forces = _slide(cloth, path, times, random, _loads(self.seed))
         return validate(np.clip(forces.astype(np.float32), *LIMITS), self.sensor)
@@ -170,7 +170,7 @@ class FabricScene:
                 rows = csv.writer(file, lineterminator="\n")
                 rows.writerow(["fabric", *CONSTITUENTS])
                 for name, shares in self.compositions.items():
-                    rows.writerow([name, *(f"{100 * shares.get(one, 0):g}" for one in CONSTITUENTS)])
+                    rows.writerow([name, *(f"{100 * shares.get(constituent, 0):g}" for constituent in CONSTITUENTS)])
             for protocol, count in ((ROBOT, robot), (HAND, hand)):
                 for name in self.fabrics:
                     own = folder / f"protocol{protocol}" / name
@@ -181,32 +181,34 @@ class FabricScene:
             raise InputError(f"simulated fabrics cannot be written into {folder}: {error.strerror}") from error
 
 
-def _recipe(seed: int, at: int) -> dict[str, float]:
+def _recipe(seed: int, i: int) -> dict[str, float]:
     """One to three constituents in steps of 5 %; elastane is never more than a tenth, and so never alone."""
-    random = np.random.default_rng([_RECIPE, seed, at])
+    random = np.random.default_rng([_RECIPE, seed, i])
     number = int(random.choice([1, 2, 3], p=[0.25, 0.5, 0.25]))
-    drawn = [CONSTITUENTS[one] for one in random.choice(len(CONSTITUENTS), number, replace=False, p=_OFTEN)]
+    drawn = [
+        CONSTITUENTS[constituent] for constituent in random.choice(len(CONSTITUENTS), number, replace=False, p=_OFTEN)
+    ]
     steps = {}
     if "elastane" in drawn:
-        drawn = [one for one in drawn if one != "elastane"] or ["cotton"]
+        drawn = [constituent for constituent in drawn if constituent != "elastane"] or ["cotton"]
         steps["elastane"] = int(random.integers(1, round(_MOST_ELASTANE * 20) + 1))
     left = 20 - sum(steps.values())
     cuts = np.sort(random.choice(np.arange(3, left - 2), len(drawn) - 1, replace=False))
     sizes = np.diff([0, *cuts.tolist(), left])
-    steps |= {one: int(size) for one, size in zip(drawn, sizes, strict=True)}
-    return {one: steps[one] / 20 for one in sorted(steps)}
+    steps |= {constituent: int(size) for constituent, size in zip(drawn, sizes, strict=True)}
+    return {constituent: steps[constituent] / 20 for constituent in sorted(steps)}
 
 
 @lru_cache(maxsize=256)
-def _cloth(seed: int, at: int) -> _Cloth:
+def _cloth(seed: int, i: int) -> _Cloth:
     """A yarn blended by mass, its stiffness in logarithms, in a weave that has nothing to do with what it is of."""
-    shares = _recipe(seed, at)
-    random = np.random.default_rng([_CLOTH, seed, at])
+    shares = _recipe(seed, i)
+    random = np.random.default_rng([_CLOTH, seed, i])
 
     def mean(what: str) -> float:
-        return sum(share * float(getattr(_YARNS[one], what)) for one, share in shares.items())
+        return sum(share * float(getattr(_YARNS[constituent], what)) for constituent, share in shares.items())
 
-    stiffness = math.exp(sum(share * math.log(_YARNS[one].stiffness) for one, share in shares.items()))
+    stiffness = math.exp(sum(share * math.log(_YARNS[constituent].stiffness) for constituent, share in shares.items()))
     yarn = _Yarn(stiffness, mean("friction"), mean("hair"), mean("slub"), mean("settling"))
     weave = str(random.choice(list(_WEAVES)))
     period = math.exp(random.uniform(math.log(0.9), math.log(2.8)))

@@ -1,6 +1,6 @@
 """Heads for objects never touched, over a memory's own statistics, with a λ that is chosen by leaving objects out.
 
-`compose` takes over the λ by which materials are told apart, 0.03 of a feature's variance at most, so that describing
+`compose` takes over the λ by which materials are classified, 0.03 of a feature's variance at most, so that describing
 costs no factorisation. Where objects are few and unlike each other a head wants a tamer one. Here both λ and γ (see
 `ridge.attributes`) are those of least squared error on the class means of objects left out, one by one: of a head that
 solves with B, the error of leaving object y out is α_y / B_yy, so no head is fitted twice.
@@ -54,17 +54,17 @@ class UnseenHead:
 def fit_heads(
     statistics: Statistics, scale: Scale, attributes: Mapping[str, Mapping[str, int]], keys: Sequence[str]
 ) -> dict[str, UnseenHead]:
-    """Attribute → its head over what was felt at a scale.
+    """Attribute → its head over what was observed at a scale.
 
     attributes: material → attribute → value, of those that are known; of others there may be any.
 
-    Raises InputError where fewer than two materials with known attributes were felt.
+    Raises InputError where fewer than two materials with known attributes were observed.
     """
     names = statistics.names(scale)
-    places = np.array([at for at, name in enumerate(names) if name in attributes], dtype=np.intp)
+    places = np.array([i for i, name in enumerate(names) if name in attributes], dtype=np.intp)
     if len(places) < 2:
-        raise InputError(f"expected two materials or more with known attributes; felt was {len(places)}")
-    known = {key: np.array([attributes[names[at]][key] for at in places]) for key in keys}
+        raise InputError(f"expected two materials or more with known attributes; observed was {len(places)}")
+    known = {key: np.array([attributes[names[i]][key] for i in places]) for key in keys}
     best: dict[str, UnseenHead] = {}
     with one_thread():
         task = task_of(statistics, scale)

@@ -95,6 +95,6 @@ class Cached:
         missing = {width: starts for width, starts in windows.items() if keys[width] not in self._kept}
         if missing:
             for width, features in embed_windows(self._embedding, image, missing).items():
-                features.setflags(write=False)  # all who ask are given the same array
+                features.setflags(write=False)  # all callers get the same array
                 self._kept[keys[width]] = features
         return {width: self._kept[key] for width, key in keys.items()}

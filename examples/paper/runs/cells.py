@@ -46,18 +46,18 @@ class Split:
     streams: list[Stream]
     materials: list[str]
     validation: list[Labelled]
-    exam: list[Labelled]
+    test: list[Labelled]
     touch: list[int]
 
     @property
-    def asked(self) -> list[Stream]:
+    def test_streams(self) -> list[Stream]:
         """The streams of the test."""
-        return [stream for _, stream in self.exam]
+        return [stream for _, stream in self.test]
 
     @property
     def truth(self) -> list[str]:
         """The materials of the test."""
-        return [name for name, _ in self.exam]
+        return [name for name, _ in self.test]
 
 
 def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share: float = 0.1) -> Split:
@@ -66,18 +66,18 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
     seed: draws the validation. every: learn every so many recordings only. share: of the recordings of a material
     that go to the validation, at least one where there are three.
 
-    Raises InputError for a fold that is not there, or one with materials that the other folds do not teach.
+    Raises InputError for a fold that is not there, or one with materials that are missing from the other folds.
     """
     there = sorted(set(recordings.fold.tolist()))
     if fold not in there:
         raise InputError(f"expected a fold of {recordings.name} out of {there}; came {fold}")
     tested = recordings.fold == fold
     materials = np.array(recordings.materials)
-    untaught = sorted(set(materials[tested].tolist()) - set(materials[~tested].tolist()))
-    if untaught:
+    unknown = sorted(set(materials[tested].tolist()) - set(materials[~tested].tolist()))
+    if unknown:
         raise InputError(
-            f"expected all materials of fold {fold} of {recordings.name} in its other folds too; {untaught[:5]} are "
-            "tested and never taught. Deal the folds within each material"
+            f"expected all materials of fold {fold} of {recordings.name} in its other folds too; {unknown[:5]} are "
+            "tested and never trained on. Deal the folds within each material"
         )
     # Frames of a video must not be parted; a number of a touch may stand for one in each fold.
     marks = zip(recordings.materials, recordings.fold.tolist(), recordings.repetition.tolist(), strict=True)
@@ -90,16 +90,16 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
         left_out.update(own[np.arange(len(own)) % every != 0].tolist())
         own = own[::every]
         held.update(own[: held_back(len(own), share)].tolist())
-    pick = [at for at in np.flatnonzero(~tested) if groups[at] not in held | left_out]
-    validation = [at for at in np.flatnonzero(~tested) if groups[at] in held]
-    exam = np.flatnonzero(tested)
+    pick = [i for i in np.flatnonzero(~tested) if groups[i] not in held | left_out]
+    validation = [i for i in np.flatnonzero(~tested) if groups[i] in held]
+    test = np.flatnonzero(tested)
     labelled = list(zip(recordings.materials, recordings.streams, strict=True))
     return Split(
-        streams=[recordings.streams[at] for at in pick],
-        materials=[recordings.materials[at] for at in pick],
-        validation=[labelled[at] for at in validation],
-        exam=[labelled[at] for at in exam],
-        touch=groups[exam].tolist(),
+        streams=[recordings.streams[i] for i in pick],
+        materials=[recordings.materials[i] for i in pick],
+        validation=[labelled[i] for i in validation],
+        test=[labelled[i] for i in test],
+        touch=groups[test].tolist(),
     )
 
 
@@ -113,20 +113,20 @@ def run_cells(
 ) -> Iterator[tuple[Cell, Figures]]:
     """The figures of each cell in turn: read back where it was finished, else measured and noted at once.
 
-    progress: told the cells done, the time left, and what the cell in hand is doing. A run that is killed loses the
+    progress: receives the cells done, the time left, and what the cell in hand is doing. A run that is killed loses the
     cell in hand. Raises what `measure` raises, and InputError where the notes cannot be written.
     """
     for number, cell in enumerate(cells):
         if cell.key not in notes.notes:
-            done = {one: notes.notes[one.key]["seconds"] for one in cells if one.key in notes.notes}
+            done = {other: notes.notes[other.key]["seconds"] for other in cells if other.key in notes.notes}
             ahead = f"{number + 1}/{len(cells)}{time_left(done, cells[number:])}: {cell.key}"
 
-            def told(what: str, at: int, of: int, ahead: str = ahead) -> None:
-                progress(f"{ahead}: {what}", at, of)
+            def report(what: str, i: int, of: int, ahead: str = ahead) -> None:
+                progress(f"{ahead}: {what}", i, of)
 
-            told("starting", 0, 1)
+            report("starting", 0, 1)
             begun = time.perf_counter()
-            figures = measure(cell, told)
+            figures = measure(cell, report)
             notes.note(cell.key, figures | {"seconds": time.perf_counter() - begun})
         yield cell, notes.notes[cell.key]
 
@@ -142,8 +142,8 @@ def time_left(seconds: Mapping[Cell, float], ahead: Sequence[Cell]) -> str:
     for cell in ahead:
         if cell in seconds:
             continue
-        same = [s for one, s in seconds.items() if one.system == cell.system]
-        near = [s for one, s in seconds.items() if (one.system, one.dataset) == (cell.system, cell.dataset)]
+        same = [s for other, s in seconds.items() if other.system == cell.system]
+        near = [s for other, s in seconds.items() if (other.system, other.dataset) == (cell.system, cell.dataset)]
         total += float(np.mean(near or same or [*seconds.values()]))
     return f", about {total / 60:.0f} min left" if total >= 90 else f", about {total:.0f} s left"
 

@@ -39,7 +39,7 @@ class SystemStudy:
     epochs: of the networks. device: of all networks but ours. seed: of all that is drawn.
     precision: of the residual networks' training, see `Course`.
     quick: learn every second recording, and let residual networks read about 50 columns an image: for a look.
-    folder: where finished cells are noted, so that a run that was killed goes on; or None.
+    folder: where finished cells are noted, so that a killed run resumes; or None.
 
     Raises InputError for unknown systems, sets of one name, a device that is not there, or weights that are needed and
     not given.
@@ -64,8 +64,8 @@ class SystemStudy:
         needing = [key for key in self.systems if key in NEED_WEIGHTS and self.weights is None]
         if needing:
             raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
-        if len({one.name for one in self.sets}) < len(self.sets) or not self.sets:
-            raise InputError(f"expected data sets of different names; came {[one.name for one in self.sets]}")
+        if len({item.name for item in self.sets}) < len(self.sets) or not self.sets:
+            raise InputError(f"expected data sets of different names; came {[item.name for item in self.sets]}")
         _ = self.course  # is refused where it cannot be
         require_device(self.device)
         if self.seed < 0:
@@ -85,11 +85,11 @@ class SystemStudy:
     def cells(self, folds: Mapping[str, Sequence[int]]) -> list[Cell]:
         """The cells of these folds of each set, by name; set by set and system by system."""
         return [
-            Cell(one.name, fold, key)
-            for one in self.sets
+            Cell(item.name, fold, key)
+            for item in self.sets
             for key in self.systems
-            for fold in folds[one.name]
-            if not (one.sensor.camera and key in NOT_OF_FRAMES)
+            for fold in folds[item.name]
+            if not (item.sensor.camera and key in NOT_OF_FRAMES)
         ]
 
     def run(
@@ -101,10 +101,10 @@ class SystemStudy:
         """
         notes = RunFile(None if self.folder is None else self.folder / f"{self.name}.json", self.plan)
         cells = self.cells(folds)
-        for one in self.sets:
-            require_data(notes, one)
-            for fold in folds[one.name]:
-                split(one, fold, self.seed)  # what is refused is refused before anything is measured
+        for item in self.sets:
+            require_data(notes, item)
+            for fold in folds[item.name]:
+                split(item, fold, self.seed)  # what is refused is refused before anything is measured
         yield from run_cells(notes, cells, self._measure, progress)
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
@@ -118,12 +118,12 @@ class SystemStudy:
 
     @cached_property
     def _by_name(self) -> dict[str, Recordings]:
-        return {one.name: one for one in self.sets}
+        return {item.name: item for item in self.sets}
 
     @cached_property
     def _catalogues(self) -> dict[str, Catalogue]:
         # One for all sets of a sensor: other folds of the same touches need not be embedded again.
-        return {one.sensor.name: self._catalogue(one) for one in self.sets}
+        return {item.sensor.name: self._catalogue(item) for item in self.sets}
 
     def _catalogue(self, recordings: Recordings) -> Catalogue:
         every = columns_averaged(recordings.sensor) if self.quick else 1

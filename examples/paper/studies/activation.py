@@ -45,7 +45,7 @@ def maximise(
     seed: int = 0,
     steps: int = STEPS,
     size: int = SIZE,
-    told: Callable[[int, int], object] = lambda done, of: None,
+    report: Callable[[int, int], object] = lambda done, of: None,
 ) -> FloatArray:
     """For each unit of the first block the image that excites it most, float32 of shape (units, 3, size, size).
 
@@ -68,7 +68,7 @@ def maximise(
             # Dead units have no slope: their image stays smoothed noise.
             images = images + STRIDE * slope / slope.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(1e-12)
             images = _standardised(images + CALM * _roughness(images))
-        told(step + 1, steps)
+        report(step + 1, steps)
     found: FloatArray = images.numpy()
     return found
 

@@ -35,7 +35,7 @@ class ActivationStudy(SystemStudy):
     """Fine-tune on each set, all folds but those asked for; then `looks` and `likeness` of what came of it.
 
     tuned: set → the first layers of the network that was fine-tuned on it; they are kept beside the run's notes, too,
-    so that a run that was killed goes on.
+    so that a killed run resumes.
 
     Raises InputError where no weights are given: there would be nothing to be fine-tuned.
     """
@@ -46,7 +46,7 @@ class ActivationStudy(SystemStudy):
     def __post_init__(self) -> None:
         if self.systems != (SYSTEM,):
             raise InputError(f"expected the one system {SYSTEM}; came {', '.join(self.systems)}")
-        if any(one.sensor.camera for one in self.sets):
+        if any(recordings.sensor.camera for recordings in self.sets):
             raise InputError("expected sets of streams: a camera's frames are not compared with tactile images")
         super().__post_init__()
 
@@ -61,9 +61,9 @@ class ActivationStudy(SystemStudy):
         network = system.network
         assert isinstance(network, ResNetClassifier)
         self._keep(cell.dataset, {name: tensor.cpu().numpy() for name, tensor in network.net.state_dict().items()})
-        said = system.predict(part.asked)
-        right = sum(one == other for one, other in zip(part.truth, said, strict=True))
-        return {"right": right, "tested": len(said)}
+        predicted = system.predict(part.test_streams)
+        right = sum(true == guess for true, guess in zip(part.truth, predicted, strict=True))
+        return {"right": right, "tested": len(predicted)}
 
     def _keep(self, dataset: str, tensors: Mapping[str, npt.NDArray[Any]]) -> None:
         first: dict[str, Any] = {
@@ -85,10 +85,10 @@ class ActivationStudy(SystemStudy):
         """
         assert self.weights is not None
         found = {START: load_network(self.weights)}
-        for one in self.sets:
+        for recordings in self.sets:
             net = load_network(self.weights)
-            net.load_state_dict(self._first_layers(one.name), strict=False)
-            found[f"fine-tuned on {one.name}"] = net
+            net.load_state_dict(self._first_layers(recordings.name), strict=False)
+            found[f"fine-tuned on {recordings.name}"] = net
         return found | {CONTROL: ResNet.random(self.seed, found[START].depth, found[START].stem)}
 
     def _first_layers(self, dataset: str) -> dict[str, torch.Tensor]:
@@ -109,7 +109,9 @@ class ActivationStudy(SystemStudy):
         """For each network the images of `maximise`, from the same noise."""
         steps, size = (STEPS // 3, SIZE // 2) if self.quick else (STEPS, SIZE)
         return {
-            name: maximise(net, seed=self.seed, steps=steps, size=size, told=partial(progress, f"what excites: {name}"))
+            name: maximise(
+                net, seed=self.seed, steps=steps, size=size, report=partial(progress, f"what excites: {name}")
+            )
             for name, net in networks.items()
         }
 
@@ -117,8 +119,8 @@ class ActivationStudy(SystemStudy):
         """`compare` of every two networks, on the same number of touches of each set."""
         random = np.random.default_rng(self.seed)
         images = [
-            tactile_image(one.streams[at])
-            for one in self.sets
-            for at in random.choice(len(one), min(COMPARED, len(one)), replace=False)
+            tactile_image(recordings.streams[i])
+            for recordings in self.sets
+            for i in random.choice(len(recordings), min(COMPARED, len(recordings)), replace=False)
         ]
         return [asdict(pair) for pair in compare(networks, images, start=START)]

@@ -1,4 +1,4 @@
-"""The paper's systems in the studies of robustness: taught by the same touches, with its augmentations or without."""
+"""The paper's systems in the studies of robustness: trained on the same touches, with its augmentations or without."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from scroll_tactile.signals.augmentation import Augmentation, Change
 __all__ = ["BASELINES", "COPIES", "STRONG", "Sometimes", "baseline"]
 
 BASELINES = tuple(key for key in SYSTEMS if key not in OURS and not key.startswith("least-squares"))
-"""Keys of the catalogue that can be asked about touches of any length and speed."""
+"""Keys of the catalogue that classify touches of any length and speed."""
 
 
 @dataclass(frozen=True)
 class Sometimes(Augmentation):
-    """An augmentation that leaves some touches as they were felt: `share` is the probability that one is changed.
+    """An augmentation that leaves some touches as they were recorded: `share` is the probability that one is changed.
 
-    Where every touch of every epoch came strongly changed, networks told 28 to 53 % of RoboSkin's clean touches after
+    Where every touch of every epoch came strongly changed, networks had 28 to 53 % of RoboSkin's clean touches after
     twenty epochs, in place of 85 to 92.
     """
 
@@ -41,7 +41,7 @@ class Sometimes(Augmentation):
 STRONG = Sometimes(flip=0.5, speed=(0.45, 2.2), keep=0.1, noise=0.6, drift=0.1)
 """The paper's four, as strong as the studies: to about half and twice the speed, down to a tenth of the touch, and to
 noise of a standard deviation of 0.6 of half the range, as uniform noise of ± 0.52 of the range has. Half of what a
-system sees is as it was felt."""
+system sees is as it was recorded."""
 
 COPIES = 3
 """Of each touch, for a system that is not trained over epochs, in which it would see others every time."""
@@ -53,15 +53,15 @@ def baseline(
     """A system of the catalogue for the studies of robustness, and what it depends on, in JSON's types.
 
     With its augmentation a network sees each touch changed anew in every epoch, and any other system COPIES changed
-    ones beside each. The validation, a tenth of each material's touches, is left as it was felt.
+    ones beside each. The validation, a tenth of each material's touches, is left as it was recorded.
 
     Raises InputError for a system that is not in BASELINES.
     """
     if key not in BASELINES:
         raise InputError(f"expected a system out of {', '.join(BASELINES)}; came {key!r}")
 
-    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
-        learned, held = _part(lessons, seed)
+    def make(train: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
+        learned, held = _part(train, seed)
         if augmented and key not in EPOCHAL:
             learned = [*learned, *_copies(learned, augmentation, seed)]
         made = replace(catalogue, augmentation=augmentation if augmented else None).make(key)
@@ -73,15 +73,15 @@ def baseline(
     return make, {"augmentation": drawn, "columns": catalogue.every, "seed": seed, **course}
 
 
-def _part(lessons: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[Labelled]]:
+def _part(train: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[Labelled]]:
     """What is learned, and a tenth of each material's touches to choose on (see `held_back`)."""
     random = np.random.default_rng([seed, 3])
     held: set[int] = set()
-    for name in sorted({name for name, _ in lessons}):
-        own = random.permutation([at for at, (one, _) in enumerate(lessons) if one == name])
+    for name in sorted({name for name, _ in train}):
+        own = random.permutation([i for i, (material, _) in enumerate(train) if material == name])
         held.update(own[: held_back(len(own))].tolist())
-    learned = [touch for at, touch in enumerate(lessons) if at not in held]
-    return learned, [lessons[at] for at in sorted(held)]
+    learned = [touch for i, touch in enumerate(train) if i not in held]
+    return learned, [train[i] for i in sorted(held)]
 
 
 def _copies(touches: Sequence[Labelled], augmentation: Augmentation, seed: int) -> list[Labelled]:

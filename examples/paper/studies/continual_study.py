@@ -47,7 +47,7 @@ class Continual:
     sizes: of the buffer. epochs: of a fine-tune; the learner's own choice where it is None. device: of fine-tunes.
     curve: measure after every so many parts of the pass, as many as materials (see `part_ends`); 0: at its end only,
     and no forgetting. tuned_curve: measure `f*` there too, each time from a fine-tune of its own.
-    peers: whether to run them. folder: where finished parts are noted, so that an interrupted run goes on; or None.
+    peers: whether to run them. folder: where finished parts are noted, so that an interrupted run resumes; or None.
 
     Raises InputError for sizes that cannot be, such as fewer exemplars than materials, or a negative curve.
     """
@@ -112,10 +112,10 @@ class _ContinualFold:
         self.notes = notes
         self.progress = progress
         recordings = task.recordings
-        taught, self.exam = hold_out(recordings, recordings.fold == number)
-        self.lessons = [taught[at] for at in arrange(task.schedule, [name for name, _ in taught], task.seed)]
-        self.total = len(self.lessons)
-        self.ends = part_ends(task.schedule, [name for name, _ in self.lessons])
+        trained, self.test = hold_out(recordings, recordings.fold == number)
+        self.train = [trained[i] for i in arrange(task.schedule, [name for name, _ in trained], task.seed)]
+        self.total = len(self.train)
+        self.ends = part_ends(task.schedule, [name for name, _ in self.train])
         every = task.curve
         self.stops = sorted({self.total, *(self.ends[every - 1 :: every] if every else ())})
 
@@ -130,7 +130,7 @@ class _ContinualFold:
         return {
             "fold": self.number,
             "learned": self.total,
-            "tested": len(self.exam),
+            "tested": len(self.test),
             "digest": f["digest"],
             "equals_offline": all(part["digest"] == f["digest"] for part in (offline, *tuned.values())),
             "f": f,
@@ -157,14 +157,14 @@ class _ContinualFold:
 
     def _closed_form(self) -> dict[str, Any]:
         learner = self._learner(0)
-        points = self._learn(learner, "f", self.stops, lambda exam: _said(learner, exam))
+        points = self._learn(learner, "f", self.stops, lambda test: _predict(learner, test))
         return {"digest": learner.digest(), **_figures(points)}
 
     def _offline(self) -> dict[str, Any]:
         """The same touches in another order, all at random, as offline training has them; and the ridge floor."""
         learner = self._learner(0, "ridge")
-        self._teach_offline(learner, "offline")
-        point = tally([name for name, _ in self.exam], _said(learner, self.exam))
+        self._train_offline(learner, "offline")
+        point = tally([name for name, _ in self.test], _predict(learner, self.test))
         return {"digest": learner.digest(), "ridge": accuracy_of(point)}
 
     def _tuned(self, size: Size, f: dict[str, Any]) -> dict[str, Any]:
@@ -183,16 +183,16 @@ class _ContinualFold:
                 progress=lambda step, done, of: self.progress(f"{what} ({step})", done, of),
             )
 
-        def answer(exam: Sequence[Labelled]) -> list[str | None]:
-            if len(learner.materials) > 1:  # with one there is nothing to be told apart
+        def answer(test: Sequence[Labelled]) -> list[str | None]:
+            if len(learner.materials) > 1:  # with one there is nothing to classify
                 tune()
-            return _said(learner, exam, tuned=True)
+            return _predict(learner, test, tuned=True)
 
         points = self._learn(learner, name, self.stops[:-1] if self.task.tuned_curve else [], answer)
         report = tune()
-        exam = tally([material for material, _ in self.exam], _said(learner, self.exam, tuned=True))
+        test = tally([material for material, _ in self.test], _predict(learner, self.test, tuned=True))
         other = self._learner(capacity)
-        self._teach_offline(other, f"{name}: another order")
+        self._train_offline(other, f"{name}: another order")
         return {
             "digest": learner.digest(),
             "tuned_digest": learner.tuned_digest(),
@@ -200,12 +200,12 @@ class _ContinualFold:
             "buffer_of_another_order": _buffer_digest(other) == _buffer_digest(learner),
             "bytes_per_exemplar": self._bytes(learner),
             **{name: getattr(report, name) for name in _REPORTED},
-            **_figures(points | {str(self.total): exam}),
+            **_figures(points | {str(self.total): test}),
         }
 
     def _bytes(self, learner: TactileLearner) -> float:
-        """Bytes of an exemplar's readings, as they are felt: float32 of shape (T, n)."""
-        sizes = {stream.key: stream.readings.nbytes for _, stream in self.lessons}
+        """Bytes of an exemplar's readings, as they are recorded: float32 of shape (T, n)."""
+        sizes = {stream.key: stream.readings.nbytes for _, stream in self.train}
         kept = [sizes[key] for keys in learner.exemplars.values() for key in keys]
         return sum(kept) / max(1, len(kept))
 
@@ -216,30 +216,31 @@ class _ContinualFold:
         stops: Sequence[int],
         answer: Callable[[Sequence[Labelled]], list[str | None]],
     ) -> Points:
-        """Teach all lessons, and measure after so many of them; what an interrupted run measured is read back."""
+        """Learn all training touches, and measure after so many of them; what an interrupted run measured is read
+        back."""
         key = f"fold {self.number}, {name}, so far"
         points: Points = dict(self.notes.notes.get(key, {}))
-        for done, (material, stream) in enumerate(self.lessons, start=1):
+        for done, (material, stream) in enumerate(self.train, start=1):
             learner.observe(material, stream)
             self.progress(f"{name}: learning", done, self.total)
             if done in stops and str(done) not in points:
-                asked = [touch for touch in self.exam if touch[0] in learner.materials]
+                asked = [touch for touch in self.test if touch[0] in learner.materials]
                 points[str(done)] = tally([truth for truth, _ in asked], answer(asked))
                 self.notes.note(key, points)
         return points
 
-    def _teach_offline(self, learner: TactileLearner, name: str) -> None:
+    def _train_offline(self, learner: TactileLearner, name: str) -> None:
         order = np.random.default_rng([self.task.seed, 1]).permutation(self.total)
-        for done, at in enumerate(order, start=1):
-            learner.observe(*self.lessons[at])
+        for done, i in enumerate(order, start=1):
+            learner.observe(*self.train[i])
             self.progress(f"{name}: learning", done, self.total)
 
     @cached_property
     def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Features of the lessons and of the exam."""
+        """Features of the training and of the test touches."""
         self.progress("peers: embedding", 0, 1)
-        taught = touch_features(self.embedding, [stream for _, stream in self.lessons])
-        return taught, touch_features(self.embedding, [stream for _, stream in self.exam])
+        trained = touch_features(self.embedding, [stream for _, stream in self.train])
+        return trained, touch_features(self.embedding, [stream for _, stream in self.test])
 
     def _peers(self) -> Iterator[tuple[str, Size | None, Callable[[], ContinualPeer]]]:
         seed = self.task.seed
@@ -257,21 +258,21 @@ class _ContinualFold:
 
     def _peer(self, name: str, size: Size | None, make: Callable[[], ContinualPeer]) -> dict[str, Any]:
         peer = make()
-        taught, tested = self._vectors
-        truth = [material for material, _ in self.exam]
+        trained, tested = self._vectors
+        truth = [material for material, _ in self.test]
         points: Points = {}
-        for done, ((material, _), features) in enumerate(zip(self.lessons, taught, strict=True), start=1):
+        for done, ((material, _), features) in enumerate(zip(self.train, trained, strict=True), start=1):
             peer.observe(features, material)
             if done in self.ends:
                 peer.boundary()
                 self.progress(name, done, self.total)
             if done in self.stops:
-                met = [at for at, material in enumerate(truth) if material in peer.materials]
-                points[str(done)] = tally([truth[at] for at in met], peer.predict(tested[met]))
+                met = [i for i, material in enumerate(truth) if material in peer.materials]
+                points[str(done)] = tally([truth[i] for i in met], peer.predict(tested[met]))
         return {"peer": name, "size": None if size is None else str(size), **_figures(points)}
 
 
-def _said(learner: TactileLearner, touches: Sequence[Labelled], *, tuned: bool = False) -> list[str | None]:
+def _predict(learner: TactileLearner, touches: Sequence[Labelled], *, tuned: bool = False) -> list[str | None]:
     return [learner.predict(stream, tuned=tuned).material for _, stream in touches]
 
 

@@ -34,11 +34,11 @@ class Efficiency(SystemStudy):
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         touches, system = self._split(cell), self._system(cell)
-        exam, truth = touches.asked, touches.truth
+        test, truth = touches.test_streams, touches.truth
         points: list[list[float]] = []
 
-        def test(at: int) -> None:
-            points.append([at, accuracy(truth, system.predict(exam))])
+        def measure(i: int) -> None:
+            points.append([i, accuracy(truth, system.predict(test))])
 
         if cell.system in EPOCHAL:
             system.fit(
@@ -47,15 +47,17 @@ class Efficiency(SystemStudy):
                 touches.validation,
                 self.seed,
                 progress,
-                watch=lambda: test(len(points) + 1),
+                watch=lambda: measure(len(points) + 1),
             )
             return {"tested": len(truth), "by": "epochs", "points": points}
         most = min(touches.materials.count(name) for name in set(touches.materials))
-        most += min((sum(name == one for one, _ in touches.validation) for name in set(touches.materials)), default=0)
+        most += min(
+            (sum(name == touch for touch, _ in touches.validation) for name in set(touches.materials)), default=0
+        )
         for count in [count for count in STREAMS if count <= most]:
-            lessons = first_touches(touches, count, self.seed)
-            system.fit([one for _, one in lessons], [name for name, _ in lessons], [], self.seed, progress)
-            test(count)
+            train = first_touches(touches, count, self.seed)
+            system.fit([touch for _, touch in train], [name for name, _ in train], [], self.seed, progress)
+            measure(count)
         return {"tested": len(truth), "by": "streams", "points": points}
 
 
@@ -65,11 +67,11 @@ def first_touches(touches: Split, count: int, seed: int) -> list[Labelled]:
     order = np.random.default_rng([seed, 1]).permutation(len(every))
     met: dict[str, int] = {}
     kept = []
-    for at in order:
-        name = every[at][0]
+    for i in order:
+        name = every[i][0]
         met[name] = met.get(name, 0) + 1
         if met[name] <= count:
-            kept.append(every[at])
+            kept.append(every[i])
     return kept
 
 

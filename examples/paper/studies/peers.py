@@ -40,7 +40,7 @@ def touch_features(embedding: Embedding, streams: Sequence[Stream]) -> FloatArra
 
 
 class ContinualPeer(ABC):
-    """A learner of feature vectors in one pass, which is told of new materials by meeting them.
+    """A learner of feature vectors in one pass, which learns of new materials by meeting them.
 
     materials: those met, in the order of meeting.
     """
@@ -57,13 +57,13 @@ class ContinualPeer(ABC):
         """Scores of N touches, shape (N, d), for the materials met, shape (N, C)."""
 
     def boundary(self) -> None:  # noqa: B027 (it is complete: most peers do nothing then)
-        """Be told that a task ends here; most have no use for it, and the learner is not told either."""
+        """A task ends here; most have no use for it, and the learner does not know it either."""
 
     def predict(self, features: FloatArray) -> list[str]:
         """The material of each of N touches, features of shape (N, d). Raises InputError before any was met."""
         if not self.materials:
             raise InputError("expected a peer that has observed something; it has not. Call observe first")
-        return [self.materials[at] for at in self.scores(features).argmax(axis=1)]
+        return [self.materials[i] for i in self.scores(features).argmax(axis=1)]
 
     def _place(self, material: str) -> int:
         if material not in self.materials:
@@ -193,7 +193,7 @@ class RanPAC(ContinualPeer):
         kept = max(1, int(0.8 * len(rows)))
         fitted, held = rows[:kept], rows[kept:]
         if not len(held):
-            return self.penalty  # a task of one touch says nothing
+            return self.penalty  # a task of one touch decides nothing
         # (ΦᵀΦ + λI)⁻¹Φᵀ = Φᵀ(ΦΦᵀ + λI)⁻¹: as many unknowns as touches instead of features.
         values, vectors = np.linalg.eigh(fitted @ fitted.T)
         inner, turned = held @ fitted.T @ vectors, vectors.T @ targets[:kept]

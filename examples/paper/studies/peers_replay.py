@@ -97,18 +97,18 @@ class Replaying(ContinualPeer):
         if place == self._weights.shape[1]:
             self._weights = np.pad(self._weights, ((0, 0), (0, 1)))
         chosen = self._random.permutation(len(self._buffer))[: self.drawn]
-        batch = [(features, place), *(self._buffer[at] for at in chosen)]
+        batch = [(features, place), *(self._buffer[i] for i in chosen)]
         rows = self._standardised(np.stack([row for row, _ in batch]))
         errors = softmax(rows @ self._weights, axis=1)
-        errors[np.arange(len(batch)), [at for _, at in batch]] -= 1
+        errors[np.arange(len(batch)), [i for _, i in batch]] -= 1
         self._weights -= self.rate * rows.T @ errors / len(batch)
         self._offer(features, place)
 
     def _offer(self, features: FloatArray, place: int) -> None:
         if len(self._buffer) < self.capacity:
             self._buffer.append((features, place))
-        elif self.capacity and (at := int(self._random.integers(self._seen))) < self.capacity:
-            self._buffer[at] = (features, place)
+        elif self.capacity and (i := int(self._random.integers(self._seen))) < self.capacity:
+            self._buffer[i] = (features, place)
 
     def _standardised(self, features: FloatArray) -> FloatArray:
         spread = np.sqrt(self._squares / self._seen)

@@ -16,7 +16,7 @@ from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Answers, Labelled, ask, hold_out, observe_all
+from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, hold_out, observe_all
 from scroll_tactile.pipelines.metrics import calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
@@ -24,7 +24,7 @@ from scroll_tactile.readouts.readout import ReadoutName
 __all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "subset", "summary"]
 
 Progress = Callable[[str, int, int], object]
-"""Told (what is being done, steps done, steps in all)."""
+"""Receives (what is being done, steps done, steps in all)."""
 
 FIGURES = ("accuracy", "first", "half", "twice", "calibration_error", "false_alarms", "novelty_auroc")
 """Of each fold: accuracy after the last material; from the first 0.3 s; of half streams after learning full ones;
@@ -46,7 +46,7 @@ class Replay:
     blocked: folds of successive repetitions, instead of the published or drawn ones.
     novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
     features: of the embedding.
-    folder: where each fold's memory and finished figures are kept, so that an interrupted run goes on; or None.
+    folder: where each fold's memory and finished figures are kept, so that an interrupted run resumes; or None.
 
     Raises DatasetError where there are no blocked folds.
     """
@@ -94,25 +94,25 @@ class _ReplayFold:
         self.number = number
         self.progress = progress
         recordings = replay.recordings
-        taught, self.exam = hold_out(recordings, tested)
-        order = arrange(replay.schedule, [name for name, _ in taught], replay.seed)
-        self.lessons = [taught[at] for at in order]
+        trained, self.test = hold_out(recordings, tested)
+        order = arrange(replay.schedule, [name for name, _ in trained], replay.seed)
+        self.train = [trained[i] for i in order]
 
     def run(self) -> dict[str, Any]:
         begun = time.perf_counter()
         folder = self.replay.folder
         with self._learner(None if folder is None else folder / f"fold-{self.number}") as learner:
             done = count(1)
-            observe_all(learner, self.lessons, lambda: self.progress("learning", next(done), len(self.lessons)))
+            observe_all(learner, self.train, lambda: self.progress("learning", next(done), len(self.train)))
             figures = self._figures(learner)
             digest = learner.digest()
         figures["twice"] = self._twice()
         figures["novelty_auroc"] = self._novelty() if self.replay.novelty else None
         return {
             "fold": self.number,
-            "learned": len(self.lessons),
-            "tested": len(self.exam),
-            "tested_of": dict(Counter(name for name, _ in self.exam)),
+            "learned": len(self.train),
+            "tested": len(self.test),
+            "tested_of": dict(Counter(name for name, _ in self.test)),
             **{name: figures[name] for name in (*FIGURES, "confusions")},
             "equals_offline": self._offline() == digest,
             "digest": digest,
@@ -128,11 +128,11 @@ class _ReplayFold:
 
     def _figures(self, learner: TactileLearner) -> dict[str, Any]:
         self.progress("testing", 0, 3)
-        whole = ask(learner, self.exam)
+        whole = evaluate(learner, self.test)
         self.progress("testing", 1, 3)
-        first = ask(learner, self.exam, seconds=_FIRST)
+        first = evaluate(learner, self.test, seconds=_FIRST)
         self.progress("testing", 2, 3)
-        half = ask(learner, [(name, stream.first(stream.seconds / 2)) for name, stream in self.exam])
+        half = evaluate(learner, [(name, stream.first(stream.seconds / 2)) for name, stream in self.test])
         self.progress("testing", 3, 3)
         return {
             "accuracy": whole.accuracy,
@@ -145,15 +145,15 @@ class _ReplayFold:
 
     def _twice(self) -> float:
         learner = self._learner()
-        shorter = [(name, stream.first(stream.seconds / 2)) for name, stream in self.lessons]
-        self._teach(learner, shorter, "learning halves")
-        return ask(learner, self.exam).accuracy
+        shorter = [(name, stream.first(stream.seconds / 2)) for name, stream in self.train]
+        self._train(learner, shorter, "learning halves")
+        return evaluate(learner, self.test).accuracy
 
     def _offline(self) -> str:
         """The digest of the same touches learned in another order, all at random: offline training's."""
         learner = self._learner()
-        order = np.random.default_rng([self.replay.seed, 1]).permutation(len(self.lessons))
-        self._teach(learner, [self.lessons[at] for at in order], "learning offline")
+        order = np.random.default_rng([self.replay.seed, 1]).permutation(len(self.train))
+        self._train(learner, [self.train[i] for i in order], "learning offline")
         return learner.digest()
 
     def _novelty(self) -> float:
@@ -161,20 +161,20 @@ class _ReplayFold:
         from scipy.stats import rankdata
         from sklearn.metrics import roc_auc_score
 
-        names = sorted({name for name, _ in self.lessons}, key=_number)
+        names = sorted({name for name, _ in self.train}, key=_number)
         areas = []
         for rotation in range(_ROTATIONS):
             out = set(names[rotation::_ROTATIONS])
             learner = self._learner()
-            lessons = [touch for touch in self.lessons if touch[0] not in out]
-            self._teach(learner, lessons, f"novelty {rotation + 1}/{_ROTATIONS}")
-            answers = ask(learner, self.exam)
+            train = [touch for touch in self.train if touch[0] not in out]
+            self._train(learner, train, f"novelty {rotation + 1}/{_ROTATIONS}")
+            answers = evaluate(learner, self.test)
             novelty = np.array([prediction.novelty for prediction in answers.predictions])
             new = np.array([name in out for name in answers.truth])
             areas.append(roc_auc_score(new, rankdata(novelty)))  # ranks: a novelty may be infinite
         return float(np.mean(areas))
 
-    def _teach(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:
+    def _train(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:
         for done, (name, stream) in enumerate(touches):
             learner.observe(name, stream)
             self.progress(what, done + 1, len(touches))
@@ -186,7 +186,7 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _calibration_error(answers: Answers) -> float:
-    right = [truth == said for truth, said in zip(answers.truth, answers.said, strict=True)]
+    right = [truth == predicted for truth, predicted in zip(answers.truth, answers.predicted, strict=True)]
     return calibration_error([prediction.probability for prediction in answers.predictions], right)
 
 
@@ -209,12 +209,12 @@ def subset(recordings: Recordings, materials: int) -> Recordings:
     names = list(dict.fromkeys(recordings.materials))
     if not 2 <= materials <= len(names):
         raise InputError(f"expected 2 to {len(names)} materials; came {materials}")
-    kept = [at for at, name in enumerate(recordings.materials) if name in set(names[:materials])]
+    kept = [i for i, name in enumerate(recordings.materials) if name in set(names[:materials])]
     return Recordings(
         name=recordings.name,
         sensor=recordings.sensor,
-        streams=[recordings.streams[at] for at in kept],
-        materials=[recordings.materials[at] for at in kept],
+        streams=[recordings.streams[i] for i in kept],
+        materials=[recordings.materials[i] for i in kept],
         repetition=recordings.repetition[kept],
         fold=recordings.fold[kept],
         ordered=recordings.ordered,

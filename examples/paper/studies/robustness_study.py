@@ -1,8 +1,8 @@
-"""Robustness: systems that learned from clean touches, asked about touches that were made or felt otherwise.
+"""Robustness: systems that trained on clean touches, tested on touches that were made or recorded otherwise.
 
 A study is a grid of strengths, systems, with and without augmentation, and folds. A system learns a fold once, for
-all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has lessons of its own. Each
-cell is written down when it is finished, and an interrupted run goes on with the next.
+all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has training touches of its
+own. Each cell is written down when it is finished, and an interrupted run resumes with the next.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class TestedSystem(Protocol):
 
 
 Make = Callable[[Sequence[Labelled], bool, Progress], TestedSystem]
-"""Makes a system that has learned these touches, with its augmentation (True) or without; told how far it is."""
+"""Makes a system that has learned these touches, with its augmentation (True) or without; reports how far it is."""
 
 
 class Learned:
@@ -107,13 +107,13 @@ def ours(
     """
     robust = Robust() if embedding is None else embedding
 
-    def make(lessons: Sequence[Labelled], augmented: bool, progress: Progress) -> TestedSystem:
+    def make(train: Sequence[Labelled], augmented: bool, progress: Progress) -> TestedSystem:
         if augmented:
             learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
         else:
             learner = TactileLearner(sensor=sensor, exemplars=0)
         done = count()
-        observe_all(learner, lessons, lambda: progress("learning", next(done) + 1, len(lessons)))
+        observe_all(learner, train, lambda: progress("learning", next(done) + 1, len(train)))
         return Learned(learner)
 
     return make, {"embedding": repr(robust), "augmentation": augmentation.to_json()}
@@ -123,8 +123,8 @@ def ours(
 class Robustness:
     """What to study.
 
-    recordings: the touches. systems: by name, what makes and teaches each. settings: by name, all that a system's
-    answers depend on beside its name, in JSON's types, so that what other settings gave is not gone on with.
+    recordings: the touches. systems: by name, what makes and trains each. settings: by name, all that a system's
+    answers depend on beside its name, in JSON's types, so that what other settings gave is not mixed in.
     studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
     quick: fewer strengths. folder: where finished cells are kept, or None.
 
@@ -184,7 +184,7 @@ class Robustness:
                 record
                 for system in self.systems
                 for augmented in self.augmented
-                for record in self._taught(system, augmented, cells, notes, progress)
+                for record in self._records(system, augmented, cells, notes, progress)
             ]
 
     def cells(self, fold: int) -> list[tuple[str, float, int]]:
@@ -205,7 +205,7 @@ class Robustness:
                 "the same, or take another folder"
             )
 
-    def _taught(
+    def _records(
         self,
         name: str,
         augmented: bool,
@@ -221,23 +221,23 @@ class Robustness:
             key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
             if key not in notes.notes:
                 session = study == SESSION
-                lessons, exam = self._split(fold, session)
+                train, test = self._split(fold, session)
                 if session not in systems:
 
-                    def told(step: str, at: int, of: int, where: str = where) -> None:
-                        progress(f"{where}: {step}", at, of)
+                    def report(step: str, i: int, of: int, where: str = where) -> None:
+                        progress(f"{where}: {step}", i, of)
 
-                    systems[session] = self.systems[name](lessons, augmented, told)
-                asked = exam if session else self._perturbed(exam, study, strength)
-                said = systems[session].predict([stream for _, stream in asked])
-                share = accuracy([material for material, _ in asked], list(said))
+                    systems[session] = self.systems[name](train, augmented, report)
+                asked = test if session else self._perturbed(test, study, strength)
+                predicted = systems[session].predict([stream for _, stream in asked])
+                share = accuracy([material for material, _ in asked], list(predicted))
                 notes.note(key, {"accuracy": share, "tested": len(asked)})
             about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
             yield about | notes.notes[key]
 
-    def _perturbed(self, exam: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
+    def _perturbed(self, test: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
         perturb = PERTURBED[study].perturb
-        return [(material, perturb(stream, strength, self.seed)) for material, stream in exam]
+        return [(material, perturb(stream, strength, self.seed)) for material, stream in test]
 
     def _split(self, fold: int, session: bool) -> tuple[list[Labelled], list[Labelled]]:
         places: npt.NDArray[np.int64] = self.recordings.blocked() if session else self.recordings.fold

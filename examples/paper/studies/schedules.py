@@ -41,7 +41,7 @@ def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list
         raise InputError(f"expected a schedule, one of {', '.join(SCHEDULES)}; came {schedule!r}")
     random = np.random.default_rng(seed)
     names = sorted(set(materials))
-    turn = {names[place]: at for at, place in enumerate(random.permutation(len(names)))}
+    turn = {names[place]: i for i, place in enumerate(random.permutation(len(names)))}
     draw = random.permutation(len(materials))
     seen: dict[str, int] = {}
     repetition = []
@@ -50,12 +50,12 @@ def arrange(schedule: ScheduleName, materials: Sequence[str], seed: int) -> list
         seen[name] = repetition[-1] + 1
     places = range(len(materials))
     if schedule == "shuffled":
-        return [int(at) for at in draw]
+        return [int(i) for i in draw]
     if schedule == "batches":
-        return sorted(places, key=lambda at: (turn[materials[at]] // _BATCH, draw[at]))
+        return sorted(places, key=lambda i: (turn[materials[i]] // _BATCH, draw[i]))
     if schedule == "interleaved":
-        return sorted(places, key=lambda at: (repetition[at], turn[materials[at]]))
-    order = sorted(places, key=lambda at: (turn[materials[at]], repetition[at]))
+        return sorted(places, key=lambda i: (repetition[i], turn[materials[i]]))
+    order = sorted(places, key=lambda i: (turn[materials[i]], repetition[i]))
     return order[::-1] if schedule == "reversed" else order
 
 
@@ -67,7 +67,7 @@ def part_ends(schedule: ScheduleName, materials: Sequence[str]) -> list[int]:
     """
     total, kinds = len(materials), len(set(materials))
     if schedule in ("class-by-class", "reversed"):
-        return [at for at in range(1, total + 1) if at == total or materials[at] != materials[at - 1]]
+        return [i for i in range(1, total + 1) if i == total or materials[i] != materials[i - 1]]
     return [round(total * part / kinds) for part in range(1, kinds + 1)]
 
 
@@ -76,7 +76,7 @@ class Trial:
     """One random schedule: what was done, what came of it, and whether the answers are those of the first.
 
     batches: stretches of touches, with a prediction after each. reopened: how often the memory was closed and opened
-    again. split: touches that a second learner felt (0: there was none). digest: of the joined statistics.
+    again. split: touches that a second learner observed (0: there was none). digest: of the joined statistics.
     """
 
     batches: int
@@ -140,12 +140,12 @@ def _try(
     order = random.permutation(len(touches))
     cuts = np.flatnonzero(random.random(len(touches)) < 4 / len(touches))  # about five batches
     second = set(random.permutation(len(touches))[: random.integers(1, len(touches))].tolist()) if split else set()
-    parts = [[at for at in order if at not in second]] + ([[at for at in order if at in second]] if split else [])
+    parts = [[i for i in order if i not in second]] + ([[i for i in order if i in second]] if split else [])
     reopened = 0
     with ExitStack() as opened:
         learners = []
-        for at, part in enumerate(parts):
-            path = folder / str(at)
+        for i, part in enumerate(parts):
+            path = folder / str(i)
             reopened += _learn(
                 path, sensor, embedding, [touches[place] for place in part], set(cuts.tolist()), probes[0], random
             )
@@ -168,13 +168,13 @@ def _learn(
     reopened = 0
     learner = TactileLearner.open(path, sensor=sensor, embedding=embedding)
     try:
-        for at, (name, stream) in enumerate(touches):
+        for i, (name, stream) in enumerate(touches):
             learner.observe(name, stream)
-            if at in cuts and random.random() < 0.5:
+            if i in cuts and random.random() < 0.5:
                 learner.close()
                 learner = TactileLearner.open(path, embedding=embedding)
                 reopened += 1
-            elif at in cuts:
+            elif i in cuts:
                 learner.predict(probe[1])
     finally:
         learner.close()
@@ -182,7 +182,7 @@ def _learn(
 
 
 def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
-    """One learner, in memory, that has felt what all of these have."""
+    """One learner, in memory, that has observed what all of these have."""
     joint = TactileLearner(sensor=learners[0].sensor, embedding=learners[0].embedding)
     memory = joint.memory
     for learner in learners:

@@ -41,7 +41,7 @@ class Table1(SystemStudy):
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         touches, system = self._split(cell), self._system(cell)
-        exam, truth = touches.asked, touches.truth
+        test, truth = touches.test_streams, touches.truth
         curve: list[float] = []
         system.fit(
             touches.streams,
@@ -49,15 +49,15 @@ class Table1(SystemStudy):
             touches.validation,
             self.seed,
             progress,
-            watch=lambda: curve.append(accuracy(truth, system.predict(exam))),
+            watch=lambda: curve.append(accuracy(truth, system.predict(test))),
         )
-        said = system.predict(exam)
+        predicted = system.predict(test)
         figures = {
             "learned": len(touches.streams),
             "validation": len(touches.validation),
             "tested": len(truth),
-            "right": sum(one == other for one, other in zip(truth, said, strict=True)),
-            **_votes(truth, said, touches.touch),
+            "right": sum(true == guess for true, guess in zip(truth, predicted, strict=True)),
+            **_votes(truth, predicted, touches.touch),
         }
         if isinstance(system, TrainedNetwork):
             figures["epochs"] = [
@@ -70,15 +70,15 @@ class Table1(SystemStudy):
         return figures
 
 
-def _votes(truth: Sequence[str], said: Sequence[str], touch: Sequence[int]) -> Figures:
-    """Right answers by the majority of what is said of one recording, where recordings have several frames."""
+def _votes(truth: Sequence[str], predicted: Sequence[str], touch: Sequence[int]) -> Figures:
+    """Right answers by the majority of answers for a recording, where recordings have several frames."""
     ballots: dict[int, list[str]] = {}
-    for one, answer in zip(touch, said, strict=True):
-        ballots.setdefault(one, []).append(answer)
+    for recording, answer in zip(touch, predicted, strict=True):
+        ballots.setdefault(recording, []).append(answer)
     if len(ballots) == len(truth):
         return {}
     name_of = dict(zip(touch, truth, strict=True))
-    right = sum(max(sorted(set(votes)), key=votes.count) == name_of[one] for one, votes in ballots.items())
+    right = sum(max(sorted(set(votes)), key=votes.count) == name_of[recording] for recording, votes in ballots.items())
     return {"recordings": len(ballots), "recordings_right": right}
 
 

@@ -52,7 +52,7 @@ EPOCHAL = ("conv-lstm", "snn", "resnet", "resnet-pretrained")
 NEED_WEIGHTS = tuple(key for key in SYSTEMS if "vision" in key or key in ("least-squares", "resnet-pretrained"))
 """Those that need the weights of a trained ResNet."""
 
-# Of the threshold encoding, in units of the image. SVMs on spikes of 0.01 and 0.02 tell BioTac apart in 95 % and 96, of
+# Of the threshold encoding, in units of the image. SVMs on spikes of 0.01 and 0.02 have 95 % and 96 of BioTac, of
 # 0.05 in 94; RoboSkin in 94 to 96 with all of them.
 THRESHOLD = 0.02
 # Into which a touch's spikes are counted for the SVM, 0.25 s of BioTac: reading by reading it has 80 to 86 %.

@@ -1,4 +1,4 @@
-"""Ours: a memory of touches that is told what fabrics are made of, as a system of the comparison."""
+"""Ours: a memory of touches that is given what fabrics are made of, as a system of the comparison."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from examples.paper.systems.constituent_squares import Shares, Told
+from examples.paper.systems.constituent_squares import Estimates, Shares
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile import Embedding
 from scroll_tactile.errors import InputError
@@ -17,15 +17,15 @@ from scroll_tactile.results import Composition
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["ConstituentMemory", "told_of"]
+__all__ = ["ConstituentMemory", "estimates_of"]
 
 
 class ConstituentMemory:
-    """A `TactileLearner` that meets every touch once, is told what fabrics are made of, and composes.
+    """A `TactileLearner` that meets every touch once, is given what fabrics are made of, and composes.
 
-    embedding: frozen. read: from a touch to the stream that is learned, or asked about. augmentation: copies that
+    embedding: frozen. read: from a touch to the stream that is learned or tested. augmentation: copies that
     touches are observed with, or none. unfamiliar: how probable it is beforehand that a touch is of a fabric never
-    touched, which whoever asks knows; see `TactileLearner.compose`.
+    touched, which the caller knows; see `TactileLearner.compose`.
     """
 
     def __init__(
@@ -56,32 +56,32 @@ class ConstituentMemory:
         require_touches(streams, materials, validation)
         sensor = self._read(streams[0]).sensor
         learner = TactileLearner(sensor=sensor, embedding=self._embedding, exemplars=0, augmentation=self._augmentation)
-        lessons = [*zip(materials, streams, strict=True), *validation]
-        for done, (material, stream) in enumerate(lessons, start=1):
+        train = [*zip(materials, streams, strict=True), *validation]
+        for done, (material, stream) in enumerate(train, start=1):
             learner.observe(material, self._read(stream))
-            progress("learning", done, len(lessons))
+            progress("learning", done, len(train))
         for fabric in learner.materials:
             learner.describe(fabric, dict(self._shares.of[fabric]))
         self._learner = learner
 
     def compositions(self, streams: Sequence[Stream], unfamiliar: float, progress: Progress) -> list[Composition]:
-        """What the learner says of each. Raises InputError before `fit`."""
+        """What the learner composes of each. Raises InputError before `fit`."""
         if self._learner is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
-        said = []
+        predicted = []
         for done, stream in enumerate(streams, start=1):
             felt = self._read(stream)
-            said.append(self._learner.compose(felt, constituents=self._shares.names, unfamiliar=unfamiliar))
+            predicted.append(self._learner.compose(felt, constituents=self._shares.names, unfamiliar=unfamiliar))
             progress("asking", done, len(streams))
-        return said
+        return predicted
 
-    def tell(self, streams: Sequence[Stream], progress: Progress = silent) -> Told:
-        """See `Teller.tell`."""
-        return told_of(self._shares.names, self.compositions(streams, self.unfamiliar, progress))
+    def estimate(self, streams: Sequence[Stream], progress: Progress = silent) -> Estimates:
+        """See `ConstituentSystem.estimate`."""
+        return estimates_of(self._shares.names, self.compositions(streams, self.unfamiliar, progress))
 
 
-def told_of(names: Sequence[str], said: Sequence[Composition]) -> Told:
+def estimates_of(names: Sequence[str], predicted: Sequence[Composition]) -> Estimates:
     """Compositions as arrays, the constituents in the order of `names`."""
-    rows = [[(one[name].presence, one[name].share) for name in names] for one in said]
+    rows = [[(composition[name].presence, composition[name].share) for name in names] for composition in predicted]
     both = np.array(rows, dtype=np.float64).reshape(-1, len(names), 2)  # None becomes NaN
-    return Told(both[..., 0], both[..., 1])
+    return Estimates(both[..., 0], both[..., 1])

@@ -1,4 +1,4 @@
-"""Networks with one head for each constituent: the paper's way to tell what a touch is made of."""
+"""Networks with one head for each constituent: the paper's way to compose a touch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from examples.paper.systems.constituent_squares import Heads, Shares, Told
+from examples.paper.systems.constituent_squares import Estimates, Heads, Shares
 from examples.paper.systems.descent import Loss
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.system_protocol import Watch, silent, unwatched
@@ -35,7 +35,7 @@ def presence_loss(logits: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
 
 
 class ConstituentNet(TrainedNetwork):
-    """A residual network with one head for each constituent, which tells its presence: a logistic unit.
+    """A residual network with one head for each constituent, which predicts its presence: a logistic unit.
 
     Trained as `TrainedNetwork` is. Shares, which the paper's heads do not report, are by ridge regression on the
     features below them, of the touches that the network learned.
@@ -63,12 +63,12 @@ class ConstituentNet(TrainedNetwork):
         features, held = self._features(streams), self._features([stream for _, stream in validation])
         self._heads = Heads(features, held, self._shares, materials, [name for name, _ in validation])
 
-    def tell(self, streams: Sequence[Stream], progress: Progress = silent) -> Told:
-        """See `Teller.tell`."""
+    def estimate(self, streams: Sequence[Stream], progress: Progress = silent) -> Estimates:
+        """See `ConstituentSystem.estimate`."""
         if self._heads is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
         presence = torch.sigmoid(self.outputs(streams).double()).numpy()
-        return Told(presence, self._heads(self._features(streams)).share)
+        return Estimates(presence, self._heads(self._features(streams)).share)
 
     @property
     def _outputs(self) -> int:

@@ -1,4 +1,4 @@
-"""Systems that tell what a touch is made of: their protocol, and the simplest of them, least squares.
+"""Systems that estimate what a touch is made of: their protocol, and the simplest of them, least squares.
 
 Each learns touches by the fabric that they are of, as a `System` does, and knows from a `Shares` what fabrics are made
 of; what is unknown of a fabric is left out of the constituent's targets, and is not a zero.
@@ -20,7 +20,7 @@ from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["ConstituentSquares", "Heads", "Shares", "Teller", "Told"]
+__all__ = ["ConstituentSquares", "ConstituentSystem", "Estimates", "Heads", "Shares"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -47,15 +47,15 @@ class Shares:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What is said of N touches: probability of each of K constituents, and its share; (N, K), NaN where none is."""
+class Estimates:
+    """Estimates for N touches: probability of each of K constituents, and its share; (N, K), NaN where none is."""
 
     presence: FloatArray
     share: FloatArray
 
 
-class Teller(Protocol):
-    """A system that tells constituents."""
+class ConstituentSystem(Protocol):
+    """A system that estimates constituents."""
 
     @property
     def name(self) -> str:
@@ -74,7 +74,7 @@ class Teller(Protocol):
         """As `System.fit`."""
         ...
 
-    def tell(self, streams: Sequence[Stream], progress: Progress = silent) -> Told:
+    def estimate(self, streams: Sequence[Stream], progress: Progress = silent) -> Estimates:
         """What each stream is made of. Raises InputError before `fit`."""
         ...
 
@@ -99,27 +99,27 @@ class Heads:
             learned, tested = what(fabrics), what(asked)
             penalty = 1e-3
             if np.isfinite(tested).any():
-                losses = [lost(_said(_solved(features, learned, one), held), tested) for one in PENALTIES]
-                penalty = max(one for one, loss in zip(PENALTIES, losses, strict=True) if loss == min(losses))
+                losses = [lost(_predict(_solved(features, learned, choice), held), tested) for choice in PENALTIES]
+                penalty = max(choice for choice, loss in zip(PENALTIES, losses, strict=True) if loss == min(losses))
             self.penalties.append(penalty)
             self._heads.append(_solved(rows, np.concatenate([learned, tested]), penalty))
 
-    def __call__(self, features: FloatArray) -> Told:
+    def __call__(self, features: FloatArray) -> Estimates:
         """What touches of these features, (N, d), are made of; their shares sum to one."""
-        presence, share = (_said(heads, features) for heads in self._heads)
-        total = share.sum(axis=1, keepdims=True)  # NaN where one is not told: then they stay as they are
-        return Told(presence, np.divide(share, total, out=share.copy(), where=total > 0))
+        presence, share = (_predict(heads, features) for heads in self._heads)
+        total = share.sum(axis=1, keepdims=True)  # NaN where one is unknown: then they stay as they are
+        return Estimates(presence, np.divide(share, total, out=share.copy(), where=total > 0))
 
 
 _Head = tuple[Ridge, int]  # and which of its outputs
 
 
-def _wrong(said: FloatArray, true: FloatArray) -> float:
-    return float((((said > 0.5) != (true > 0)) & np.isfinite(true)).sum())
+def _wrong(predicted: FloatArray, true: FloatArray) -> float:
+    return float((((predicted > 0.5) != (true > 0)) & np.isfinite(true)).sum())
 
 
-def _apart(said: FloatArray, true: FloatArray) -> float:
-    return float(np.nansum(np.square(said - true)))
+def _apart(predicted: FloatArray, true: FloatArray) -> float:
+    return float(np.nansum(np.square(predicted - true)))
 
 
 def _solved(features: FloatArray, wanted: FloatArray, penalty: float) -> list[_Head | None]:
@@ -127,8 +127,8 @@ def _solved(features: FloatArray, wanted: FloatArray, penalty: float) -> list[_H
     known = np.isfinite(wanted)
     solved: dict[bytes, tuple[Ridge, list[int]]] = {}
     heads: list[_Head | None] = []
-    for at in range(wanted.shape[1]):
-        rows = known[:, at]
+    for i in range(wanted.shape[1]):
+        rows = known[:, i]
         if not rows.any():
             heads.append(None)
             continue
@@ -137,15 +137,15 @@ def _solved(features: FloatArray, wanted: FloatArray, penalty: float) -> list[_H
             model = ridge(features[rows], wanted[rows][:, same], penalty)
             solved[rows.tobytes()] = model, np.flatnonzero(same).tolist()
         model, places = solved[rows.tobytes()]
-        heads.append((model, places.index(at)))
+        heads.append((model, places.index(i)))
     return heads
 
 
-def _said(heads: Sequence[_Head | None], features: FloatArray) -> FloatArray:
+def _predict(heads: Sequence[_Head | None], features: FloatArray) -> FloatArray:
     """Outputs between 0 and 1, (N, K), NaN where there is no head."""
     columns = [np.full(len(features), np.nan) if head is None else head[0](features)[:, head[1]] for head in heads]
-    said: FloatArray = np.clip(np.stack(columns, axis=1), 0, 1)
-    return said
+    predicted: FloatArray = np.clip(np.stack(columns, axis=1), 0, 1)
+    return predicted
 
 
 class ConstituentSquares:
@@ -176,8 +176,8 @@ class ConstituentSquares:
         self._heads = Heads(features, held, self._shares, materials, [name for name, _ in validation])
         self.chosen = self._heads.penalties
 
-    def tell(self, streams: Sequence[Stream], progress: Progress = silent) -> Told:
-        """See `Teller.tell`."""
+    def estimate(self, streams: Sequence[Stream], progress: Progress = silent) -> Estimates:
+        """See `ConstituentSystem.estimate`."""
         if self._heads is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
         return self._heads(self._squares.features(streams, progress))

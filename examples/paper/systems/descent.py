@@ -109,7 +109,7 @@ def seeded(seed: int, device: str) -> Iterator[None]:
 
 def descend(
     net: nn.Module,
-    taught: Batches,
+    trained: Batches,
     held: Batches | None,
     course: Course,
     random: np.random.Generator,
@@ -129,16 +129,16 @@ def descend(
     plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=course.factor, patience=course.patience)
     epochs: list[Epoch] = []
     best, state = math.inf, None
-    for at in range(course.epochs):
+    for i in range(course.epochs):
         rate = float(optimiser.param_groups[0]["lr"])
-        loss = _epoch(net, taught, optimiser, course, random, at + 1, criterion)
+        loss = _epoch(net, trained, optimiser, course, random, i + 1, criterion)
         validation = None if held is None else _loss(net, held, criterion)
         epochs.append(Epoch(loss, validation, rate))
         judged = loss if validation is None else validation
         if judged < best:
             best, state = judged, {name: tensor.clone() for name, tensor in net.state_dict().items()}
         plateau.step(judged)
-        progress("training", at + 1, course.epochs)
+        progress("training", i + 1, course.epochs)
         watch()
     if state is not None:
         net.load_state_dict(state)
@@ -147,7 +147,7 @@ def descend(
 
 def _epoch(
     net: nn.Module,
-    taught: Batches,
+    trained: Batches,
     optimiser: torch.optim.Optimizer,
     course: Course,
     random: np.random.Generator,
@@ -156,16 +156,16 @@ def _epoch(
 ) -> float:
     """Mean loss of one pass in a random order."""
     net.train()
-    order = random.permutation(len(taught.targets))
+    order = random.permutation(len(trained.targets))
     total = torch.zeros((), dtype=torch.float64)
     # Of nearly one size: batch normalisation cannot train on a last batch of one.
     for places in np.array_split(order, -(-len(order) // course.batch)):
-        targets = taught.targets[torch.from_numpy(places)]
+        targets = trained.targets[torch.from_numpy(places)]
         try:
             # Rounded weights are kept until the outermost autocast ends, which is that of `seeded`: not to be kept.
             half = course.precision == "bfloat16"
             with torch.autocast(targets.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
-                logits = net(taught.fetch(places))
+                logits = net(trained.fetch(places))
             loss = criterion(logits.float(), targets)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -187,7 +187,7 @@ def _epoch(
 def _loss(net: nn.Module, held: Batches, criterion: Loss) -> float:
     """Mean loss on touches that nothing is learned from."""
     places = np.arange(len(held.targets))
-    logits = torch.cat([logits_of(net, held.fetch(places[at : at + AT_ONCE])) for at in range(0, len(places), AT_ONCE)])
+    logits = torch.cat([logits_of(net, held.fetch(places[i : i + AT_ONCE])) for i in range(0, len(places), AT_ONCE)])
     return float(criterion(logits.double(), held.targets))
 
 

@@ -101,7 +101,7 @@ class LeastSquares:
         """See `System.predict`."""
         if self._solved is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
-        return [self._names[at] for at in self._solved(self.features(streams)).argmax(axis=1)]
+        return [self._names[i] for i in self._solved(self.features(streams)).argmax(axis=1)]
 
     def features(self, streams: Sequence[Stream], progress: Progress = silent) -> FloatArray:
         """One vector for each of N streams, (N, d)."""

@@ -84,8 +84,8 @@ class SpikingNet(nn.Module):
             inflow = currents(fired)
             potential = torch.zeros_like(inflow[..., 0])
             steps = []
-            for at in range(inflow.shape[-1]):
-                out, potential = neuron(inflow[..., at], potential)
+            for i in range(inflow.shape[-1]):
+                out, potential = neuron(inflow[..., i], potential)
                 steps.append(out)
             fired = torch.stack(steps, dim=-1)
         logits: torch.Tensor = self.head(fired.mean(dim=-1))
@@ -127,7 +127,7 @@ class ResNetClassifier(nn.Module):
         return functional.adaptive_avg_pool2d(last, 1).flatten(1)
 
     def prepare(self, batches: Iterable[torch.Tensor]) -> None:
-        """Be told of all images that will be learned from; of a trained network the statistics become theirs.
+        """Prepare for all images that will be learned from; of a trained network the statistics become theirs.
 
         Batch normalisation trains with the batch's mean μ and deviation σ, and the published ones, μ₀ and σ₀, are of
         photographs, or of nothing where the file has them folded into the slopes: training would begin with another

@@ -42,10 +42,10 @@ class OnePass:
         learner = TactileLearner(
             sensor=streams[0].sensor, embedding=self._embedding, readout=self._readout, exemplars=0
         )
-        lessons = [*zip(materials, streams, strict=True), *validation]
-        for done, (material, stream) in enumerate(lessons, start=1):
+        train = [*zip(materials, streams, strict=True), *validation]
+        for done, (material, stream) in enumerate(train, start=1):
             learner.observe(material, stream)
-            progress("learning", done, len(lessons))
+            progress("learning", done, len(train))
         self._learner = learner
 
     def predict(self, streams: Sequence[Stream]) -> list[str]:

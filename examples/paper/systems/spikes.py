@@ -24,7 +24,7 @@ __all__ = ["REST", "decode", "encode"]
 Image = npt.NDArray[np.float32]
 
 REST = -1.0
-"""The least value of an image: where every channel begins, so that the first spikes tell how it was pressed."""
+"""The least value of an image: where every channel begins, so that the first spikes show how it was pressed."""
 
 
 def encode(image: Image, threshold: float, rest: float = REST) -> Image:
@@ -40,9 +40,9 @@ def encode(image: Image, threshold: float, rest: float = REST) -> Image:
     # x̂ is kept as a whole number of thresholds, so that its rounding does not add up.
     level = np.zeros(len(image))
     fired = np.empty_like(steps)
-    for at in range(steps.shape[1]):
-        fired[:, at] = np.trunc(steps[:, at] - level)
-        level += fired[:, at]
+    for i in range(steps.shape[1]):
+        fired[:, i] = np.trunc(steps[:, i] - level)
+        level += fired[:, i]
     return np.concatenate([np.maximum(fired, 0), np.maximum(-fired, 0)]).astype(np.float32)
 
 

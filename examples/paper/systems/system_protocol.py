@@ -17,7 +17,7 @@ Watch = Callable[[], object]
 
 
 def silent(what: str, done: int, of: int) -> None:
-    """Progress that nobody wants to hear of."""
+    """Progress that is reported to nobody."""
 
 
 def unwatched() -> None:
@@ -46,7 +46,7 @@ class System(Protocol):
 
         validation: touches of the same materials that a system may choose settings on. One that has nothing to
         choose, or has chosen, learns them too: all systems are given the same touches in all.
-        seed: of all that is drawn; 0 or more. progress: told what is being done.
+        seed: of all that is drawn; 0 or more. progress: receives what is being done.
 
         Raises InputError for fewer than two materials, or other numbers of streams than of materials.
         """
@@ -67,7 +67,7 @@ def require_touches(streams: Sequence[Stream], materials: Sequence[str], validat
         raise InputError(f"expected as many streams as materials; came {len(streams)} and {len(materials)}")
     names = sorted(set(materials))
     if len(names) < 2:
-        raise InputError(f"expected streams of two materials or more, to be told apart; came {names}")
+        raise InputError(f"expected streams of two materials or more, to be classified; came {names}")
     strange = {name for name, _ in validation} - set(names)
     if strange:
         raise InputError(f"expected a validation of the materials that are learned; it also has {sorted(strange)}")

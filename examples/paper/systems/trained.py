@@ -27,7 +27,7 @@ Make = Callable[[tuple[int, ...], int, int], nn.Module]
 
 
 class TrainedNetwork:
-    """A network trained as `descend` does, on images of one width; it is asked about images of any.
+    """A network trained as `descend` does, on images of one width; it classifies images of any.
 
     make: a new network for each fit. read: from an image to what the network reads, both (…, T). course: of the
     training. device: torch's name of one. augmentation: of every touch in every epoch, drawn anew; none as in the
@@ -79,17 +79,19 @@ class TrainedNetwork:
         images = [self._view(stream) for stream in streams]
         columns = self._columns = usual_columns(images)
         random = np.random.default_rng([seed, 0])
-        taught = self._batches(images, materials, columns, random if self._augmentation is not None else None)
+        trained = self._batches(images, materials, columns, random if self._augmentation is not None else None)
         held = None
         if validation:
-            held = self._batches([self._view(one) for _, one in validation], [name for name, _ in validation], columns)
+            held = self._batches(
+                [self._view(held_stream) for _, held_stream in validation], [name for name, _ in validation], columns
+            )
         with seeded(seed, self._device):
             shape = self._read(one_width(images[0], columns)).shape
             self._net = self._make(shape, self._outputs, seed).to(self._device)
             if isinstance(self._net, ResNetClassifier):
                 places = np.array_split(np.arange(len(images)), -(-len(images) // AT_ONCE))
-                self._net.prepare(taught.fetch(some) for some in places)
-            self.epochs = descend(self._net, taught, held, self.course, random, progress, watch, self._criterion)
+                self._net.prepare(trained.fetch(some) for some in places)
+            self.epochs = descend(self._net, trained, held, self.course, random, progress, watch, self._criterion)
 
     @property
     def network(self) -> nn.Module:
@@ -116,12 +118,12 @@ class TrainedNetwork:
         images = [self._view(stream) for stream in streams]
         if self._augmentation is not None:
             images = [one_width(image, max(self._columns, image.shape[-1])) for image in images]
-        for at, image in enumerate(images):
-            sizes.setdefault(image.shape, []).append(at)
+        for i, image in enumerate(images):
+            sizes.setdefault(image.shape, []).append(i)
         for members in sizes.values():
-            inputs = torch.from_numpy(np.stack([self._read(images[at]) for at in members])).to(self._device)
-            for at, row in zip(members, logits_of(network, inputs).cpu(), strict=True):
-                given[at] = row
+            inputs = torch.from_numpy(np.stack([self._read(images[i]) for i in members])).to(self._device)
+            for i, row in zip(members, logits_of(network, inputs).cpu(), strict=True):
+                given[i] = row
         return torch.stack(given) if given else torch.empty(0, 1)
 
     @property
@@ -144,7 +146,7 @@ class TrainedNetwork:
             augmentation = self._augmentation
 
             def drawn(places: npt.NDArray[np.intp]) -> torch.Tensor:
-                changed = [augmentation.augment(images[at], random, columns=columns) for at in places]
+                changed = [augmentation.augment(images[i], random, columns=columns) for i in places]
                 return torch.from_numpy(np.stack([self._read(image) for image in changed])).to(self._device)
 
             return Batches(drawn, targets)

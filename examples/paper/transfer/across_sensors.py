@@ -1,4 +1,4 @@
-"""Transfer across sensors: materials learned with one, and asked about with another, after few touches of it or none.
+"""Transfer across sensors: materials learned with one, and tested with another, after few touches of it or none.
 
 Every way stands beside learning from these few touches alone, and all have the same draws of them.
 """
@@ -19,7 +19,7 @@ from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
 from examples.paper.studies.peers import touch_features
 from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
-from examples.paper.transfer.few_touches import Feeler, draw_touches, feeler_maker, few_touches
+from examples.paper.transfer.few_touches import FewTouchLearner, candidate_maker, draw_touches, few_touches
 from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
@@ -50,7 +50,7 @@ WAYS = {
 }
 """Key → name, as in tables."""
 
-_BLIND = ("as-they-are", "standardised", "resampled")  # ways that ask no touch of the new sensor to be named
+_BLIND = ("as-they-are", "standardised", "resampled")  # ways that need no labelled touch of the new sensor
 _IN_KERNELS = ("ridge-map", "procrustes", "prior", "prior-control")
 LIKENESS = 0.3
 """Of "prior", set with one fold: 0.3, 0.6 and 0.9 gain −0.1, 0 and −0.4 points (± 0.1 to 0.2) with one touch of
@@ -59,11 +59,11 @@ RoboSkin, and 0.7, 1.0 and 0 (± 0.5) with one of BioTac, over 0, the control.""
 
 @dataclass(frozen=True)
 class SensorTransfer:
-    """Two sensors that touched the same materials; each is learned with in turn, and the other asked about.
+    """Two sensors that touched the same materials; each is learned with in turn, and the other tested.
 
     sets: two, of different sensors without a camera, with the same materials. ways: keys of WAYS.
     folds: tested, of the new sensor; counts: touches of each material of the new sensor, 0 or more; draws: of these.
-    seed: of the draws. folder: where finished cells are noted, so that a run that was killed goes on; or None.
+    seed: of the draws. folder: where finished cells are noted, so that a killed run resumes; or None.
 
     What is not labelled of the new sensor's touches outside the fold serves "standardised" and "resampled": each
     feature's mean and spread. Raises InputError for what cannot be.
@@ -78,12 +78,12 @@ class SensorTransfer:
     folder: Path | None = None
 
     def __post_init__(self) -> None:
-        one, other = self.sets
-        if one.sensor == other.sensor or set(one.materials) != set(other.materials):
+        item, other = self.sets
+        if item.sensor == other.sensor or set(item.materials) != set(other.materials):
             raise InputError(
-                f"expected two sensors that touched the same materials; came {one.sensor.name!r} with "
-                f"{len(set(one.materials))} and {other.sensor.name!r} with {len(set(other.materials))} materials, "
-                f"{len(set(one.materials) & set(other.materials))} of them the same"
+                f"expected two sensors that touched the same materials; came {item.sensor.name!r} with "
+                f"{len(set(item.materials))} and {other.sensor.name!r} with {len(set(other.materials))} materials, "
+                f"{len(set(item.materials) & set(other.materials))} of them the same"
             )
         strange = [key for key in self.ways if key not in WAYS]
         if strange or not self.ways:
@@ -93,7 +93,7 @@ class SensorTransfer:
                 "expected one fold or more, counts of 0 touches or more, 1 draw or more and a seed of 0 or more; came "
                 f"folds {self.folds}, counts {self.counts}, draws {self.draws}, seed {self.seed}"
             )
-        SharedFeatures((one.sensor, other.sensor))
+        SharedFeatures((item.sensor, other.sensor))
 
     @property
     def plan(self) -> dict[str, Any]:
@@ -121,10 +121,10 @@ class SensorTransfer:
         Raises InputError for a folder of another run or folds that are not there, and what learning raises.
         """
         notes = RunFile(None if self.folder is None else self.folder / "transfer-sensors.json", self.plan)
-        for one in self.sets:
-            require_data(notes, one)
+        for item in self.sets:
+            require_data(notes, item)
             for fold in self.folds:
-                draw_touches(one, fold, self.seed, 0)  # what is refused is refused before anything is measured
+                draw_touches(item, fold, self.seed, 0)  # what is refused is refused before anything is measured
         yield from run_cells(notes, self.cells(), self._measure, progress)
 
     def agreement(self) -> dict[str, dict[str, float]]:
@@ -137,7 +137,7 @@ class SensorTransfer:
         random = np.random.default_rng([self.seed, 1])
         pairs = np.triu_indices(len(set(self.sets[0].materials)), 1)
         for kind in ("spectra", "kernels"):
-            ours, theirs = (self._known(one, kind, silent).likeness for one in self.sets)
+            ours, theirs = (self._known(item, kind, silent).likeness for item in self.sets)
             exchanged = [random.permutation(len(ours)) for _ in range(200)]
             by_chance = [_correlation(ours[np.ix_(order, order)][pairs], theirs[pairs]) for order in exchanged]
             found[kind] = {
@@ -148,9 +148,9 @@ class SensorTransfer:
 
     @cached_property
     def _directions(self) -> dict[str, tuple[Recordings, Recordings]]:
-        """Name → what is learned with, and what is asked about with."""
-        one, other = self.sets
-        return {f"{old.name} → {new.name}": (old, new) for old, new in ((one, other), (other, one))}
+        """Name → what is learned with, and what is tested with."""
+        item, other = self.sets
+        return {f"{old.name} → {new.name}": (old, new) for old, new in ((item, other), (other, item))}
 
     def _counts_of(self, way: str) -> list[int]:
         return [count for count in self.counts if (count == 0) == (way in _BLIND)]
@@ -162,10 +162,12 @@ class SensorTransfer:
         counts = self._counts_of(cell.system)
         return few_touches(new, cell.fold, make, counts, draws, self.seed, progress)
 
-    def _maker(self, way: str, old: Recordings, new: Recordings, fold: int, progress: Progress) -> Callable[[], Feeler]:
+    def _maker(
+        self, way: str, old: Recordings, new: Recordings, fold: int, progress: Progress
+    ) -> Callable[[], FewTouchLearner]:
         """What makes new learners of a way."""
         if way == ALONE:
-            return feeler_maker(new.sensor, self._kernels)
+            return candidate_maker(new.sensor, self._kernels)
         kind = "resampled" if way == "resampled" else "kernels" if way in _IN_KERNELS else "spectra"
         features = self._features[kind]
         if way == "spectra-alone":
@@ -176,7 +178,7 @@ class SensorTransfer:
         if way in ("prior", "prior-control"):
             return lambda: SharesPrior(features, known, likeness=LIKENESS if way == "prior" else 0.0)
         if way in ("standardised", "resampled"):
-            unlabelled = np.array([features(new.streams[at]) for at in np.flatnonzero(new.fold != fold)])
+            unlabelled = np.array([features(new.streams[i]) for i in np.flatnonzero(new.fold != fold)])
             return lambda: OneReadout(features, known, unlabelled=unlabelled)
         return lambda: OneReadout(features, known, as_it_is=way == "as-they-are", apart=way == "scatter")
 
@@ -202,8 +204,8 @@ class SensorTransfer:
         return {name: _kept(features) for name, features in made.items()}
 
 
-def _correlation(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
-    return float(np.corrcoef(one, other)[0, 1])
+def _correlation(item: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
+    return float(np.corrcoef(item, other)[0, 1])
 
 
 def _kept(features: Features) -> Features:

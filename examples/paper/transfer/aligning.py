@@ -1,4 +1,4 @@
-"""Ways to ask about touches of a new sensor with what was learned by an old one, and few touches of the new."""
+"""Ways to classify touches of a new sensor with what was learned by an old one, and few touches of the new."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class OneReadout(_Touches):
         with one_thread():
             selection = select(parts[0] if len(parts) == 1 else parts[0] + parts[1], WHOLE, "lda")
         assert selection is not None
-        return selection, [at for at, name in enumerate(selection.names) if not name.startswith(_OLD)]
+        return selection, [i for i, name in enumerate(selection.names) if not name.startswith(_OLD)]
 
 
 class MapsAcross(_Touches):
@@ -219,7 +219,7 @@ class SharesPrior(_Touches):
     """The new sensor's means drawn towards each other as the old sensor's materials lie.
 
     The means have the prior N(0, K ⊗ Σ), K = r G + (1 − r) I, with G the cosines between the old sensor's means where
-    their scatter is white; given k touches they are K (K + s/k I)⁻¹ of what was felt.
+    their scatter is white; given k touches they are K (K + s/k I)⁻¹ of what was observed.
 
     likeness: r, from 0 (materials lie apart alike, the control) to 1.
     """

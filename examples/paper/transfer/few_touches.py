@@ -23,15 +23,23 @@ from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics, fold_of
 
-__all__ = ["COUNTS", "Feeler", "WidestFeatures", "WidestReadout", "draw_touches", "feeler_maker", "few_touches"]
+__all__ = [
+    "COUNTS",
+    "FewTouchLearner",
+    "WidestFeatures",
+    "WidestReadout",
+    "candidate_maker",
+    "draw_touches",
+    "few_touches",
+]
 
 COUNTS = (1, 2, 5, 10, 20)
 WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 """Touches of each material after which the test is taken."""
 
 
-class Feeler(Protocol):
-    """What learns touches one by one, and says of others which material they are of."""
+class FewTouchLearner(Protocol):
+    """What learns touches one by one, and classifies others."""
 
     def observe(self, material: str, stream: Stream) -> object:
         """Learn a touch."""
@@ -71,7 +79,7 @@ class WidestFeatures:
 class WidestReadout:
     """A `TactileLearner` with LDA, of touches that are all whole, and an embedding that judges by the widest scale.
 
-    It says the same materials: narrower windows have no say there. It spares embedding them, which for a network is
+    It names the same materials: narrower windows do not count there. It spares embedding them, which for a network is
     four fifths of the work, and the calibration, which changes no ranking.
 
     features: of touches, kept and shared by as many readouts as there are draws.
@@ -110,9 +118,9 @@ class _LearnerFeeler:
         return str(self._learner.predict(stream).material)
 
 
-def feeler_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], Feeler]:
-    """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that says the same."""
-    if window_plan(sensor, embedding).judged == "widest":
+def candidate_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], FewTouchLearner]:
+    """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that answers the same."""
+    if Reading.of(sensor, embedding).judged == "widest":
         features = WidestFeatures(sensor, embedding)
         return lambda: WidestReadout(features)
     return lambda: _LearnerFeeler(sensor, embedding)
@@ -128,23 +136,23 @@ def draw_touches(recordings: Recordings, fold: int, seed: int, draw: int) -> dic
         there = sorted(set(recordings.fold.tolist()))
         raise InputError(f"expected a fold of {recordings.name} out of {there}; came {fold}")
     touches: dict[str, dict[tuple[int, int], list[int]]] = {name: {} for name in sorted(set(recordings.materials))}
-    for at in np.flatnonzero(recordings.fold != fold).tolist():
-        mark = (int(recordings.fold[at]), int(recordings.repetition[at]))
-        touches[recordings.materials[at]].setdefault(mark, []).append(at)
+    for i in np.flatnonzero(recordings.fold != fold).tolist():
+        mark = (int(recordings.fold[i]), int(recordings.repetition[i]))
+        touches[recordings.materials[i]].setdefault(mark, []).append(i)
     drawn: dict[str, list[list[int]]] = {}
     for place, (name, own) in enumerate(touches.items()):
         if not own:
             raise InputError(f"expected touches of {name!r} of {recordings.name} outside of fold {fold}; there is none")
         groups = list(own.values())
         order = np.random.default_rng([seed, fold, draw, place]).permutation(len(groups))
-        drawn[name] = [groups[at] for at in order]
+        drawn[name] = [groups[i] for i in order]
     return drawn
 
 
 def few_touches(
     recordings: Recordings,
     fold: int,
-    make: Callable[[], Feeler],
+    make: Callable[[], FewTouchLearner],
     counts: Sequence[int],
     draws: int,
     seed: int,
@@ -152,28 +160,28 @@ def few_touches(
 ) -> dict[str, Any]:
     """Right answers on a fold after so many touches of each material from the others, for several draws of these.
 
-    Returns tested, the number of recordings asked about, and by count: right, one number a draw, and taught, the mean
+    Returns tested, the number of recordings tested, and by count: right, one number a draw, and learned, the mean
     number of touches of a material. A count that no material has is left out; a material that has fewer gives all.
     """
-    exam = np.flatnonzero(recordings.fold == fold).tolist()
+    test = np.flatnonzero(recordings.fold == fold).tolist()
     drawn = [draw_touches(recordings, fold, seed, draw) for draw in range(draws)]
     most = max(len(own) for own in drawn[0].values())
     stops = [count for count in sorted(counts) if count <= most]
     right: dict[str, list[int]] = {str(count): [] for count in stops}
-    taught = {str(count): float(np.mean([min(count, len(own)) for own in drawn[0].values()])) for count in stops}
+    trained = {str(count): float(np.mean([min(count, len(own)) for own in drawn[0].values()])) for count in stops}
     for draw, touches in enumerate(drawn):
-        feeler, begun = make(), 0
+        candidate, begun = make(), 0
         for stop in stops:
-            lessons = [(name, at) for name, own in touches.items() for group in own[begun:stop] for at in group]
-            total = len(lessons) + len(exam)
+            train = [(name, i) for name, own in touches.items() for group in own[begun:stop] for i in group]
+            total = len(train) + len(test)
             what = f"draw {draw + 1} of {draws}, {stop} touches"
-            for done, (name, at) in enumerate(lessons):
-                feeler.observe(name, recordings.streams[at])
+            for done, (name, i) in enumerate(train):
+                candidate.observe(name, recordings.streams[i])
                 progress(what, done + 1, total)
             hits = 0
-            for done, at in enumerate(exam):
-                hits += feeler.name_of(recordings.streams[at]) == recordings.materials[at]
-                progress(what, len(lessons) + done + 1, total)
+            for done, i in enumerate(test):
+                hits += candidate.name_of(recordings.streams[i]) == recordings.materials[i]
+                progress(what, len(train) + done + 1, total)
             right[str(stop)].append(hits)
             begun = stop
-    return {"tested": len(exam), "right": right, "learned": taught}
+    return {"tested": len(test), "right": right, "learned": trained}

@@ -1,4 +1,5 @@
-"""Features that do not know the sensor: the same numbers of a touch, however many channels felt it, and how often."""
+"""Features that do not know the sensor: the same numbers of a touch, however many channels recorded it, and how
+often."""
 
 from __future__ import annotations
 
@@ -47,19 +48,19 @@ class SharedFeatures:
     sensors: tuple[Sensor, ...]
 
     def __post_init__(self) -> None:
-        cameras = [one.name for one in self.sensors if one.camera]
+        cameras = [skin.name for skin in self.sensors if skin.camera]
         if cameras or not self.sensors:
             raise InputError(f"expected sensors with channels; came {cameras or 'none'}")
 
     @property
     def rate(self) -> float:
         """Hz."""
-        return min(one.rate for one in self.sensors)
+        return min(skin.rate for skin in self.sensors)
 
     @property
     def columns(self) -> int:
         """Of a window, at the common rate."""
-        return round(min(one.duration for one in self.sensors) * self.rate)
+        return round(min(skin.duration for skin in self.sensors) * self.rate)
 
     def spectra(self, stream: Stream) -> FloatArray:
         """Plain statistics of a touch, (140,), the mean over its windows.

@@ -21,8 +21,7 @@ from examples.paper.runs.study import weights_digest
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork, require_device
-from examples.paper.transfer.few_touches import COUNTS, feeler_maker, few_touches
-from scroll_tactile import Embedding, Kernels, Vision
+from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
@@ -48,12 +47,12 @@ Tensors = Mapping[str, torch.Tensor]
 class TaskTransfer:
     """Which embeddings are fine-tuned on what, and how they are tried.
 
-    sets: of different names, two or more, all asked about. sources: the names of those fine-tuned on; all unless given.
+    sets: of different names, two or more, all tested. sources: the names of those fine-tuned on; all unless given.
     weights: of the pre-trained ResNet.
     folds: tested, of each set. counts: touches of each material learned before a test; draws: of those touches.
     epochs, rate: of a fine-tuning; device: where it runs; precision: see `Course`. every: learn every
     so many recordings only when fine-tuning. seed: of all that is drawn.
-    folder: where finished cells are noted and fine-tuned networks kept, so that a run that was killed goes on; or None.
+    folder: where finished cells are noted and fine-tuned networks kept, so that a killed run resumes; or None.
 
     Raises InputError for what cannot be, WeightsError for weights that cannot be had.
     """
@@ -73,7 +72,7 @@ class TaskTransfer:
     sources: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        names = [one.name for one in self.sets]
+        names = [item.name for item in self.sets]
         if len(set(names)) < max(2, len(names)):
             raise InputError(f"expected two data sets or more, of different names; came {names}")
         if strange := sorted(set(self.sources or ()) - set(names)):
@@ -103,7 +102,7 @@ class TaskTransfer:
     def cells(self) -> list[Cell]:
         """Fold by fold: the rows of nothing fine-tuned, then for each set the fine-tuning, and its row on every set."""
         found = []
-        names = [one.name for one in self.sets]
+        names = [item.name for item in self.sets]
         for fold in self.folds:
             found += [Cell(name, fold, system) for system in ("kernels", "vision") for name in names]
             for source in names if self.sources is None else self.sources:
@@ -118,20 +117,20 @@ class TaskTransfer:
         that is damaged, and what learning and training raise.
         """
         notes = RunFile(None if self.folder is None else self.folder / "transfer-tasks.json", self.plan)
-        for source, fold in ((one.name, fold) for one in self.sets for fold in self.folds):
+        for source, fold in ((item.name, fold) for item in self.sets for fold in self.folds):
             if (figures := notes.notes.get(Cell(source, fold, TRAINING).key)) is not None:
                 self._noted[source, fold] = figures["digest"]
-        for one in self.sets:
-            require_data(notes, one)
+        for item in self.sets:
+            require_data(notes, item)
             for fold in self.folds:
-                split(one, fold, self.seed, every=self.every)  # what is refused is refused before anything is measured
+                split(item, fold, self.seed, every=self.every)  # what is refused is refused before anything is measured
         yield from run_cells(notes, self.cells(), self._measure, progress)
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         recordings = self._by_name[cell.dataset]
         if cell.system == TRAINING:
             return self._train(recordings, cell.fold, progress)
-        make = feeler_maker(recordings.sensor, self._embedding(cell, progress))
+        make = candidate_maker(recordings.sensor, self._embedding(cell, progress))
         return few_touches(recordings, cell.fold, make, self.counts, self.draws, self.seed, progress)
 
     def _embedding(self, cell: Cell, progress: Progress) -> Embedding:
@@ -146,7 +145,7 @@ class TaskTransfer:
         touches = split(recordings, fold, self.seed, every=self.every)
         trained = TrainedNetwork(TRAINING, self._network, course=self.course, device=self.device, view=tactile_image)
         trained.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
-        said = trained.predict(touches.asked)
+        predicted = trained.predict(touches.test_streams)
         assert isinstance(trained.network, ResNetClassifier)
         state = trained.network.net.state_dict()
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
@@ -154,9 +153,9 @@ class TaskTransfer:
         return {
             "learned": len(touches.streams),
             "validation": len(touches.validation),
-            "tested": len(said),
-            "right": sum(one == other for one, other in zip(touches.truth, said, strict=True)),
-            "losses": [[one.loss, one.validation_loss] for one in trained.epochs],
+            "tested": len(predicted),
+            "right": sum(true == guess for true, guess in zip(touches.truth, predicted, strict=True)),
+            "losses": [[item.loss, item.validation_loss] for item in trained.epochs],
             "digest": _digest(tensors),
         }
 
@@ -206,7 +205,7 @@ class TaskTransfer:
 
     @cached_property
     def _by_name(self) -> dict[str, Recordings]:
-        return {one.name: one for one in self.sets}
+        return {item.name: item for item in self.sets}
 
     @cached_property
     def _noted(self) -> dict[tuple[str, int], str]:
@@ -229,22 +228,22 @@ def some_frames(recordings: Recordings, frames: int) -> Recordings:
         return recordings
     seen: dict[tuple[str, int, int], int] = {}
     chosen = []
-    for at, (name, fold) in enumerate(zip(recordings.materials, recordings.fold.tolist(), strict=True)):
-        video = (name, fold, int(recordings.repetition[at]))
+    for i, (name, fold) in enumerate(zip(recordings.materials, recordings.fold.tolist(), strict=True)):
+        video = (name, fold, int(recordings.repetition[i]))
         seen[video] = seen.get(video, 0) + 1
         if seen[video] <= frames:
-            chosen.append(at)
+            chosen.append(i)
     return replace(
         recordings,
-        streams=[recordings.streams[at] for at in chosen],
-        materials=[recordings.materials[at] for at in chosen],
+        streams=[recordings.streams[i] for i in chosen],
+        materials=[recordings.materials[i] for i in chosen],
         repetition=recordings.repetition[chosen],
         fold=recordings.fold[chosen],
     )
 
 
 def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
-    """A row for each data set that is asked about and each embedding.
+    """A row for each data set that is tested and each embedding.
 
     points: count of touches → mean accuracy over draws and folds, its standard deviation, and the mean and standard
     deviation of the difference to the vision model of the same draws (None where that was not measured).

@@ -30,12 +30,12 @@ from examples.benchmarks.vector_peers import (
     VectorPeer,
     lacking,
 )
+from examples.paper.drawing import picture
 from examples.paper.studies.peers import touch_features
 from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.drawing import picture
 from scroll_tactile.readouts.readout import ReadoutName
 
 __all__ = ["WIDTHS", "draw_frontier", "knee", "measure_frontier", "run_frontier", "run_peers"]

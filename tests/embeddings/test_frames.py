@@ -19,7 +19,6 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
-from scroll_tactile.testing import check_embedding
 
 GEL = Gel()
 NETWORK = ResNet.random(0).state_dict()

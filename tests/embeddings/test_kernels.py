@@ -10,7 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.embeddings import Kernels, banks, embed_windows, kernels
+from scroll_tactile import Kernels
+from scroll_tactile.embeddings import banks, kernels
+from scroll_tactile.embeddings.protocol import embed_windows
 
 SMALL = Kernels(dimension=64)
 BOTH = [SMALL, Kernels()]  # the default as well: it uses several thresholds of a kernel, and larger banks

@@ -5,7 +5,6 @@ import pytest
 
 from scroll_tactile import Maps
 from scroll_tactile.errors import InputError
-from scroll_tactile.testing import check_embedding
 
 
 def pressed(places, columns=60, layout=(6, 7)):

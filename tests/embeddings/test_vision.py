@@ -8,10 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile import Embedding, TactileLearner, Vision, sensors
+from scroll_tactile import TactileLearner, Vision, sensors
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings import Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import TOGETHER, pool_windows, to_planes
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, WeightsError

@@ -10,7 +10,7 @@ from test_perturbations import PAD
 from examples.paper import drawing as plots
 from examples.paper.plots import draw_robustness, robustness_curves
 from examples.paper.studies.robustness_study import Robustness, ours, summary
-from scroll_tactile import Kernels
+from scroll_tactile import Kernels, Robust
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import DatasetError, InputError

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from examples.paper.drawing import confusion_counts
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
-from scroll_tactile.pipelines.drawing import confusion_counts
-from scroll_tactile.pipelines.memories import open_memory
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 

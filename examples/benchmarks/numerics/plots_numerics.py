@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile.pipelines.drawing import picture
+from examples.paper.drawing import picture
 
 __all__ = ["draw_numerics", "points"]
 

@@ -187,7 +187,7 @@ class Objects:
         predicted = [learner.compose(self.recordings.streams[i], unfamiliar=1.0) for i in test]
         keys = list(next(iter(self.attributes.values())))
         trained = {name: values for name, values in self.attributes.items() if name not in group}
-        heads = fit_heads(learner._memory.statistics, self._width, trained, keys)
+        heads = fit_heads(learner.memory.statistics, Scale("window", self._width), trained, keys)
         means = [in_units(self._read(self._waves, i), self._waves.bound).mean(axis=0) for i in test]
         graded: dict[str, dict[str, Any]] = {}
         for key in keys:

@@ -20,6 +20,7 @@ from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, Str
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
 from examples.paper.studies.schedules import ScheduleName, arrange, part_ends
+from scroll_tactile import Embedding
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from examples.paper.studies.schedules import ScheduleName, arrange
+from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner

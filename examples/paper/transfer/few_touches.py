@@ -120,7 +120,7 @@ class _LearnerFeeler:
 
 def candidate_maker(sensor: Sensor, embedding: Embedding) -> Callable[[], FewTouchLearner]:
     """What makes new learners with an embedding: `TactileLearner`, or `WidestReadout` where that answers the same."""
-    if Reading.of(sensor, embedding).judged == "widest":
+    if window_plan(sensor, embedding).judged == "widest":
         features = WidestFeatures(sensor, embedding)
         return lambda: WidestReadout(features)
     return lambda: _LearnerFeeler(sensor, embedding)

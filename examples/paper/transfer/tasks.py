@@ -22,6 +22,7 @@ from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork, require_device
 from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches
+from scroll_tactile import Embedding, Kernels, Vision
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError

@@ -19,6 +19,7 @@
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
     ├── EmbeddingError                       an embedding broke its promise: mend it before it is used
+    ├── LearnerError (AssertionError)        a learner of one's own making broke a promise: see `check_learner`
     ├── WeightsError                         a file of weights is damaged, another architecture's, or unreachable
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
     ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
@@ -103,6 +104,10 @@ class EmbeddingMismatchError(MismatchError):
 
 class EmbeddingError(ScrollTactileError):
     """An embedding gave features that are not finite, not within its bound, or not of its dimension."""
+
+
+class LearnerError(ScrollTactileError, AssertionError):
+    """A learner of a user's own making does not keep what is promised of all."""
 
 
 class WeightsError(ScrollTactileError):

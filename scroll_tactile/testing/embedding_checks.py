@@ -1,4 +1,4 @@
-"""Checks for the tests of those who write their own part: whether it keeps the promises that exactness rests on."""
+"""Whether an embedding keeps its promises."""
 
 from __future__ import annotations
 

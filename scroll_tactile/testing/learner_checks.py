@@ -1,0 +1,223 @@
+"""Whether a learner keeps its promises, with its own sensor, embedding and settings."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.datasets.gel import Gel
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import EmptyStreamError, LearnerError, NotFiniteError, StreamError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.results import Prediction
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["check_learner"]
+
+Labelled = tuple[str, npt.NDArray[np.float32]]
+Make = Callable[[Path], TactileLearner]
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What every check works with: how to make a learner, folders to make them in, and touches of three materials."""
+
+    make: Make
+    root: Path
+    touches: list[Labelled]
+
+    def learner(self, name: str, touches: Iterable[Labelled] = ()) -> TactileLearner:
+        """A learner in a folder of this name that observed these touches, in this order."""
+        learner = self.make(self.root / name)
+        for material, readings in touches:
+            learner.observe(material, readings.copy())
+        return learner
+
+    def require_same(self, name: str, ours: TactileLearner, theirs: TactileLearner) -> None:
+        """Raise LearnerError where two learners differ in digest, materials, exemplars or answers."""
+        for what, of in (
+            ("digest", lambda learner: learner.digest()),
+            ("materials", lambda learner: learner.materials),
+            ("exemplars", lambda learner: learner.exemplars),
+            ("answers", lambda learner: [repr(learner.predict(readings)) for _, readings in self.touches[:3]]),
+        ):
+            if (here := of(ours)) != (there := of(theirs)):
+                raise LearnerError(f"{name}: expected the same {what}; came {here!r:.200} and {there!r:.200}")
+
+
+def check_learner(make_learner: Make, *, touches: Sequence[tuple[str, npt.ArrayLike]] | None = None) -> list[str]:
+    """Try a learner of a user's own making on everything that is promised of it; what was found to hold, in words.
+
+    make_learner: opens the memory in the folder that it is given, or makes it where there is nothing, always with the
+    same sensor, embedding and settings. touches: (material, readings of shape (T, n)) of two materials or more, three
+    touches each; simulated ones unless given.
+
+    Raises LearnerError that names the first promise that does not hold, or what the learner raised.
+
+    >>> from scroll_tactile import Kernels, TactileLearner, sensors
+    >>> def make(path):
+    ...     return TactileLearner.open(path, sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64))
+    >>> check_learner(make)[0]
+    'any order gives the same memory'
+    """
+    promises = [
+        _any_order,
+        _any_split,
+        _merging_is_union,
+        _retracting_undoes,
+        _predicting_changes_nothing,
+        _opening_gives_back,
+        _a_snapshot_knows_the_same,
+        _nothing_is_known_at_first,
+        _one_material_is_named,
+        _a_new_material_needs_no_announcement,
+        _what_cannot_be_read_is_refused,
+        _read_only_arrays_are_read,
+    ]
+    held = []
+    with tempfile.TemporaryDirectory(prefix="check-learner-") as folder:
+        with make_learner(Path(folder) / "first") as learner:
+            given = _simulated(learner.sensor) if touches is None else _as_given(learner.sensor, touches)
+        for number, promise in enumerate(promises):
+            promise(_Bench(make_learner, Path(folder) / str(number), given))
+            assert promise.__doc__ is not None
+            held.append(promise.__doc__.rstrip("."))
+    return held
+
+
+def _any_order(bench: _Bench) -> None:
+    """any order gives the same memory."""
+    with bench.learner("a", bench.touches) as ours, bench.learner("b", bench.touches[::-1]) as theirs:
+        bench.require_same("order", ours, theirs)
+
+
+def _any_split(bench: _Bench) -> None:
+    """touches observed one by one, or in a batch, give the same memory."""
+    with bench.learner("a", bench.touches) as ours, bench.learner("b") as theirs:
+        with theirs.batch():
+            for material, readings in bench.touches:
+                theirs.observe(material, readings)
+        bench.require_same("batch", ours, theirs)
+
+
+def _merging_is_union(bench: _Bench) -> None:
+    """two merged memories are the one that observed everything."""
+    half = len(bench.touches) // 2
+    with bench.learner("a", bench.touches[:half]) as ours, bench.learner("whole", bench.touches) as whole:
+        bench.learner("b", bench.touches[half:]).close()
+        ours.merge(bench.root / "b", shared="twice")
+        bench.require_same("merge", ours, whole)
+
+
+def _retracting_undoes(bench: _Bench) -> None:
+    """a retracted observation leaves the memory as if it had never been."""
+    *others, (material, readings) = bench.touches
+    with bench.learner("a", others) as ours, bench.learner("b", others[:1]) as theirs:
+        receipt = theirs.observe(material, readings)
+        for name, touch in others[1:]:
+            theirs.observe(name, touch)
+        theirs.retract(receipt)
+        bench.require_same("retract", theirs, ours)
+
+
+def _predicting_changes_nothing(bench: _Bench) -> None:
+    """a prediction changes nothing, and repeats itself."""
+    with bench.learner("a", bench.touches) as learner:
+        digest, first = learner.digest(), learner.predict(bench.touches[0][1])
+        for _, readings in bench.touches:
+            learner.predict(readings)
+        again = learner.predict(bench.touches[0][1])
+        if (learner.digest(), repr(again)) != (digest, repr(first)):
+            raise LearnerError(f"predict: the memory or its answer changed: {first!r:.200}, then {again!r:.200}")
+
+
+def _opening_gives_back(bench: _Bench) -> None:
+    """a memory that was closed opens as it was."""
+    bench.learner("a", bench.touches).close()
+    with bench.learner("a") as again, bench.learner("b", bench.touches) as whole:
+        bench.require_same("open", again, whole)
+
+
+def _a_snapshot_knows_the_same(bench: _Bench) -> None:
+    """a deep copy is a snapshot that knows the same."""
+    with bench.learner("a", bench.touches) as learner:
+        bench.require_same("deepcopy", copy.deepcopy(learner), learner)
+
+
+def _nothing_is_known_at_first(bench: _Bench) -> None:
+    """before anything is observed the answer is unknown."""
+    with bench.learner("a") as learner:
+        _require("an empty memory", learner.predict(bench.touches[0][1]), None, known=False)
+
+
+def _one_material_is_named(bench: _Bench) -> None:
+    """with one material observed that one is the answer."""
+    with bench.learner("a", bench.touches[:1]) as learner:
+        _require("one material", learner.predict(bench.touches[0][1]), bench.touches[0][0])
+
+
+def _a_new_material_needs_no_announcement(bench: _Bench) -> None:
+    """a new material is a candidate from its first touch on."""
+    new, readings = bench.touches[-1]
+    with bench.learner("a", [touch for touch in bench.touches if touch[0] != new]) as learner:
+        learner.predict(readings)
+        learner.observe(new, readings)
+        ranked = [name for name, _ in learner.predict(readings).ranking]
+        if new not in ranked:
+            raise LearnerError(f"a new material: {new!r} was observed and is no candidate among {ranked}")
+
+
+def _what_cannot_be_read_is_refused(bench: _Bench) -> None:
+    """NaN and empty streams are refused, and leave the memory as it was."""
+    readings = bench.touches[0][1].astype(np.float64)
+    readings.reshape(-1)[-1] = np.nan
+    with bench.learner("a", bench.touches[:3]) as learner:
+        digest = learner.digest()
+        for wrong, error in ((readings, NotFiniteError), (readings[:0], EmptyStreamError)):
+            try:
+                learner.observe("wrong", wrong)
+            except error:
+                pass
+            except StreamError as other:
+                raise LearnerError(f"expected {error.__name__}; came {type(other).__name__}: {other}") from other
+            else:
+                raise LearnerError(f"expected {error.__name__}; the stream was observed")
+        if learner.digest() != digest:
+            raise LearnerError("a refused stream changed the memory")
+
+
+def _read_only_arrays_are_read(bench: _Bench) -> None:
+    """arrays that are read-only are read, and none is written into."""
+    readings = bench.touches[0][1].copy()
+    before = readings.tobytes()
+    readings.flags.writeable = False
+    with bench.learner("a") as learner:
+        learner.observe("a", readings)
+        learner.predict(readings)
+    if readings.tobytes() != before:
+        raise LearnerError("an array that was observed was written into")
+
+
+def _require(what: str, answer: Prediction, material: str | None, *, known: bool | None = None) -> None:
+    if answer.material != material or (known is not None and answer.known != known):
+        raise LearnerError(f"{what}: expected material {material!r}; came {answer!r:.200}")
+
+
+def _simulated(sensor: Sensor) -> list[Labelled]:
+    """Three touches of each of three materials, in turns."""
+    scene = Gel(sensor) if sensor.camera else Scene(sensor)
+    names = scene.materials[:3]
+    return [(name, scene.touch(name, repetition).readings) for repetition in range(3) for name in names]
+
+
+def _as_given(sensor: Sensor, touches: Sequence[tuple[str, npt.ArrayLike]]) -> list[Labelled]:
+    counts = {material: sum(name == material for name, _ in touches) for material, _ in touches}
+    if len(counts) < 2 or min(counts.values()) < 3:
+        raise LearnerError(f"expected three touches or more of two materials or more of {sensor.name}; came {counts}")
+    return [(material, np.asarray(readings, dtype=np.float32)) for material, readings in touches]

@@ -1,0 +1,70 @@
+"""A user certifies their own learner: what keeps every promise, and what breaks one, which is then named."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Augmented, Kernels, Robust, Sensor, TactileLearner
+from scroll_tactile.datasets.gel import SMALL as CAMERA
+from scroll_tactile.errors import LearnerError
+from scroll_tactile.testing import check_learner
+
+PAD = Sensor(name="pad", channels=3, rate=50.0, low=(0.0, -1.0, 0.0), high=(1.0, 1.0, 9.0), unit="N", duration=1.0)
+SMALL = Kernels(dimension=64)
+WAYS = {
+    "usual": {"sensor": PAD, "embedding": SMALL},
+    "ridge": {"sensor": PAD, "embedding": SMALL, "readout": "ridge"},
+    "followed": {"sensor": PAD, "embedding": SMALL, "refit": 1.0},
+    "no exemplars": {"sensor": PAD, "embedding": SMALL, "exemplars": 0},
+    "copies": {"sensor": PAD, "embedding": SMALL, "augmentation": Augmented(copies=2)},
+    "robust": {"sensor": PAD, "embedding": Robust(SMALL), "augmentation": Augmented(copies=0, noisy=2)},
+    "camera": {"sensor": CAMERA},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_learner_keeps_its_promises(way):
+    held = check_learner(lambda path: TactileLearner.open(path, **WAYS[way]))
+    assert len(held) == 12
+
+
+class Forgetful(TactileLearner):
+    def retract(self, receipt):
+        """Do nothing."""
+
+
+class Hasty(TactileLearner):
+    def predict(self, stream, **asked):
+        self.observe("seen", stream)
+        return super().predict(stream, **asked)
+
+
+class Ordered(TactileLearner):
+    def observe(self, material, stream):
+        return super().observe(material, np.asarray(stream) * (0.5 if self.materials else 1.0))
+
+
+class Careless(TactileLearner):
+    def observe(self, material, stream):
+        return super().observe(material, np.nan_to_num(np.asarray(stream)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (Ordered, "order: expected the same digest"),
+        (Forgetful, "retract: expected the same digest"),
+        (Hasty, "predict: the memory or its answer changed"),
+        (Careless, "expected NotFiniteError; the stream was observed"),
+    ],
+)
+def test_one_that_breaks_a_promise_is_named(kind, said):
+    with pytest.raises(LearnerError, match=said):
+        check_learner(lambda path: kind.open(path, sensor=PAD, embedding=SMALL))
+
+
+def test_touches_may_be_given():
+    rng = np.random.default_rng(0)
+    touches = [("ab"[i % 2], rng.random((60, 3))) for i in range(6)]
+    assert check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=touches)
+    with pytest.raises(LearnerError, match="three touches or more"):
+        check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=touches[:3])

@@ -145,7 +145,7 @@ def capabilities_of(embedding: object) -> Capabilities:
     declared = getattr(embedding, "capabilities", Capabilities())
     if not isinstance(declared, Capabilities):
         raise EmbeddingError(
-            f"expected the capabilities of {type(embedding).__name__} as scroll_tactile.embeddings.Capabilities(...); "
+            f"expected the capabilities of {type(embedding).__name__} as scroll_tactile.Capabilities(...); "
             f"came {declared!r:.80}"
         )
     return declared

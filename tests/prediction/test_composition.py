@@ -9,6 +9,10 @@ import pytest
 from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
 from scroll_tactile.errors import DescriptionError, MaterialError, SensorMismatchError
 from scroll_tactile.memory.descriptions import checked, targets_of
+from scroll_tactile.prediction.composition import Composer
+from scroll_tactile.prediction.constituents import ConstituentHead, StageHeads
+from scroll_tactile.prediction.features import Encoded
+from scroll_tactile.readouts.attributes import Curve
 from scroll_tactile.signals.stream import validate
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
@@ -106,15 +110,29 @@ class TestCompose:
                 assert all(0 <= one.share <= 1 and 0 <= one.presence <= 1 for one in said.constituents)
 
 
+@pytest.mark.parametrize(("unknown", "shares"), [((), [0.25, 0.75]), (("silk",), [None, 0.75])])
+def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares):
+    """Of a touch felt through noise, which its probabilities alone compose."""
+    descriptions = {"a": {"wool": 1.0}, "b": {"wool": 0.5, "silk": 0.5}}
+    targets = targets_of({name: checked(name, description) for name, description in descriptions.items()})
+    head = ConstituentHead(np.arange(2), np.zeros(3), None)
+    heads = {name: "too few" if name in unknown else head for name in targets}
+    composer = Composer(None, targets, [StageHeads(Curve(1.0, 0.0), 1.0, heads, heads)])
+    touch_through_noise = Encoded(np.zeros((4, 50), np.float32), {}, noisy=True, seconds=1.0)
+    found, unfamiliar = composer.compose(["silk", "wool"], {"a": 0.5, "b": 0.5}, touch_through_noise, 0.1)
+    assert [constituent.share for constituent in found] == shares
+    assert unfamiliar == 0.1
+
+
 class TestSharpness:
     """Where a touch is one row of the statistics, each can be taken out of the readouts that answer."""
 
     # Its touches are shorter than a wide window, and read as one.
     SLOW = SKIN.model_copy(update={"duration": 1.4})
 
-    def taught(self, names):
+    def taught(self, names, touches=6):
         taught = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
-        for at in range(6):
+        for at in range(touches):
             for number, name in enumerate(names):
                 taught.observe(name, self.shape(number, at))
         return taught
@@ -136,6 +154,22 @@ class TestSharpness:
         chances = {name: chance**sharpness for name, chance in said.prediction.ranking}
         assert said["hard"].presence == pytest.approx((chances["b"] + chances["d"]) / sum(chances.values()))
         assert said["hard"].evidence[0][1] == pytest.approx(max(chances.values()) / sum(chances.values()))
+
+    def test_fewer_than_eight_touches_or_one_material_leave_them_as_they_are(self):
+        for names, touches, sharp in (("ab", 3, False), ("a", 9, False), ("abc", 3, True)):
+            taught = self.taught(names, touches)
+            for name in names:
+                taught.describe(name, {"hard": name == "b"})
+            composer = taught._current.composer(taught._ledger, taught.model())
+            assert (composer.stages[-1].sharpness != 1) == sharp
+
+    def test_the_only_touch_of_a_material_is_not_taken_out(self):
+        taught = self.taught("abc")
+        taught.observe("d", self.shape(3, 0))
+        for name in "abcd":
+            taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
+        composer = taught._current.composer(taught._ledger, taught.model())
+        assert np.isfinite(composer.stages[-1].sharpness)
 
     def test_it_is_the_same_whenever_it_was_described(self):
         before, after = self.taught([]), self.taught([])
@@ -270,6 +304,12 @@ class TestDescribing:
         assert [type(value) for value in taught.descriptions["felt"].values()] == [float, bool, float]
         taught.describe("felt", None)
         assert taught.descriptions == {}
+
+    def test_rounded_shares_pass_and_equal_descriptions_are_kept_equal(self):
+        assert checked("felt", {"wool": 1.0000005}) == {"wool": 1.0000005}
+        assert checked("felt", dict.fromkeys("abc", 0.333333)) == dict.fromkeys("abc", 0.333333)
+        # Minus zero would be another text on the disk.
+        assert repr(checked("felt", {"silk": -0.0, "wool": 1})) == repr(checked("felt", {"wool": 1.0, "silk": 0.0}))
 
     def test_targets_are_zero_where_shares_are_whole_and_missing_where_not(self):
         targets = targets_of(

@@ -15,13 +15,13 @@ from scroll_tactile.statistics.statistics import Statistics, fold_of
 DIMENSION, SCALES, STAGES = 8, (10, 40), [[10], [10, 40]]
 
 
-def scene(noises=(20_000, 20_000), materials=6, each=20, seed=0, unit=40_000):
+def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000):
     """A memory of touches with one window a scale; noises: their spread at each scale."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(len(SCALES), materials, DIMENSION)) * unit
     statistics, pool = Statistics(DIMENSION, SCALES), TouchSample()
-    for at in range(materials * each):
-        material, key = at % materials, rng.bytes(32)
+    for i in range(touches):
+        material, key = i % materials, rng.bytes(32)
         codes = {
             scale: np.rint(means[place, material] + rng.normal(size=(1, DIMENSION)) * noises[place]).astype(np.int32)
             for place, scale in enumerate(SCALES)
@@ -137,7 +137,7 @@ def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
 
 
 def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
-    statistics, sample = scene(materials=2, each=2)
+    statistics, sample = scene(materials=2, touches=4)
     selection = select(statistics, 10, "lda")
     (stage,) = calibrate(sample, [[10]], {10: selection}, "lda")
     assert len(stage.novelties) == 0
@@ -157,9 +157,9 @@ def test_the_novelty_of_known_touches_is_standardised(kind):
 
 
 @pytest.mark.parametrize("materials", [1, 2, 3])
-@pytest.mark.parametrize("each", [1, 2, 3, 4, 5])
-def test_novelty_is_measured_by_eight_touches_or_more_whose_material_the_other_folds_know(materials, each):
-    statistics, sample = scene(materials=materials, each=each, seed=each)
+@pytest.mark.parametrize("touches", [1, 2, 4, 6, 7, 8, 9, 15])
+def test_novelty_is_measured_by_eight_touches_or_more_whose_material_the_other_folds_know(materials, touches):
+    statistics, sample = scene(materials=materials, touches=touches)
     folds = [(material, fold_of(key)) for material, key, _ in sample]
     held_out = 0
     for material, fold in folds:
@@ -200,7 +200,7 @@ def test_a_touch_counts_only_where_every_scale_was_fitted_without_its_fold():
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_small_and_dull_memories_calibrate_without_a_warning(kind):
-    for settings in ({"materials": 1, "each": 1}, {"materials": 2, "each": 1}, {"noises": (0, 0), "unit": 0}):
+    for settings in ({"materials": 1, "touches": 1}, {"materials": 2, "touches": 2}, {"noises": (0, 0), "unit": 0}):
         for stage in calibrated(kind, **settings):
             assert np.isfinite(stage.weights).all()
             assert np.isfinite(stage.threshold(0.05))

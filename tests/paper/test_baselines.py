@@ -2,27 +2,23 @@
 
 import numpy as np
 import pytest
+from paper_touches import PATCH
 
 from examples.paper.studies.baselines import BASELINES, COPIES, Sometimes, baseline
 from examples.paper.systems.catalogue import Catalogue
 from examples.paper.systems.descent import Course
 from examples.paper.systems.svm import Svm
+from examples.paper.systems.system_protocol import silent
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.robustness import noise
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Augmentation
 
-PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 SCENE = Scene(PATCH, seed=0)
 NAMES = SCENE.materials[:3]
-LESSONS = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12)]
-EXAM = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12, 18)]
-
-
-def quiet(what: str, done: int, of: int) -> None:
-    """Nobody listens."""
+TRAIN = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12)]
+TEST = [(name, SCENE.touch(name, i)) for name in NAMES for i in range(12, 18)]
 
 
 def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatch):
@@ -37,9 +33,9 @@ def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatc
     monkeypatch.setattr(Svm, "fit", watched)
     make, settings = baseline("svm", Catalogue(), seed=1)
     for augmented in (False, True):
-        make(LESSONS, augmented, quiet)
+        make(TRAIN, augmented, silent)
     assert settings["augmentation"]["copies"] == COPIES
-    felt = {stream.key for _, stream in LESSONS}
+    felt = {stream.key for _, stream in TRAIN}
     for streams, validation in zip(trained, held, strict=True):
         assert {stream.key for stream in validation} <= felt
         assert len(validation) == 3
@@ -53,12 +49,12 @@ def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
     catalogue = Catalogue(course=Course(epochs=30, batch=8))
     make, settings = baseline("conv-lstm", catalogue, augmentation=Augmentation(0, (1, 1), 1, noise=0.3, drift=0))
     assert settings["epochs"] == 30
-    asked = [noise(stream, 0.4, 0) for _, stream in EXAM]
-    plain, tough = (make(LESSONS, augmented, quiet) for augmented in (False, True))
-    shares = [accuracy([name for name, _ in EXAM], list(system.predict(asked))) for system in (plain, tough)]
+    asked = [noise(stream, 0.4, 0) for _, stream in TEST]
+    plain, tough = (make(TRAIN, augmented, silent) for augmented in (False, True))
+    shares = [accuracy([name for name, _ in TEST], list(system.predict(asked))) for system in (plain, tough)]
     assert shares[1] > shares[0]
-    clean = [stream for _, stream in EXAM]
-    assert list(make(LESSONS, True, quiet).predict(clean)) == list(tough.predict(clean))
+    clean = [stream for _, stream in TEST]
+    assert list(make(TRAIN, True, silent).predict(clean)) == list(tough.predict(clean))
 
 
 def test_some_touches_stay_as_they_were_felt():
@@ -76,7 +72,7 @@ def test_the_validation_is_drawn_by_the_seed_alone():
     first, second = (baseline("svm", Catalogue(), seed=seed)[1] for seed in (0, 1))
     assert first["seed"] != second["seed"]
     before = np.random.get_state()[1].copy()  # noqa: NPY002 (it is looked at only)
-    baseline("svm-spikes", Catalogue())[0](LESSONS, True, quiet)
+    baseline("svm-spikes", Catalogue())[0](TRAIN, True, silent)
     assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
 
 

@@ -16,7 +16,6 @@ from examples.paper.systems.constituent_nets import presence_loss
 from examples.paper.systems.constituent_squares import Heads, Shares
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import BIOTAC
 
@@ -36,13 +35,6 @@ def biotac():
     number = np.tile(np.arange(6), 2)
     streams = [scene.touch(name, i, seconds=1) for name, i in zip(names, number.tolist(), strict=True)]
     return Recordings("BioTac-20", BIOTAC, streams, names, number, number % 3, ordered=True)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "random.pth"
-    torch.save(ResNet.random(3).state_dict(), path)
-    return str(path)
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import refused, run
+from paper_touches import recorded, untimed
 
 from examples.paper.commands.continual_command import parse_sizes
 from examples.paper.studies.continual_study import Continual
 from examples.paper.studies.schedules import part_ends
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.continual import accuracy_of, curve, forgetting, forgetting_of, summary, tally
 
@@ -24,29 +24,12 @@ SMALL: dict[str, Any] = {"sizes": (0, 8, "all"), "epochs": 1}
 @pytest.fixture(scope="module")
 def recordings() -> Recordings:
     """Four materials under a simulated RoboSkin, eight touches each, in two folds."""
-    scene = Scene(sensors.ROBOSKIN)
-    names = scene.materials[:4]
-    return Recordings(
-        name="simulated",
-        sensor=scene.sensor,
-        streams=[scene.touch(name, i) for name in names for i in range(8)],
-        materials=[name for name in names for _ in range(8)],
-        repetition=np.tile(np.arange(8), 4),
-        fold=np.tile(np.arange(8) % 2, 4),
-        ordered=False,
-    )
+    return recorded(sensors.ROBOSKIN, materials=4, each=8, folds=2, name="simulated")
 
 
 @pytest.fixture(scope="module")
 def whole(recordings: Recordings) -> list[dict[str, Any]]:
     return list(Continual(recordings, Kernels(dimension=64), **SMALL).run([0, 1]))
-
-
-def figures(folds: Any) -> Any:
-    """Without the times, as JSON has them."""
-    if isinstance(folds, dict):
-        return {name: figures(value) for name, value in folds.items() if not name.endswith("seconds")}
-    return [figures(value) for value in folds] if isinstance(folds, (list, tuple)) else folds
 
 
 class TestForgetting:
@@ -141,10 +124,10 @@ class TestContinual:
             with pytest.raises(KeyboardInterrupt):
                 list(task.run([0, 1], interrupt))
         resumed = list(task.run([0, 1], lambda what, done, of: reported.append(what)))
-        assert figures(resumed) == figures(whole)
+        assert untimed(resumed) == untimed(whole)
         assert reported.count("offline: learning") == 2 * 16  # once in each fold
         reported.clear()
-        assert figures(list(task.run([0, 1], lambda what, done, of: reported.append(what)))) == figures(whole)
+        assert untimed(list(task.run([0, 1], lambda what, done, of: reported.append(what)))) == untimed(whole)
         assert reported == []
         with pytest.raises(InputError, match="seed 0 there, 1 here"):
             list(Continual(recordings, Kernels(dimension=64), seed=1, **SMALL, folder=tmp_path / "kept").run([0]))

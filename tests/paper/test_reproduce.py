@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import refused, run
+from paper_touches import PATCH, recorded, untimed
 
 from examples.paper.commands.options import SETS
 from examples.paper.runs.cells import Cell, pooled, split, time_left
@@ -19,40 +20,15 @@ from examples.paper.studies.efficiency import Efficiency, curves, first_touches
 from examples.paper.studies.table1 import PAPER, Table1, blocked, rows
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets import Recordings, physiclear
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import DatasetError, InputError, WeightsError
-from scroll_tactile.sensors import Sensor
 
-PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 FEW: dict[str, Any] = {"systems": ("svm-spikes", "conv-lstm", "svm"), "epochs": 2}
-
-
-def recorded(name: str = "RoboSkin-20", seed: int = 0, ordered: bool = False) -> Recordings:
-    """Three materials under a small sensor, twelve touches each, in three folds."""
-    scene = Scene(PATCH, seed=seed)
-    names = scene.materials[:3]
-    return Recordings(
-        name=name,
-        sensor=scene.sensor,
-        streams=[scene.touch(material, i) for material in names for i in range(12)],
-        materials=[material for material in names for _ in range(12)],
-        repetition=np.tile(np.arange(12), 3),
-        fold=np.tile(np.arange(12) % 3, 3),
-        ordered=ordered,
-    )
 
 
 @pytest.fixture(scope="module")
 def recordings() -> Recordings:
     return recorded()
-
-
-def figures(value: Any) -> Any:
-    """Without the times."""
-    if isinstance(value, dict):
-        return {key: figures(item) for key, item in value.items() if not key.endswith("seconds")}
-    return [figures(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 class TestSplit:
@@ -146,9 +122,7 @@ class TestTable1:
         kept = [key for key in begun if "fold" in key]
         assert kept and not any(cell in key for key in kept)
         again = list(Table1([recordings], **FEW, folder=tmp_path / "run").run({"RoboSkin-20": [0, 1]}))
-        assert figures(json.loads(json.dumps([f for _, f in again]))) == figures(
-            json.loads(json.dumps([f for _, f in whole]))
-        )
+        assert untimed([figures for _, figures in again]) == untimed([figures for _, figures in whole])
         done = {key: begun[key]["seconds"] for key in kept}
         assert {cell.key: f["seconds"] for cell, f in again if cell.key in done} == done  # not done again
 
@@ -236,8 +210,8 @@ class TestEfficiency:
 @pytest.fixture
 def patched(monkeypatch: pytest.MonkeyPatch) -> None:
     sets: dict[str, Callable[[Path, int], Recordings]] = {
-        "biotac-20": lambda data, seed: recorded("BioTac-20", ordered=True),
-        "biotac-20-blocked": lambda data, seed: blocked(recorded("BioTac-20", ordered=True)),
+        "biotac-20": lambda data, seed: recorded(name="BioTac-20", ordered=True),
+        "biotac-20-blocked": lambda data, seed: blocked(recorded(name="BioTac-20", ordered=True)),
         "roboskin-20": lambda data, seed: recorded(),
     }
     for name, reader in sets.items():

@@ -46,22 +46,15 @@ def touches(first: int, after: int, **kind: Any) -> list[Labelled]:
     return [(name, felt(name, i, **kind)) for name in NAMES for i in range(first, after)]
 
 
-TAUGHT, HELD, EXAM = touches(0, 8), touches(8, 9), touches(10, 13)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("weights") / "random.pth"
-    torch.save(ResNet.random(3).state_dict(), path)
-    return str(path)
+TRAIN, HELD, TEST = touches(0, 8), touches(8, 9), touches(10, 13)
 
 
 def fit(system: System, seed: int = 0, **more: Any) -> System:
-    system.fit([stream for _, stream in TAUGHT], [name for name, _ in TAUGHT], HELD, seed, **more)
+    system.fit([stream for _, stream in TRAIN], [name for name, _ in TRAIN], HELD, seed, **more)
     return system
 
 
-def share(system: System, test: list[Labelled] = EXAM) -> float:
+def share(system: System, test: list[Labelled] = TEST) -> float:
     predicted = system.predict([stream for _, stream in test])
     return float(np.mean([name == answer for (name, _), answer in zip(test, predicted, strict=True)]))
 
@@ -107,7 +100,7 @@ class TestInputs:
         assert np.allclose(image[0], 0) and np.allclose(image[1:], -1)
 
     def test_a_stream_is_its_tactile_image(self):
-        assert np.array_equal(picture(EXAM[0][1]), tactile_image(EXAM[0][1]))
+        assert np.array_equal(picture(TEST[0][1]), tactile_image(TEST[0][1]))
 
     def test_columns_are_averaged(self):
         image = np.arange(14, dtype=np.float32).reshape(2, 7)
@@ -152,19 +145,19 @@ def test_each_system_learns_what_can_be_told_apart(key: str, catalogue: Catalogu
 @pytest.mark.parametrize("key", SYSTEMS)
 def test_nothing_is_answered_before_a_fit(key: str, new: Catalogue):
     with pytest.raises(InputError, match="fit first"):
-        new.make(key).predict([EXAM[0][1]])
+        new.make(key).predict([TEST[0][1]])
 
 
 @pytest.mark.parametrize("key", ["svm", "conv-lstm", "least-squares-random", "kernels-lda"])
 def test_touches_that_cannot_be_learned_are_refused(key: str):
     system = Catalogue(course=QUICK).make(key)
-    streams = [stream for _, stream in TAUGHT]
+    streams = [stream for _, stream in TRAIN]
     with pytest.raises(InputError, match="as many streams"):
         system.fit(streams, ["a"], [], 0)
     with pytest.raises(InputError, match="two materials"):
         system.fit(streams, ["a"] * len(streams), [], 0)
     with pytest.raises(InputError, match="'stone'"):
-        system.fit(streams, [name for name, _ in TAUGHT], [("stone", streams[0])], 0)
+        system.fit(streams, [name for name, _ in TRAIN], [("stone", streams[0])], 0)
 
 
 class TestCatalogue:
@@ -265,7 +258,7 @@ class TestTraining:
         widths: list[int] = []
         for system in (plain, tough):
             system.network.register_forward_hook(lambda module, inputs, output: widths.append(inputs[0].shape[-1]))
-            whole = TAUGHT[0][1]
+            whole = TRAIN[0][1]
             system.predict([whole, whole.first(whole.seconds / 2)])
         assert widths[0] == 2 * widths[1] == widths[2]
         assert len(widths) == 3  # of one width, and asked together
@@ -295,7 +288,7 @@ class TestTraining:
         system = TrainedNetwork(
             "net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=2, batch=8)
         )
-        system.fit([stream for _, stream in TAUGHT], [name for name, _ in TAUGHT], [], 0)
+        system.fit([stream for _, stream in TRAIN], [name for name, _ in TRAIN], [], 0)
         assert [epoch.validation_loss for epoch in system.epochs] == [None, None]
 
     def test_a_loss_that_is_not_finite_stops_it(self):

@@ -2,9 +2,12 @@
 
 import json
 import re
+import shlex
 
 import pytest
+import typer
 
+from examples.paper.__main__ import app as paper
 from examples.tables import ROOMS, TEXTS, filled, made, main, read_tables
 from scroll_tactile.errors import InputError
 
@@ -95,6 +98,17 @@ def test_every_result_says_what_made_it_and_names_no_machine(path):
     assert {"command", "seed", "versions", "date"} <= made_by.keys()
     assert made_by["command"].startswith(("python -m examples.", "python tests/faults/"))
     assert not re.search(r"/(root|work|tmp|home)/", text)
+
+
+@pytest.mark.parametrize("path", sorted(ROOMS[0].glob("results/*.json")), ids=lambda path: path.stem)
+def test_the_noted_commands_can_be_given(path):
+    for command in json.loads(path.read_text())["command"].split(" && "):
+        python, m, program, *words = shlex.split(command)
+        assert (python, m, program) == ("python", "-m", "examples.paper")
+        parsed = typer.main.get_command(paper)
+        while words and hasattr(parsed, "commands"):
+            parsed = parsed.commands[words.pop(0)]
+        parsed.make_context("it", words)  # raises for an option that there is not
 
 
 def test_the_results_are_small():

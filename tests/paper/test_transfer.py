@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from commands import refused, run
 
 from examples.paper.systems.system_protocol import silent
@@ -27,7 +26,6 @@ from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, s
 from scroll_tactile import Kernels, Vision
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.physiclear import HALF_SIZE
-from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
@@ -56,13 +54,6 @@ def recorded(sensor, each=10, shift=0.0, name=None):
     numbers = np.tile(np.arange(each), len(CYCLES))
     streams = [felt(sensor, material, i, shift) for material, i in zip(names, numbers.tolist(), strict=True)]
     return Recordings(name or sensor.name, sensor, streams, names, numbers, numbers % 5, ordered=True)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "random.pth"
-    torch.save(ResNet.random(3).state_dict(), path)
-    return str(path)
 
 
 class TestFewTouches:

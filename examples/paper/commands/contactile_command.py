@@ -10,12 +10,12 @@ import typer
 from rich.table import Table
 
 from examples.paper.commands.options import Device, Json, Run, Seed, Where, machine
-from examples.paper.commands.sets import command_line, leave_out, named, origin, require_folders
+from examples.paper.commands.sets import command_line, leave_out, named, origin, require_folders, write_result
 from examples.paper.fabric import fabrics_set as published
 from examples.paper.fabric.contactile_rows import EPOCHAL, NEED_BIOTAC, NEED_WEIGHTS, PAPER_EPOCHS, ROWS
 from examples.paper.fabric.contactile_study import HAND, PARTS, Contactile, rows, simulated
 from examples.paper.fabric.fabrics_set import Fabrics
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import InputError
 
@@ -149,8 +149,7 @@ def _close(
     made |= {"simulated": made_up} | machine()
     made |= {"seconds": sum(figures["seconds"] for _, figures in results)}
     made |= {"not scored": [name for name in study.shares.names if name not in study.scored]}
-    write_json(json, made | {"rows": found, "cells": {cell.key: figures for cell, figures in results}})
-    say(f"figures: {json}")
+    write_result(json, made | {"rows": found, "cells": {cell.key: figures for cell, figures in results}})
 
 
 def _show(found: Sequence[Mapping[str, Any]], study: Contactile, made_up: bool) -> None:

@@ -12,12 +12,21 @@ from rich.markup import escape
 from rich.table import Table
 
 from examples.paper.commands.options import Data, Device, FewMaterials, Folds, Json, Plot, Run, Seed, Where
-from examples.paper.commands.sets import Dataset, command_line, draw_into, origin, parse_folds, read, require_folders
+from examples.paper.commands.sets import (
+    Dataset,
+    command_line,
+    draw_into,
+    origin,
+    parse_folds,
+    read,
+    require_folders,
+    write_result,
+)
 from examples.paper.plots import draw_continual
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
 from scroll_tactile import Embedding, Joined, Kernels, Vision
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.continual import summary
@@ -77,9 +86,9 @@ def continual(
     """
     require_folders(json, plot)
     chosen_sizes = parse_sizes(sizes)
-    # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 in 98.6; BioTac in 99.5 with both.
-    usual = 1260 if embedding is EmbeddingChoice.BOTH else 1008
-    frozen = _embedding(embedding, weights, features or usual)
+    # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 have 98.6; both have 99.5 of BioTac.
+    kernels = features or (1260 if embedding is EmbeddingChoice.BOTH else 1008)
+    frozen = _embedding(embedding, weights, kernels)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         recordings = read(dataset, data, seed)
@@ -106,14 +115,13 @@ def continual(
     _show(recordings, results, published)
     if json is not None:
         settings: dict[str, Any] = {"embedding": embedding.value, "weights": None if weights is None else Path(weights)}
-        settings |= {"features": None if embedding is EmbeddingChoice.VISION else features or usual}
+        settings |= {"features": None if embedding is EmbeddingChoice.VISION else kernels}
         settings |= {"schedule": schedule.value, "sizes": ",".join(map(str, chosen_sizes)), "folds": folds or "all"}
         settings |= {"seed": seed, "curve": curve, "device": device.value, "epochs": epochs}
         settings |= {"tuned_curve": tuned_curve, "no_peers": not peers, "run": None if run is None else "RUN"}
         command = command_line("continual", dataset.value, data="DATA", **settings)
         rows = summary(results)
-        write_json(json, origin(command, recordings) | task.plan | {"sizes": sizes, "means": rows, "folds": results})
-        say(f"figures: {json}")
+        write_result(json, origin(command, recordings) | task.plan | {"sizes": sizes, "means": rows, "folds": results})
     if plot is not None:
         _plot(plot, f"{recordings.name}, {frozen.name}, {schedule.value}", results, published)
 

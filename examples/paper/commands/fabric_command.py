@@ -11,12 +11,21 @@ from rich.table import Table
 
 from examples.paper.commands.contactile_command import contactile
 from examples.paper.commands.options import Data, Folds, Json, Run, Seed, Weights
-from examples.paper.commands.sets import Dataset, command_line, named, origin, parse_folds, read, require_folders
+from examples.paper.commands.sets import (
+    Dataset,
+    command_line,
+    named,
+    origin,
+    parse_folds,
+    read,
+    require_folders,
+    write_result,
+)
 from examples.paper.fabric import objects
 from examples.paper.fabric.attributes_study import Attributes
 from examples.paper.fabric.attributes_study import summary as summary_of_attributes
 from examples.paper.fabric.fabric_study import FIGURES, Letters, SlideTransfer, summary
-from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar
 from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.grades import read_grades
 from scroll_tactile.datasets.letter_spike import DOTS
@@ -66,8 +75,7 @@ def letters(
     if json is not None:
         settings: dict[str, Any] = {"folds": folds or "all", "groups": groups, "seed": seed, "cosines": cosines}
         command = command_line("fabric", "letters", data="DATA", **settings)
-        write_json(json, origin(command, recordings) | task.plan | {"means": summary(results), "parts": results})
-        say(f"figures: {json}")
+        write_result(json, origin(command, recordings) | task.plan | {"means": summary(results), "parts": results})
 
 
 @fabric.command()
@@ -91,8 +99,7 @@ def slide(
     console().print(table)
     if json is not None:
         command = command_line("fabric", "slide", data="DATA", seed=seed)
-        write_json(json, origin(command, slides.recordings) | task.plan | {"seed": seed, "parts": results})
-        say(f"figures: {json}")
+        write_result(json, origin(command, slides.recordings) | task.plan | {"seed": seed, "parts": results})
 
 
 @fabric.command()
@@ -127,8 +134,7 @@ def attributes(
     if json is not None:
         settings: dict[str, Any] = {"grades": grades, "sets": sets, "dimension": dimension, "seed": seed}
         command = command_line("fabric", "attributes", data="DATA", **settings)
-        write_json(json, origin(command) | {"seed": seed, "sets": found})
-        say(f"figures: {json}")
+        write_result(json, origin(command) | {"seed": seed, "sets": found})
 
 
 @fabric.command()
@@ -158,8 +164,7 @@ def gelsight(
         settings: dict[str, Any] = {"weights": None if weights is None else Path(weights), "folds": folds or "all"}
         settings |= {"groups": groups, "seed": seed, "trees": trees}
         command = command_line("fabric", "gelsight", data="DATA", **settings)
-        write_json(json, origin(command, recordings) | task.plan | {"means": means, "parts": results})
-        say(f"figures: {json}")
+        write_result(json, origin(command, recordings) | task.plan | {"means": means, "parts": results})
 
 
 def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:

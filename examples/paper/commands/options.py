@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from examples.paper.commands.sets import command_line, leave_out, named, origin, parse_folds
+from examples.paper.commands.sets import command_line, leave_out, named, origin, parse_folds, write_result
 from examples.paper.runs.cells import Cell, Figures
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import blocked
 from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
-from scroll_tactile.cli.terminal import say, write_json
+from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError
@@ -166,5 +166,4 @@ def close(
     about = machine() | study.plan | {"seconds": sum(figures["seconds"] for _, figures in results)}
     sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
     cells = {cell.key: figures for cell, figures in results}
-    write_json(json, origin(command) | about | {"sensors": sensors, **found, "cells": cells})
-    say(f"figures: {json}")
+    write_result(json, origin(command) | about | {"sensors": sensors, **found, "cells": cells})

@@ -12,9 +12,18 @@ from rich.table import Table
 
 from examples.paper import drawing as plots
 from examples.paper.commands.options import Data, FewMaterials, Folds, Json, Plot, Run, Seed
-from examples.paper.commands.sets import Dataset, command_line, draw_into, origin, parse_folds, read, require_folders
+from examples.paper.commands.sets import (
+    Dataset,
+    command_line,
+    draw_into,
+    origin,
+    parse_folds,
+    read,
+    require_folders,
+    write_result,
+)
 from examples.paper.studies.replay import FIGURES, PUBLISHED, Replay, subset, summary
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.pipelines.metrics import confusion_counts
 
@@ -93,8 +102,7 @@ def replay(
         }
         settings |= {"blocked": blocked, "novelty": novelty, "run": None if run is None else "RUN"}
         command = command_line("replay", dataset.value, data="DATA", **settings)
-        write_json(json, origin(command, recordings) | task.plan | {"means": summary(results), "folds": results})
-        say(f"figures: {json}")
+        write_result(json, origin(command, recordings) | task.plan | {"means": summary(results), "folds": results})
     if plot is not None:
         _plot(plot, recordings, results)
 

@@ -38,6 +38,7 @@ from examples.paper.commands.sets import (
     parse_folds,
     read,
     require_folders,
+    write_result,
 )
 from examples.paper.plots import draw_robustness
 from examples.paper.runs.study import columns_averaged, weights_digest
@@ -47,7 +48,7 @@ from examples.paper.studies.robustness_study import NAMES, PAPER, SESSION, Make,
 from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, Catalogue
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
@@ -118,11 +119,10 @@ def robustness(
             every = columns_averaged(recordings.sensor) if quick else 1
             makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
             folder = None if run is None else run / recordings.name
-            task = Robustness(
-                recordings, makes, settings, _studies(study, recordings), seed=seed, quick=quick, folder=folder
-            )
-            chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
+            studies = _studies(study, recordings)
+            task = Robustness(recordings, makes, settings, studies, seed=seed, quick=quick, folder=folder)
             about = {"dataset": recordings.name}
+            chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
             found = [about | record for fold in task.run(chosen, progress) for record in fold]
             sensor = recordings.sensor.model_dump(mode="json")
             kept[recordings.name] = {**task.plan, "settings": settings, "sensor": sensor}
@@ -130,19 +130,17 @@ def robustness(
             means += [about | row for row in summary(found)]
     for name in kept:
         _show(name, [row for row in means if row["dataset"] == name])
-    trained = any(key in EPOCHAL for key in keys)
-    if trained:
+    networks: dict[str, Any] = {}
+    if any(key in EPOCHAL for key in keys):
+        networks = {"epochs": passes, "device": device.value, "precision": precision.value}
         say(f"networks: {passes} epochs, on {device.value}, ResNets in {precision.value}")
     if quick:
         say("[yellow]quick:[/] one fold, few strengths; the ResNets' images averaged to about 50 columns")
     if json is not None:
         options: dict[str, Any] = {"data": "DATA", "sets": sets, "systems": ",".join(keys), "folds": folds or "all"}
         options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
-        if trained:
-            options |= {"epochs": passes, "device": device.value, "precision": precision.value}
-        measured = {"seed": seed, "quick": quick, "sets": kept, "means": means, "records": records}
-        write_json(json, origin(command_line("robustness", study.value, **options)) | measured)
-        say(f"figures: {json}")
+        made = origin(command_line("robustness", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
+        write_result(json, made | {"sets": kept, "means": means, "records": records})
     _draw(plot, list(kept), means)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import platform
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.metadata import version
@@ -28,6 +30,7 @@ __all__ = [
     "parse_folds",
     "read",
     "require_folders",
+    "write_result",
 ]
 
 
@@ -123,3 +126,38 @@ def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]
         "machine": f"{platform.machine()} {platform.system()}",
     }
     return made if recordings is None else made | {"sensor": recordings.sensor.model_dump(mode="json")}
+
+
+def write_result(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result as JSON, whole or not at all: short values on one line, numbers to eight digits, NaN as null.
+
+    Raises InputError where the file cannot be written.
+    """
+    draft = path.with_name(path.name + ".new")
+    try:
+        draft.write_text(_laid_out(_rounded(result)) + "\n", encoding="utf-8")
+        draft.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    say(f"figures: {path}")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.8g}") if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _rounded(part) for key, part in value.items()}
+    return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def _laid_out(value: Any, indent: str = "") -> str:
+    line = json.dumps(value, ensure_ascii=False)
+    if len(indent) + len(line) <= 120 or not isinstance(value, dict | list):
+        return line
+    inner = indent + " "
+    if isinstance(value, dict):
+        rows = [f"{json.dumps(key, ensure_ascii=False)}: {_laid_out(part, inner)}" for key, part in value.items()]
+    else:
+        rows = [_laid_out(part, inner) for part in value]
+    begin, end = "{}" if isinstance(value, dict) else "[]"
+    return begin + "\n" + ",\n".join(inner + row for row in rows) + "\n" + indent + end

@@ -23,14 +23,22 @@ from examples.paper.commands.options import (
     Where,
     machine,
 )
-from examples.paper.commands.sets import command_line, draw_into, named, origin, parse_folds, require_folders
+from examples.paper.commands.sets import (
+    command_line,
+    draw_into,
+    named,
+    origin,
+    parse_folds,
+    require_folders,
+    write_result,
+)
 from examples.paper.plots import draw_transfer
 from examples.paper.runs.cells import Cell, Figures
 from examples.paper.transfer.across_sensors import WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
 from examples.paper.transfer.few_touches import COUNTS
 from examples.paper.transfer.tasks import TRAINING, TaskTransfer, rows, some_frames
-from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
 from scroll_tactile.datasets import Recordings, fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError, InputError
@@ -223,5 +231,4 @@ def _write(
     command = command_line("transfer", part, data="DATA", folds=folds, **options, seed=study.seed, run=run)
     sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
     cells = {cell.key: figures for cell, figures in results}
-    write_json(path, origin(command) | machine() | study.plan | {"sensors": sensors, **measured, "cells": cells})
-    say(f"figures: {path}")
+    write_result(path, origin(command) | machine() | study.plan | {"sensors": sensors, **measured, "cells": cells})

@@ -116,7 +116,7 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)
     left = np.linalg.solve(system[np.ix_(others, others)], np.append(np.delete(targets, 3, axis=0), [[0, 0]], axis=0))
     assert targets[3] - system[3, others] @ left == pytest.approx(by_formula)
-    with pytest.raises(InputError, match="felt was 1"):
+    with pytest.raises(InputError, match="observed was 1"):
         fit_heads(statistics, 1, {"m00": known["m00"]}, ["bright"])
 
 

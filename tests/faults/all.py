@@ -1,4 +1,4 @@
-"""All of this folder's commands, one after another: `python tests/faults/all.py --json examples/benchmarks/results/faults.json`.
+"""Runs every fault study in turn, and writes its record; see the list below."""
 
 One that fails does not keep the others from running. The record has that of each; the exit code is 1 where one failed.
 """

@@ -1,4 +1,4 @@
-"""Runs every fault study in turn, and writes its record; see the list below."""
+"""Every fault study in turn; each writes its record, and the folder holds all of them in the end.
 
 One that fails does not keep the others from running. The record has that of each; the exit code is 1 where one failed.
 """

@@ -104,13 +104,15 @@ def targets_of(descriptions: Mapping[str, Description]) -> dict[str, Target]:
     A material whose shares sum to one has nothing else that is a mass: a constituent of which any material has a share
     is absent from it, with a share of 0, where it is not named.
     """
-    names = sorted({name for one in descriptions.values() for name in one})
-    masses = {name for one in descriptions.values() for name, value in one.items() if isinstance(value, float)}
+    names = sorted({name for description in descriptions.values() for name in description})
+    masses = {
+        name for description in descriptions.values() for name, value in description.items() if isinstance(value, float)
+    }
     targets = {name: Target({}, {}) for name in names}
-    for material, one in sorted(descriptions.items()):
-        whole = any(isinstance(value, float) for value in one.values()) and None not in one.values()
+    for material, description in sorted(descriptions.items()):
+        whole = any(isinstance(value, float) for value in description.values()) and None not in description.values()
         for name in names:
-            value = one.get(name, 0.0 if whole and name in masses else None)
+            value = description.get(name, 0.0 if whole and name in masses else None)
             if isinstance(value, bool):
                 targets[name].presence[material] = value
             elif value is not None:

@@ -187,10 +187,10 @@ class HeadFitter:
                 if len(places) == 1
                 else f"{len(places)} of which it is known were"
             )
-            return f"{some} felt for long enough; a head takes two or more"
+            return f"{some} observed for long enough; a head takes two or more"
         if np.ptp(values) == 0:
             who = "every" if values[0] else "no"
-            return f"{who} material of which it is known and that was felt has it" + (
+            return f"{who} material of which it is known and that was observed has it" + (
                 "" if curved else f", each with a share of {values[0]:g}"
             )
         evaluated = {gamma: self._evaluated(known, gamma) for gamma in GAMMAS}

@@ -40,29 +40,16 @@ def picture(path: Path, width: float, height: float, dots: int = 120) -> Iterato
         raise InputError(f"the plot cannot be written to {path}: {error}") from error
 
 
-def draw(
-    path: Path,
-    names: Sequence[str],
-    counts: np.ndarray,
-    *,
-    title: str,
-    curve: Sequence[Sequence[float]] = (),
-) -> None:
-    """Draw counts of (truth, predicted), shape (C, C), into a picture, and a curve of (materials, accuracy) beside.
+def draw(path: Path, names: Sequence[str], counts: np.ndarray, *, title: str) -> None:
+    """Draw counts of (truth, predicted), shape (C, C), into a picture.
 
     Raises InputError where matplotlib is missing or the file cannot be written.
     """
-    with picture(path, 13 if len(curve) else 7.5, 6.5) as figure:
-        panel = figure.add_subplot(1, 2 if len(curve) else 1, 1)
+    with picture(path, 7.5, 6.5) as figure:
+        panel = figure.add_subplot()
         shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         image = panel.imshow(shares, cmap="viridis", vmin=0, vmax=1)
         panel.set_xticks(range(len(names)), names, rotation=90)
         panel.set_yticks(range(len(names)), names)
         panel.set(xlabel="predicted", ylabel="touched", title=title)
         figure.colorbar(image, ax=panel, label="share of the touches of a material", shrink=0.8)
-        if len(curve):
-            side = figure.add_subplot(1, 2, 2)
-            points = np.asarray(curve)
-            side.plot(points[:, 0], 100 * points[:, 1], marker="o")
-            side.set(xlabel="materials observed so far", ylabel="accuracy over them, %", title="Learning one by one")
-            side.grid(alpha=0.3)

@@ -88,7 +88,7 @@ def moved(net, way, by):
     return other
 
 
-def test_filters_that_moved_the_same_way_are_told_from_those_that_did_not(net):
+def test_filters_that_moved_the_same_way_are_distinguished_from_those_that_did_not(net):
     generator = torch.Generator().manual_seed(5)  # not 0: the network's own numbers
     ways = [torch.randn(net.conv1.weight.shape, generator=generator) * net.conv1.weight.std() for _ in range(2)]
     networks = {

@@ -1,4 +1,4 @@
-"""Grades of materials never touched are told by those that were."""
+"""Grades of materials held out are predicted from the others."""
 
 import json
 from dataclasses import replace
@@ -111,7 +111,7 @@ def test_a_folder_without_the_data_is_one_red_line(tmp_path):
     assert "Get it from github.com" in refused(*words)
 
 
-def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
+def test_the_command_reports_and_writes(recordings, tmp_path, monkeypatch):
     pytest.importorskip("sklearn")
     kept = [at for at, name in enumerate(recordings.materials) if name[1] != "2" and name != "11"]
     few = Recordings(
@@ -138,9 +138,9 @@ def test_the_command_tells_and_writes(recordings, tmp_path, monkeypatch):
         "--dimension",
         "64",
     ]
-    told = run(*words, "--sets", "roboskin-20", "--run", tmp_path / "run")
-    assert told.exit_code == 0, told.output
-    assert "shaking" in told.output
+    result = run(*words, "--sets", "roboskin-20", "--run", tmp_path / "run")
+    assert result.exit_code == 0, result.output
+    assert "shaking" in result.output
     found = json.loads((tmp_path / "out.json").read_text())
     assert set(found["sets"]) == {"roboskin-20"}
     assert set(found["sets"]["roboskin-20"]["means"]["shaking"]) == {"ours", "inferred", "trees", "always"}

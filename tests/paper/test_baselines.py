@@ -1,4 +1,4 @@
-"""The paper's systems in the studies of robustness: what they are taught with and without augmentation."""
+"""The paper's systems in the studies of robustness: what they are trained on with and without augmentation."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
     assert list(make(TRAIN, True, silent).predict(clean)) == list(tough.predict(clean))
 
 
-def test_some_touches_stay_as_they_were_felt():
+def test_some_touches_stay_as_they_were_recorded():
     stream = SCENE.touch("felt", 0)
 
     def same(item):

@@ -39,7 +39,7 @@ def biotac():
 
 @pytest.fixture(scope="module")
 def whole(fabrics, biotac, weights, tmp_path_factory):
-    """All rows, asked about the hand, and the study that measured them."""
+    """All rows, tested on the hand, and the study that measured them."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     study = Contactile(fabrics, tuple(ROWS), weights, biotac, **SMALL, folder=folder)
     return study, list(study.run(["hand"]))
@@ -63,7 +63,7 @@ class TestRows:
         assert found["resnet"]["difference"] == pytest.approx(here - 0.763)
         assert found["kernels"]["paper"] is found["kernels"]["difference"] is None
 
-    def test_what_a_robot_felt_is_known_when_it_is_felt_again(self, fabrics):
+    def test_what_a_robot_touched_is_known_when_it_is_touched_again(self, fabrics):
         (_, figures), *_ = Contactile(fabrics, ("kernels",)).run(["held-out"])
         assert figures["tested"] == 10  # of six touches the first fold has two
         assert figures["score"] == figures["fabric"] == 1
@@ -173,7 +173,7 @@ class TestRefusals:
 
 
 class TestCommand:
-    def test_it_tells_writes_and_goes_on(self, tmp_path):
+    def test_it_reports_writes_and_resumes(self, tmp_path):
         words = ["fabric", "contactile", "--simulated", "--size", "5,6,2", "--rows", "resnet,kernels", "--epochs", "1"]
         words += ["--every", "24", "--run", tmp_path / "run", "--json", tmp_path / "out.json"]
         reported = run(*words)

@@ -49,7 +49,7 @@ class TestScore:
             assert figures["constituents"][name]["precision"] == pytest.approx(precision[i])
             assert figures["constituents"][name]["recall"] == pytest.approx(recall[i])
 
-    def test_what_was_not_said_counts_as_not_there_and_is_counted(self):
+    def test_what_was_not_predicted_counts_as_absent_and_is_counted(self):
         figures = score(["a", "b"], [[1, 0]] * 4, [[np.nan, 0.1]] * 4)
         assert (figures["score"], figures["constituents"]["a"]["unanswered"]) == (0.5, 4)
         assert figures["calibration_error"] == pytest.approx(0.1)
@@ -99,7 +99,7 @@ def letters():
     return Recordings("made up", NUSKIN, streams, names, numbers, numbers, ordered=True)
 
 
-def test_letters_never_touched_are_told_by_their_dots(letters, tmp_path):
+def test_letters_held_out_are_composed_of_their_dots(letters, tmp_path):
     task = Letters(letters, groups=4, cosines=300, folder=tmp_path / "run")
     results = list(task.run([0]))
     assert [result["part"] for result in results] == ["known", *["never touched"] * 4]
@@ -137,7 +137,7 @@ def slides():
     return Slides(recordings, np.array(forces), np.array(speeds))
 
 
-def test_slides_are_told_at_another_force_and_speed(slides, tmp_path):
+def test_slides_are_classified_at_another_force_and_speed(slides, tmp_path):
     assert [(int(a.sum()), int(b.sum())) for a, b in directions(slides).values()] == [(16, 16)] * 4
     task = SlideTransfer(slides, parts=6, folder=tmp_path / "run")
     results = list(task.run())
@@ -147,7 +147,7 @@ def test_slides_are_told_at_another_force_and_speed(slides, tmp_path):
     assert list(task.run()) == results
 
 
-def test_the_commands_tell_write_and_go_on(letters, slides, tmp_path, monkeypatch):
+def test_the_commands_report_write_and_resume(letters, slides, tmp_path, monkeypatch):
     monkeypatch.setattr("scroll_tactile.datasets.letter_spike.load", lambda data, seed: letters)
     monkeypatch.setattr("scroll_tactile.datasets.fabric_slide.load", lambda data, seed: slides)
     common = ["--data", tmp_path, "--run", tmp_path / "run", "--json", tmp_path / "out.json"]

@@ -1,4 +1,4 @@
-"""Objects under a camera: told again by video, and their attributes told before they are touched."""
+"""Objects under a camera: classified by video, and their attributes graded before they are touched."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def results():
     return list(Objects(recordings(), FINE, groups=2, trees=5).run([0]))
 
 
-def test_known_objects_are_told_by_video_by_vote_and_by_frame(results):
+def test_known_objects_are_classified_by_video_by_vote_and_by_frame(results):
     known = [item for item in results if item["part"] == "known, counts"]
     assert [item["tested"] for item in known] == [6]
     assert all(item["learned"] == 18 for item in known)
@@ -52,7 +52,7 @@ def test_known_objects_are_told_by_video_by_vote_and_by_frame(results):
         assert round(item["frame"] * 12, 6) % 1 == 0
 
 
-def test_attributes_are_told_of_objects_left_out(results):
+def test_attributes_are_graded_of_objects_left_out(results):
     new = [item for item in results if item["part"] == "never touched"]
     assert sorted(name for item in new for name in item["objects"]) == sorted(GEL.materials)
     assert all(item["tested"] == 4 * len(item["objects"]) == 24 - item["learned"] for item in new)
@@ -95,7 +95,7 @@ def test_groups_share_the_names_out():
 
 
 def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
-    """An attribute that the first feature shows is told of new objects; an object left out was never there."""
+    """An attribute that the first feature shows is graded of new objects; an object left out was never there."""
     rng = np.random.default_rng(0)
     statistics, shown = Statistics(6, (1,)), {}
     centres = rng.uniform(-0.5, 0.5, (30, 6))

@@ -71,7 +71,7 @@ class TestStreamingLDA:
         truth = fresh @ precision @ stacked.T - 0.5 * np.diag(stacked @ precision @ stacked.T)
         np.testing.assert_allclose(peer.scores(fresh), truth, rtol=1e-8)
 
-    def test_one_touch_is_enough_to_be_asked(self) -> None:
+    def test_one_touch_is_enough_to_predict(self) -> None:
         peer = trained(StreamingLDA(), np.ones((1, 3)), ["felt"])
         assert peer.predict(np.zeros((2, 3))) == ["felt", "felt"]
 

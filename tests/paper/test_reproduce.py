@@ -275,7 +275,7 @@ class TestCommand:
         (folder / "activation BioTac-20.npz").unlink()
         assert "first layers cannot be read" in refused(*words, "--weights", weights)
 
-    def test_noise_is_asked_of_the_papers_systems_and_ours(self, tmp_path: Path):
+    def test_noise_is_measured_of_the_papers_systems_and_ours(self, tmp_path: Path):
         pytest.importorskip("matplotlib")
         file = tmp_path / "noise.json"
         words = ("robustness", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")

@@ -1,4 +1,4 @@
-"""Studies ask systems that learned from clean touches about perturbed ones, and go on where they were."""
+"""Studies test systems that were trained on clean touches on perturbed ones, and resume where they were."""
 
 import json
 
@@ -33,7 +33,7 @@ def recordings(*, ordered=True):
 
 
 class Loudest:
-    """Knows the material by the spread of its readings; `made` counts how often one was taught."""
+    """Knows the material by the spread of its readings; `made` counts how often one was trained."""
 
     made = 0
 
@@ -50,7 +50,7 @@ def study(folder=None, **settings):
     return Robustness(recordings(), {"loudest": Loudest}, quick=True, folder=folder, **settings)
 
 
-def test_a_system_is_taught_once_a_fold_for_all_studies_and_once_for_another_sitting():
+def test_a_system_is_trained_once_a_fold_for_all_studies_and_once_for_another_session():
     task = study(augmented=(False,))
     (records,) = task.run([0])
     assert Loudest.made == 2

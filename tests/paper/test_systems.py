@@ -33,7 +33,7 @@ PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="c
 NAMES = ("slow", "middle", "fast")
 
 
-def felt(material: str, repetition: int, readings: int = 60) -> Stream:
+def touched(material: str, repetition: int, readings: int = 60) -> Stream:
     """A wave of the material's own frequency under six channels, from nearly the same phase, with noise."""
     random = np.random.default_rng([NAMES.index(material), repetition])
     cycles = (1.0, 3.0, 7.0)[NAMES.index(material)]
@@ -43,7 +43,7 @@ def felt(material: str, repetition: int, readings: int = 60) -> Stream:
 
 
 def touches(first: int, after: int, **kind: Any) -> list[Labelled]:
-    return [(name, felt(name, i, **kind)) for name in NAMES for i in range(first, after)]
+    return [(name, touched(name, i, **kind)) for name in NAMES for i in range(first, after)]
 
 
 TRAIN, HELD, TEST = touches(0, 8), touches(8, 9), touches(10, 13)
@@ -74,7 +74,7 @@ class TestSpikes:
         on_off = encode(image, 0.1, rest=0.0)
         assert on_off.tolist() == [[0, 3, 0, 0], [0] * 4, [0, 0, 0, 3], [0] * 4]
 
-    def test_the_first_spikes_tell_the_level(self):
+    def test_the_first_spikes_show_the_level(self):
         assert encode(np.full((1, 5), 0.01, np.float32), 0.1)[0].tolist() == [10, 0, 0, 0, 0]
 
     @pytest.mark.parametrize("threshold", [0.0, -1.0, np.nan, np.inf])
@@ -132,13 +132,13 @@ def new(weights: str) -> Catalogue:
 
 
 @pytest.mark.parametrize("key", SYSTEMS)
-def test_each_system_learns_what_can_be_told_apart(key: str, catalogue: Catalogue):
+def test_each_system_learns_what_can_be_classified(key: str, catalogue: Catalogue):
     system = catalogue.make(key)
     assert isinstance(system, System)
     assert system.name == SYSTEMS[key]
     assert share(fit(system)) >= 0.8
     # Touches of other lengths are answered, rightly or not.
-    assert set(system.predict([felt("slow", 50, readings=30), felt("fast", 51, readings=90)])) <= set(NAMES)
+    assert set(system.predict([touched("slow", 50, readings=30), touched("fast", 51, readings=90)])) <= set(NAMES)
     assert system.predict([]) == []
 
 

@@ -40,7 +40,7 @@ STRIP = Sensor(name="strip", channels=9, rate=100.0, low=0.0, high=1000.0, unit=
 CYCLES = {"slow": 2.0, "middle": 5.0, "fast": 11.0}  # a second
 
 
-def felt(sensor, material, number, shift=0.0):
+def touched(sensor, material, number, shift=0.0):
     """A wave of the material's own frequency under all channels, with noise; the same whatever the sensor."""
     random = np.random.default_rng([sensor.channels, [*CYCLES].index(material), number])
     i = np.arange(60)[:, None] / sensor.rate
@@ -52,7 +52,7 @@ def felt(sensor, material, number, shift=0.0):
 def recorded(sensor, each=10, shift=0.0, name=None):
     names = [material for material in CYCLES for _ in range(each)]
     numbers = np.tile(np.arange(each), len(CYCLES))
-    streams = [felt(sensor, material, i, shift) for material, i in zip(names, numbers.tolist(), strict=True)]
+    streams = [touched(sensor, material, i, shift) for material, i in zip(names, numbers.tolist(), strict=True)]
     return Recordings(name or sensor.name, sensor, streams, names, numbers, numbers % 5, ordered=True)
 
 
@@ -62,9 +62,9 @@ class TestFewTouches:
         readout, learner = WidestReadout(WidestFeatures(PATCH, vision)), TactileLearner(sensor=PATCH, embedding=vision)
         for material in CYCLES:
             for i in range(3):
-                readout.observe(material, felt(PATCH, material, i))
-                learner.observe(material, felt(PATCH, material, i))
-        asked = [felt(PATCH, material, i, 0.3) for material in CYCLES for i in range(10, 16)]
+                readout.observe(material, touched(PATCH, material, i))
+                learner.observe(material, touched(PATCH, material, i))
+        asked = [touched(PATCH, material, i, 0.3) for material in CYCLES for i in range(10, 16)]
         predicted = [readout.name_of(stream) for stream in asked]
         assert predicted == [learner.predict(stream).material for stream in asked]
         assert len(set(predicted)) > 1
@@ -73,10 +73,10 @@ class TestFewTouches:
         with pytest.raises(InputError, match="widest scale alone"):
             WidestFeatures(PATCH, Kernels(dimension=64))
         candidate = candidate_maker(PATCH, Kernels(dimension=64))()
-        candidate.observe("slow", felt(PATCH, "slow", 0))
-        assert candidate.name_of(felt(PATCH, "fast", 0)) == "slow"
+        candidate.observe("slow", touched(PATCH, "slow", 0))
+        assert candidate.name_of(touched(PATCH, "fast", 0)) == "slow"
         with pytest.raises(InputError, match="45 readings or more"):
-            WidestFeatures(PATCH, Vision(None, seed=1))(felt(PATCH, "slow", 0).first(0.5))
+            WidestFeatures(PATCH, Vision(None, seed=1))(touched(PATCH, "slow", 0).first(0.5))
 
     def test_draws_leave_the_tested_fold_out_and_keep_a_video_together(self):
         touches = recorded(PATCH)
@@ -228,7 +228,7 @@ class TestAligning:
 
     @pytest.fixture
     def streams(self):
-        return [felt(PATCH, name, i) for name in CYCLES for i in range(12)]
+        return [touched(PATCH, name, i) for name in CYCLES for i in range(12)]
 
     def share(self, candidate, streams, trained, names):
         for i in trained:
@@ -287,7 +287,7 @@ class TestAligning:
         assert prior.fitted[0] == pytest.approx(weights)
         assert prior.fitted[1] == pytest.approx(np.einsum("cd,dc->c", drawn, weights) / 2)
 
-    def test_nothing_learned_is_said_to_be_nothing(self, streams):
+    def test_before_anything_was_learned_it_is_an_error(self, streams):
         found, _ = vectors(2)
         made = self.features(streams, found)
         for candidate in (
@@ -371,7 +371,7 @@ class TestCommands:
         written = json.loads(out.read_text())
         assert written["precision"] == "bfloat16"
         assert "transfer tasks --data DATA --folds 0 --weights random.pth" in written["command"]
-        assert len(written["rows"]) == 6  # two sets asked about: kernels, vision, and vision tuned on one of them
+        assert len(written["rows"]) == 6  # two sets tested: kernels, vision, and vision tuned on one of them
         assert picture.stat().st_size > 1000
 
     def test_sensors(self, tmp_path):

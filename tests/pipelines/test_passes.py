@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from examples.paper.drawing import confusion_counts
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, confusion_counts, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 
 
@@ -104,7 +103,7 @@ class TestDemo:
         again = task.run()
         assert (again.observed, again.digest, again.answers) == (0, whole.digest, whole.answers)
 
-    def test_forgetting_would_be_told(self) -> None:
+    def test_forgetting_would_be_reported(self) -> None:
         outcome = Demo(sensors.BIOTAC, **SMALL).run()
         assert len(outcome.novel) == 20
         first = outcome.steps[0]

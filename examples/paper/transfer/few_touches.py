@@ -55,24 +55,24 @@ class WidestFeatures:
     """
 
     def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
-        reading = window_plan(sensor, embedding)
-        if reading.judged != "widest" or reading.beginning or reading.noisy:
+        plan = window_plan(sensor, embedding)
+        if plan.judged != "widest" or plan.beginning or plan.noisy:
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
-        self._reading = reading
-        self._perception = FeatureExtractor(sensor, embedding, reading, None)
+        self._plan = plan
+        self._extractor = FeatureExtractor(sensor, embedding, plan, None)
         self._kept: dict[bytes, npt.NDArray[np.floating]] = {}
 
     def __call__(self, stream: Stream) -> npt.NDArray[np.floating]:
         """Features of a touch's windows, (windows, d), the widest scale's. Raises InputError for a shorter touch."""
         if stream.key not in self._kept:
             image = tactile_image(stream)
-            width = self._reading.widths[-1]
+            width = self._plan.widths[-1]
             if image.shape[1] < width:
                 raise InputError(f"expected touches of {width} readings or more; came one of {image.shape[1]}")
-            scale = self._reading.windows[-1]
-            features = self._perception.features(image, [scale])[scale]
-            self._kept[stream.key] = features[self._reading.places(image.shape[1])[scale]]
+            scale = self._plan.windows[-1]
+            features = self._extractor.features(image, [scale])[scale]
+            self._kept[stream.key] = features[self._plan.places(image.shape[1])[scale]]
         return self._kept[stream.key]
 
 

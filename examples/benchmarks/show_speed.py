@@ -36,10 +36,12 @@ def show_speed(result: Record) -> None:
         table.add_row(record["case"], record["clock"], *times, record["bar"], record["error"])
     _print(table)
     if "before" in result:
-        table = Table("what", "clock", "ms now", "ms before", "ratio", title="this checkout beside the one before")
+        head = ("what", "clock", "ms now", "ms before", "ratio", "of processor time")
+        table = Table(*head, title="this checkout beside the one before")
         for record in result["before"]:
             ratio = f"{record['ratio']:.2f}"
-            table.add_row(record["case"], record["clock"], _times(record), _times(record, "before_"), ratio)
+            times = _times(record), _times(record, "before_")
+            table.add_row(record["case"], record["clock"], *times, ratio, f"{record['processor_ratio']:.2f}")
         _print(table)
 
 

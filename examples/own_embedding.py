@@ -48,4 +48,4 @@ with tempfile.TemporaryDirectory() as folder:
         print("without it:", error)
     with TactileLearner.open(folder, embedding=Spectrum()) as learner:
         answers = [learner.predict(scene.touch(material, 50)).material for material in scene.materials[:5]]
-    print(f"right: {sum(map(str.__eq__, answers, scene.materials))} of 5")
+    print(f"right: {sum(a == m for a, m in zip(answers, scene.materials, strict=False))} of 5")

@@ -23,8 +23,6 @@
     ├── WeightsError                         a file of weights is damaged, another architecture's, or unreachable
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
     ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
-    ├── TrainingError                        a network of the comparisons could not be trained: nothing is kept of it
-    ├── SingularError (ArithmeticError)      what was felt, with this λ, does not determine the weights: raise λ
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
@@ -120,14 +118,6 @@ class DatasetError(ScrollTactileError):
 
 class FineTuneError(ScrollTactileError):
     """A fine-tune had to stop, with a loss that is not finite or without memory; the f* before it stays."""
-
-
-class TrainingError(ScrollTactileError):
-    """A network's training had to stop, with a loss that is not finite or a device without memory."""
-
-
-class SingularError(ScrollTactileError, ArithmeticError):
-    """The rows, with this λ, do not determine the weights, or not in this arithmetic."""
 
 
 class CapacityError(ScrollTactileError, OverflowError):

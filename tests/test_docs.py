@@ -34,15 +34,34 @@ def test_the_test_command_is_the_one_that_ci_runs():
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
-@pytest.mark.parametrize("name", ["first_touch.py", "two_robots.py"])
+SHOWN = {
+    "quickstart": "known False",
+    "own_sensor": "right: 3 of 3",
+    "own_embedding": "right: 5 of 5",
+    "camera": "refused: expected frames",
+    "two_robots": "a slip taken back, the same bytes: True",
+}
+
+
+def test_every_example_is_short_and_among_those_that_run():
+    scripts = {path.stem: path for path in (ROOT / "examples").glob("*.py") if path.stem not in ("__init__", "tables")}
+    assert set(scripts) == set(SHOWN)
+    assert all(len(path.read_text().splitlines()) < 60 for path in scripts.values())
+
+
+@pytest.mark.parametrize("name", SHOWN)
 def test_examples_run(name, capsys):
-    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
-    printed = capsys.readouterr().out
-    if name == "two_robots.py":
-        assert "10 of 10" in printed
-        assert printed.count("the same bytes: True") == 3
-    else:
-        assert "known False" in printed
+    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+    assert SHOWN[name] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", ["README.md", "scroll_tactile/ARCHITECTURE.md"])
+def test_pages_are_pages_and_their_links_lead_somewhere(path):
+    text = (ROOT / path).read_text()
+    assert len(text.encode()) <= 8192
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
+    assert links
+    assert all(((ROOT / path).parent / link).exists() for link in links)
 
 
 def test_commands_in_the_readme_exist():

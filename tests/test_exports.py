@@ -15,7 +15,7 @@ import store
 PACKAGES = [
     scroll_tactile,
     store,
-    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "embeddings")),
+    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "testing")),
 ]
 
 
@@ -26,11 +26,12 @@ def modules():
             yield found.name
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 def test_the_public_names_are_sorted_there_and_all_there_are(package):
     # As ruff sorts them: constants, classes, then the rest.
     names = package.__all__
     assert sorted(names, key=lambda name: (not name.isupper(), not name[0].isupper(), name)) == list(names)
+    assert set(names) <= set(dir(package))
     assert len(set(names)) == len(names)
     leaked = [
         name

@@ -40,8 +40,8 @@ def show_speed(result: Record) -> None:
         table = Table(*head, title="this checkout beside the one before")
         for record in result["before"]:
             ratio = f"{record['ratio']:.2f}"
-            times = _times(record), _times(record, "before_")
-            table.add_row(record["case"], record["clock"], *times, ratio, f"{record['processor_ratio']:.2f}")
+            both = _times(record), _times(record, "before_")
+            table.add_row(record["case"], record["clock"], *both, ratio, f"{record['processor_ratio']:.2f}")
         _print(table)
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from examples.benchmarks.solvers.certified import FIRST_BITS
 from examples.benchmarks.solvers.exact import EMPTY, Exact, Exact20, Exact24, IntegerMoments
-from scroll_tactile.errors import InputError, MismatchError, SingularError
+from examples.benchmarks.solvers.solver_protocol import SingularError
+from scroll_tactile.errors import InputError, MismatchError
 
 doubles = st.floats(allow_nan=False, allow_infinity=False)
 moderate = st.floats(-1e6, 1e6, allow_subnormal=False)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.methods import SOLVERS
-from examples.benchmarks.solvers.solver_protocol import Solver
-from scroll_tactile.errors import InputError, ScrollTactileError, SingularError
+from examples.benchmarks.solvers.solver_protocol import SingularError, Solver
+from scroll_tactile.errors import InputError, ScrollTactileError
 
 # What each reaches where nothing is hard: the covariance form starts from 1 / λ and loses as many digits as λ is
 # small; a grid of 20 or 24 bits rounds the rows.

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from examples.paper.systems.catalogue import SYSTEMS, Catalogue
-from examples.paper.systems.descent import Batches, Course, Precision, descend, logits_of, seeded
+from examples.paper.systems.descent import Batches, Course, Precision, TrainingError, descend, logits_of, seeded
 from examples.paper.systems.inputs import average_columns, one_width, picture
 from examples.paper.systems.least_squares import PENALTIES, LeastSquares
 from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
@@ -22,7 +22,7 @@ from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Vision
 from scroll_tactile.datasets.physiclear import HALF_SIZE
 from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.errors import InputError, TrainingError
+from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Augmentation

@@ -13,8 +13,8 @@ from examples.benchmarks.numerics.cases import Case
 from examples.benchmarks.numerics.recorded import digits
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.methods import SOLVERS
-from examples.benchmarks.solvers.solver_protocol import RidgeBase
-from scroll_tactile.errors import InputError, SingularError
+from examples.benchmarks.solvers.solver_protocol import RidgeBase, SingularError
+from scroll_tactile.errors import InputError
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["DEFAULT", "bars", "error_of", "measure", "new_solver", "record", "solved"]

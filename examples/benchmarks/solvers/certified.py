@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from flint import arb, arb_mat, ctx, fmpz, fmpz_mat
 
-from scroll_tactile.errors import InputError, SingularError
+from examples.benchmarks.solvers.solver_protocol import SingularError
+from scroll_tactile.errors import InputError
 
 __all__ = ["Diagnosis", "IntegerSystem", "OnSingular", "Solution", "float_of", "floats_of", "solve_exact"]
 

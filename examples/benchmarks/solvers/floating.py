@@ -21,8 +21,8 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dgemm, dger, dsyrk, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtpqrt, spotrf, spotrs
 
-from examples.benchmarks.solvers.solver_protocol import RidgeBase
-from scroll_tactile.errors import InputError, SingularError
+from examples.benchmarks.solvers.solver_protocol import RidgeBase, SingularError
+from scroll_tactile.errors import InputError
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["Covariance", "CovarianceSymmetric", "Gram32", "Gram64", "SquareRoot"]

@@ -7,11 +7,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import InputError, ScrollTactileError
 
-__all__ = ["RidgeBase", "Solver"]
+__all__ = ["RidgeBase", "SingularError", "Solver"]
 
 FloatArray = npt.NDArray[np.float64]
+
+
+class SingularError(ScrollTactileError, ArithmeticError):
+    """The rows, with this λ, do not determine the weights, or not in this arithmetic: raise λ."""
 
 
 @runtime_checkable

@@ -15,10 +15,21 @@ from torch import nn
 from torch.nn import functional
 
 from scroll_tactile.embeddings.runtimes import full_float32
-from scroll_tactile.errors import InputError, TrainingError
+from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.finetune.training import Progress
 
-__all__ = ["AT_ONCE", "Batches", "Course", "Epoch", "Loss", "Precision", "descend", "logits_of", "seeded"]
+__all__ = [
+    "AT_ONCE",
+    "Batches",
+    "Course",
+    "Epoch",
+    "Loss",
+    "Precision",
+    "TrainingError",
+    "descend",
+    "logits_of",
+    "seeded",
+]
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -26,6 +37,10 @@ Fetch = Callable[[npt.NDArray[np.intp]], torch.Tensor]
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """(outputs, targets) of a batch → their mean loss in nats, a scalar."""
 AT_ONCE = 64  # images in a batch that nothing is learned from
+
+
+class TrainingError(ScrollTactileError):
+    """A network's training had to stop, with a loss that is not finite or a device without memory."""
 
 
 @dataclass(frozen=True)

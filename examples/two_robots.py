@@ -54,4 +54,4 @@ with tempfile.TemporaryDirectory() as folder:
         print(f"put together, the same bytes: {learner.digest() == expected}")
         slip = learner.observe(scene.materials[0], scene.touch(scene.materials[9], 0))
         learner.retract(slip)
-        print(f"a slip taken back, the same bytes: {learner.digest() == expected}")
+        print(f"a slip retracted, the same bytes: {learner.digest() == expected}")

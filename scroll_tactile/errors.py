@@ -13,8 +13,8 @@
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
     │   ├── MaterialError                    a material's name is not usable
     │   ├── DescriptionError                 what a material is said to be made of cannot be
-    │   ├── UnknownMaterialError (KeyError)  a material that was never felt is asked for
-    │   └── ObservationError (KeyError)      an observation that is not there, or can no longer be taken back
+    │   ├── UnknownMaterialError (KeyError)  a material that was never observed is asked for
+    │   └── ObservationError (KeyError)      an observation that is not there, or can no longer be retracted
     ├── MismatchError                        two things that do not belong together: open the right one
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
@@ -74,7 +74,7 @@ class DescriptionError(InputError):
 
 
 class UnknownMaterialError(InputError, KeyError):
-    """A material that was never felt is asked for."""
+    """A material that was never observed is asked for."""
 
     def __str__(self) -> str:
         # KeyError would show the message as a quoted repr.
@@ -82,7 +82,7 @@ class UnknownMaterialError(InputError, KeyError):
 
 
 class ObservationError(InputError, KeyError):
-    """An observation is not in the memory, was taken back already, or was compacted and can be taken back no more."""
+    """An observation is not in the memory, was retracted already, or was compacted and can be retracted no more."""
 
     def __str__(self) -> str:
         return Exception.__str__(self)

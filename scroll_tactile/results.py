@@ -45,7 +45,7 @@ class Observation:
 class Merged:
     """What a merge brought.
 
-    observations: that came in. shared: streams, of one material, that both memories had felt.
+    observations: that came in. shared: streams, of one material, that both memories had observed.
     described: materials whose descriptions came in, or were replaced.
     """
 
@@ -70,17 +70,17 @@ class Compacted:
 class Prediction:
     """What a stream feels like.
 
-    material: the likeliest of the materials that were candidates; None where nothing was ever felt.
+    material: the likeliest of the materials that were candidates; None where nothing was ever observed.
     probability: that of `material`, given that it is one of the candidates; calibrated on touches held out.
     ranking: every candidate with its probability, likeliest first; equal ones in alphabetical order.
-    novelty: how unlike anything felt: in standard deviations above what known materials give when held out; more
-        is newer; with a scene, than its materials. Infinite where nothing was ever felt; 0 where one material only was,
-        for then there is nothing to be told apart from.
+    novelty: how unlike anything observed: in standard deviations above what known materials give when held out; more
+        is newer; with a scene, than its materials. Infinite where nothing was ever observed; 0 where one material only
+        was, for then there is nothing to be told apart from.
     known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
         then `material` is only what comes nearest.
     seconds: how much touch the answer rests on: the stream's length, or that of the longest touch learned where the
-        stream is longer, for nothing was ever felt of how a material goes on after that. Of a camera's stream only the
-        frames in contact count, and the one at rest.
+        stream is longer, for nothing was ever observed of how a material goes on after that. Of a camera's stream only
+        the frames in contact count, and the one at rest.
     tuned: whether f*, the fine-tuned model, gave the probabilities; f did otherwise. Novelty is always f's.
     """
 
@@ -100,7 +100,7 @@ class Constituent:
     name: as it was described. presence: the probability that it is there; None where no head could be learned.
     share: its part of the mass, from 0 to 1; None where it has none, or no head could be learned.
     evidence: the materials known to have it that the touch feels most like, with the probability of each among all
-        that were felt; likeliest first.
+        that were observed; likeliest first.
     unlearned: why there is no presence, in words; empty where there is one.
     """
 
@@ -116,9 +116,9 @@ class Composition:
     """What a stream feels made of.
 
     constituents: all that were asked for, in alphabetical order. unfamiliar: the probability that the touch is of a
-        material never felt: what the heads weigh, which speak for a new material, against the known ones that it
+        material never observed: what the heads weigh, which speak for a new material, against the known ones that it
         feels like.
-    prediction: what it feels like among the materials felt.
+    prediction: what it feels like among the materials observed.
     """
 
     constituents: tuple[Constituent, ...]

@@ -39,7 +39,7 @@ SHOWN = {
     "own_sensor": "right: 3 of 3",
     "own_embedding": "right: 5 of 5",
     "camera": "refused: expected frames",
-    "two_robots": "a slip taken back, the same bytes: True",
+    "two_robots": "a slip retracted, the same bytes: True",
 }
 
 

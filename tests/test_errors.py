@@ -47,5 +47,5 @@ def test_messages_read_as_written_and_survive_pickling(error):
 
 def test_an_unknown_material_is_caught_as_key_error_and_as_value_error():
     for kind in (KeyError, ValueError, errors.InputError):
-        with pytest.raises(kind, match=r"^never felt: 'wool'$"):
-            raise UnknownMaterialError("never felt: 'wool'")
+        with pytest.raises(kind, match=r"^never observed: 'wool'$"):
+            raise UnknownMaterialError("never observed: 'wool'")

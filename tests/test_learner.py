@@ -93,7 +93,7 @@ def answers(learner):
 
 
 def check(prediction, materials):
-    """What holds for every prediction of a memory that has felt something."""
+    """What holds for every prediction of a memory that has observed something."""
     assert isinstance(prediction, Prediction)
     names, shares = zip(*prediction.ranking, strict=True)
     assert sorted(names) == sorted(materials)
@@ -158,8 +158,8 @@ def test_after_one_material_only(touches, readout):
 def test_two_identical_materials_under_two_names_are_equally_likely(touches, readout):
     learner = TactileLearner(sensor=PAD, embedding=SMALL, readout=readout)
     for repetition in range(touches):
-        for name, felt in (("wool", "wool"), ("alpaca", "wool"), ("silk", "silk")):
-            learner.observe(name, touch(felt, repetition))
+        for name, feel in (("wool", "wool"), ("alpaca", "wool"), ("silk", "silk")):
+            learner.observe(name, touch(feel, repetition))
     for repetition in (0, 30):
         prediction = learner.predict(touch("wool", repetition))
         check(prediction, ["alpaca", "silk", "wool"])

@@ -51,7 +51,7 @@ def fed(felt, described=(), **settings):
 
 
 def require_same(learner, felt, described=()):
-    """All that is kept of what was felt is, to the byte, what a memory keeps that felt it in another order."""
+    """All that is kept of what was observed is, to the byte, what a memory keeps that observed it in another order."""
     whole = fed(sorted(felt), described, readout=learner.settings.readout)
     assert learner.digest() == whole.digest()
     assert learner.exemplars == whole.exemplars
@@ -69,7 +69,7 @@ def require_same(learner, felt, described=()):
 
 @dataclass(frozen=True)
 class Felt:
-    """An observation of the model; fixed: it can no longer be taken back."""
+    """An observation of the model; fixed: it can no longer be retracted."""
 
     sequence: int
     material: str
@@ -82,7 +82,7 @@ class Felt:
 
 
 class History(RuleBasedStateMachine):
-    """The model: what was observed and not taken back, in a list."""
+    """The model: what was observed and not retracted, in a list."""
 
     def __init__(self):
         super().__init__()
@@ -270,7 +270,7 @@ class History(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def split_and_add(self, data):
-        """The statistics of two memories that share the touches are, together, those of the one that felt all."""
+        """The statistics of two memories that share the touches are, together, those of the one that observed all."""
         sides = [data.draw(st.booleans()) for _ in self.felt]
         parts = [fed(one.pair for one, side in zip(self.felt, sides, strict=True) if side == part) for part in (0, 1)]
         ours, theirs = (part.memory.statistics for part in parts)

@@ -55,7 +55,7 @@ def demo(
         f"result.\nEach material is learned from {touches} touches and tested on {held_out} others, "
         f"with {features} features."
     )
-    table = Table("#", "learned", "its own touches", "all materials so far", title="accuracy on touches never felt")
+    table = Table("#", "learned", "its own touches", "all materials so far", title="accuracy on touches never observed")
     screen = console()
     with Live(table, console=screen, refresh_per_second=10) if screen.is_terminal else nullcontext():
         outcome = task.run(

@@ -77,8 +77,8 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
 
     try:
         return TactileLearner.open(path, sensor=sensor, mode=mode)
-    except NotAStoreError as error:
-        if path.is_file() or mode == "read":
+    except (InputError, NotAStoreError) as error:
+        if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
             raise
         raise InputError(f"{error}. To make a new memory, say whose readings these are, with --sensor") from error
 

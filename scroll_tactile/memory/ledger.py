@@ -34,8 +34,8 @@ class Ledger:
     """The memory of one learner, and what is written down of it.
 
     load: makes the memory as it is in the store, or an empty one where there is no store. lock: held by whoever looks
-    at the memory or changes it. version: another number after each change of what was felt, and only then. described:
-    likewise of what is said of materials. added: the observations
+    at the memory or changes it. version: another number after each change of what was observed, and only then.
+    described: likewise of what is said of materials. added: the observations
     since it was last cleared, where `follow` says that they are wanted; None where anything else has changed.
     """
 
@@ -170,7 +170,7 @@ class Ledger:
     def retract(self, receipt: Receipt | int) -> None:
         """As `TactileLearner.retract`."""
         with self.lock:
-            store = self.require_store("take anything back")
+            store = self.require_store("retract anything")
             self._withdraw(store, [observation_of(store, self.memory, receipt)], "")
 
     def forget(self, material: str) -> int:
@@ -281,15 +281,15 @@ class Ledger:
             return True
 
     def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
-        """Make f* the memory's, durably, where nothing was taken back of what it was made from.
+        """Make f* the memory's, durably, where nothing was retracted of what it was made from.
 
-        made_from, upto, taken_back: the memory, its sequence and its count when the training began.
+        made_from, upto, retracted: the memory, its sequence and its count when the training began.
         """
         with self.lock:
             self.require_writing()
             memory = self.memory
             if memory is not made_from or memory.retractions != retractions:
-                raise FineTuneError("what f* was being made from was taken back meanwhile: fine-tune again")
+                raise FineTuneError("what f* was being made from was retracted meanwhile: fine-tune again")
             before = memory.tuned, memory.tuned_upto
             memory.tuned, memory.tuned_upto = tuned, upto
             try:

@@ -1,4 +1,4 @@
-"""What was felt, as the journal tells it: which observations can be taken back, and how two memories become one."""
+"""What was observed, as the journal tells it: which observations can be retracted, and how two memories become one."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observat
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
-    """The journal's row of an observation that can be taken back.
+    """The journal's row of an observation that can be retracted.
 
-    Raises ObservationError where there is none, it was taken back before, or compacted.
+    Raises ObservationError where there is none, it was retracted before, or compacted.
     """
     sequence = receipt.sequence if isinstance(receipt, Receipt) else receipt
     if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= store.last:
         raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
     if sequence in memory.retracted:
-        raise ObservationError(f"observation {sequence} of {store.path} was taken back already")
+        raise ObservationError(f"observation {sequence} of {store.path} was retracted already")
     if sequence <= memory.base:
         raise ObservationError(
-            f"observation {sequence} of {store.path} cannot be taken back: rows 1 to {memory.base} were compacted, and "
+            f"observation {sequence} of {store.path} cannot be retracted: rows 1 to {memory.base} were compacted, and "
             "their features given up"
         )
     record = store.record(sequence)
@@ -48,15 +48,17 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
 def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
     """The sequences of all observations of a material, ascending.
 
-    Raises UnknownMaterialError for one never felt, and ObservationError where some were compacted.
+    Raises UnknownMaterialError for one never observed, and ObservationError where some were compacted.
     """
-    felt = memory.statistics.materials.get(material, 0)
-    if not felt:
-        raise UnknownMaterialError(f"{material!r} was never felt; felt were {list(memory.statistics.materials)[:30]}")
+    count = memory.statistics.materials.get(material, 0)
+    if not count:
+        raise UnknownMaterialError(
+            f"{material!r} was never observed; observed were {list(memory.statistics.materials)[:30]}"
+        )
     found = [head.sequence for head in memory.retractable(store, material)]
-    if len(found) != felt:
+    if len(found) != count:
         raise ObservationError(
-            f"{material!r} cannot be forgotten: {felt - len(found)} of its {felt} observations in {store.path} were "
+            f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
             "compacted, and their features given up. Retract the others one by one, by their receipts"
         )
     return found
@@ -97,7 +99,7 @@ Choice = Literal["same", "ours", "theirs"]
 class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: its heads. shared: streams that both felt. descriptions: those that are not ours already, by material.
+    rows: its heads. shared: streams that both observed. descriptions: those that are not ours already, by material.
     Made by `Incoming.of`.
     """
 
@@ -110,7 +112,7 @@ class Incoming:
     def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool, descriptions: Choice) -> Incoming:
         """Look through both journals.
 
-        once: leave out streams that both felt, of one material with one content hash. Raises MismatchError where
+        once: leave out streams that both observed, of one material with one content hash. Raises MismatchError where
         theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
         shared stream cannot be left out.
         """
@@ -121,7 +123,7 @@ class Incoming:
         fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
             raise ObservationError(
-                f"{len(fixed)} streams that both memories felt, such as one of {fixed[0].label!r}, cannot be counted "
+                f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be counted "
                 f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
                 'or count them twice, with shared="twice"'
             )
@@ -129,7 +131,7 @@ class Incoming:
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
-                f"{theirs.path} kept no readings of what it felt (exemplars=0), of which {ours.path} keeps "
+                f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: feel it again, or merge into a memory made with exemplars=0"
             )
         return cls(theirs, rows, len(both), _descriptions(ours, memory, theirs, descriptions))
@@ -168,12 +170,12 @@ class Incoming:
 
 
 def _retracted_in(heads: Iterable[Head]) -> set[int]:
-    """All sequences that these rows took back."""
+    """All sequences that these rows retracted."""
     return {at for head in heads if head.kind == RETRACT for at in unspanned(head.attributes["sequences"])}
 
 
 def _standing(store: Store) -> list[Head]:
-    """The rows by which anything is known, compacted ones too, without what was ever taken back."""
+    """The rows by which anything is known, compacted ones too, without what was ever retracted."""
     heads = list(store.heads())
     gone = _retracted_in(heads)
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in gone]

@@ -36,10 +36,10 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 # The kinds of journal rows.
-OBSERVE = "observe"  # a stream was felt; its codes and, where exemplars are kept, its readings are the arrays
-RETRACT = "retract"  # observations were taken back; the attribute "sequences" holds them as [first, last] pairs
+OBSERVE = "observe"  # a stream was observed; its codes and, where exemplars are kept, its readings are the arrays
+RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds them as [first, last] pairs
 MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
-MEMBER = "felt"  # one of the streams that such a memory had felt: known by name and hash, with nothing to be added
+MEMBER = "felt"  # one of the streams that such a memory had observed: known by name and hash, with nothing to be added
 DESCRIBE = "describe"  # what a material is made of; the attribute "constituents" holds it, or null to take it away
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
 READINGS = "readings"  # the array of a row that keeps a stream raw
@@ -47,14 +47,14 @@ ATTEMPTS = 20  # of a reader to read what a writer goes on changing
 
 
 class Memory:
-    """What was felt: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
+    """What was observed: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
 
     dimension: d. plan: which windows are read of a touch, and judge. exemplars: streams in its buffer, or 0.
-    tuned: f*, of the last fine-tune; None before one, or where what it was made from was taken back.
-    tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were taken back.
-    excluded: of a base, the sequences up to it that had been taken back when it was made.
-    taken_back: how often anything was, since it was loaded.
-    descriptions: material → what it is made of, whether it was felt or not.
+    tuned: f*, of the last fine-tune; None before one, or where what it was made from was retracted.
+    tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were retracted.
+    excluded: of a base, the sequences up to it that had been retracted when it was made.
+    retracted: how often anything was, since it was loaded.
+    descriptions: material → what it is made of, whether it was observed or not.
     base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
     saved: the last sequence that a generation is known to hold.
     """
@@ -113,7 +113,7 @@ class Memory:
                     self.retract(store.record(sequence))
                 elif sequence not in self.excluded:  # not by `compact`, which leaves them out: by a repair
                     logger.warning(
-                        "%s: observation %d was taken back by row %d, and is still in: its features were lost to "
+                        "%s: observation %d was retracted by row %d, and is still in: its features were lost to "
                         "damage. Only a copy from before the damage can be without it",
                         store.path,
                         sequence,
@@ -144,7 +144,7 @@ class Memory:
             self.tuned = None
 
     def retractable(self, store: Store, material: str | None = None) -> list[Head]:
-        """The observations in the journal, of one material or all, that can be taken back and were not; in order."""
+        """The observations in the journal, of one material or all, that can be retracted and were not; in order."""
         rows = store.heads(self.base, kind=OBSERVE, label=material)
         return [head for head in rows if head.sequence not in self.retracted]
 
@@ -155,7 +155,7 @@ class Memory:
         self._stale = False
 
     def refill(self, store: Store) -> None:
-        """Choose pool and exemplars again, as if what was withdrawn had never been felt, where that can matter."""
+        """Choose pool and exemplars again, as if what was withdrawn had never been observed, where that can matter."""
         if not self._stale:
             return
         touches = {(material, key): touch for material, key, touch in self.sample}
@@ -235,7 +235,7 @@ class Memory:
             self.exemplars.update(other.exemplars)
 
     def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be taken back."""
+        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be retracted."""
         arrays, names = self.statistics.to_arrays()
         pooled, materials = self.sample.to_arrays()
         attributes: dict[str, Any] = {
@@ -248,7 +248,7 @@ class Memory:
             "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= pooled
-        # A base is gone on from with the rows behind it, which tell again what of them was taken back.
+        # A base is resumed from with the rows behind it, which tell again what of them was retracted.
         gone = sorted(self.retracted if base_at is None else ())
         out = [sequence for sequence in sorted(self.retracted) if base_at is not None and sequence <= base_at]
         arrays["withdrawn"], arrays["excluded"] = np.array(gone, dtype=np.int64), np.array(out, dtype=np.int64)
@@ -302,7 +302,7 @@ class Memory:
         return memory
 
     def until(self, store: Store, upto: int) -> Memory:
-        """The memory of the observations up to `upto` that were not taken back since: what a base there holds."""
+        """The memory of the observations up to `upto` that were not retracted since: what a base there holds."""
         memory = self._empty()
         memory.base, memory.sequence = self.base, self.base
         if (base := store.base()) is not None:

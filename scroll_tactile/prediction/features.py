@@ -38,7 +38,7 @@ class Encoded:
     """A touch as it is evaluated.
 
     image: (C, T) in [-1, 1], dead channels filled in where the embedding asks for that. means: scale → mean features in
-    the codes' unit, (d,). noisy: whether it is read as felt through noise. seconds: how much touch it is.
+    the codes' unit, (d,). noisy: whether it is read as observed through noise. seconds: how much touch it is.
     """
 
     image: Image

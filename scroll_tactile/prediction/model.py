@@ -35,8 +35,8 @@ class Model:
     """Everything that predictions need of one state of a memory, so that each answer rests on one state.
 
     names: the materials. selections: scale → its readout. stages: for each, the scales that judge there. longest: the
-    columns of the longest touch that was learned. noisy: of touches felt through noise; None where none were learned.
-    filling: of dead channels; None where none are filled in.
+    columns of the longest touch that was learned. noisy: of touches observed through noise; None where none were
+    learned. filling: of dead channels; None where none are filled in.
     """
 
     kind: ReadoutName

@@ -69,7 +69,7 @@ def crop(image: Image, start: int, columns: int) -> Image:
 
 
 def jitter(image: Image, noise: npt.NDArray[np.float32], drift: npt.NDArray[np.float32]) -> Image:
-    """The touch felt by a noisier, slowly drifting sensor: image + noise + drift, clipped to [-1, 1].
+    """The touch observed by a noisier, slowly drifting sensor: image + noise + drift, clipped to [-1, 1].
 
     noise: shape (…, C, T). drift: shape (…, C, K), K values that are spread evenly over the touch with straight lines
     between them. Both in units of the image, half the sensor's range. Raises InputError for other shapes or values

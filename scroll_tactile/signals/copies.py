@@ -24,7 +24,7 @@ FEWEST = 2  # columns of a copy: a touch is not sped up until nothing of it is l
 
 
 def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
-    """The touch felt by a noisy sensor: uniform noise in ± `amplitude`, a share of the range; clipped to the range.
+    """The touch observed by a noisy sensor: uniform noise in ± `amplitude`, a share of the range; clipped to the range.
 
     image: float32 of shape (C, T) in [-1, 1], twice the share. Every value has noise of its own.
     """
@@ -34,7 +34,8 @@ def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
 
 
 def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
-    """The touch felt with dead channels: a `share` of the channels, rounded, reads the low end of the range throughout.
+    """The touch observed with dead channels: a `share` of the channels, rounded, reads the low end of the range
+    throughout.
 
     image: float32 of shape (C, T) in [-1, 1]. Which channels are broken is drawn.
     """
@@ -44,7 +45,7 @@ def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
 
 
 def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -> Image:
-    """The touch felt by a sensor that warms up: each channel's gain and zero change along a straight line.
+    """The touch observed by a sensor that warms up: each channel's gain and zero change along a straight line.
 
     image: float32 of shape (C, T) in [-1, 1]. From nothing at the beginning to, at the end, an offset of at most
     `offset` of the range and a gain of at most 1 ± `gain` about the low end of the range, drawn for each channel;

@@ -52,7 +52,7 @@ class Scale:
     """What statistics are kept of, by itself.
 
     kind: "window" for windows of `width` columns; "beginning" for the first of the narrowest windows alone; "noise-a"
-    and "noise-b" for the two sets of features of a touch felt through noise, as a whole; "channels" for readings
+    and "noise-b" for the two sets of features of a touch observed through noise, as a whole; "channels" for readings
     themselves, by which dead channels are filled in, and which judges nothing. width: 0 but for windows.
 
     Scales are ordered by their number; `str` of one is its number, which names its arrays on disk.
@@ -139,7 +139,7 @@ def _thinned(begin: Sequence[int]) -> list[int]:
 
 
 def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
-    """Width → places of the windows whose scores are averaged when the first `length` columns have been felt.
+    """Width → places of the windows whose scores are averaged when the first `length` columns have been observed.
 
     Those that lie within it; of the shortest only such as begin at least half a width after the one before:
     otherwise the densely read beginning would count for more than the rest.
@@ -181,9 +181,9 @@ class WindowPlan:
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
-    is a scale of its own. noisy: whether touches felt through noise are. filled: whether silent channels are filled in.
-    penalties: the λ that the readouts are tried with; none: those of `shrinkage`. frames: whether windows are a
-    camera's frames.
+    is a scale of its own. noisy: whether touches observed through noise are. filled: whether silent channels are
+    filled in. penalties: the λ that the readouts are tried with; none: those of `shrinkage`. frames: whether windows
+    are a camera's frames.
     """
 
     widths: tuple[int, ...]
@@ -211,7 +211,7 @@ class WindowPlan:
         return extent(columns, self.widths, partial=self.partial, frames=self.frames)
 
     def judging(self, length: int) -> list[Scale]:
-        """The scales that judge when so many columns have been felt."""
+        """The scales that judge when so many columns have been observed."""
         fit = fitting(length, self.widths, partial=self.partial)
         chosen = fit[-1:] if self.judged == "widest" else fit
         first = [BEGINNING] if self.beginning and chosen[0] == self.widths[0] else []

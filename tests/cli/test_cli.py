@@ -80,11 +80,11 @@ class TestMemory:
         assert found["silk"]["presence"] > 0.5 > found["wool"]["presence"]
         assert found["soft"]["presence"] is None and found["soft"]["unlearned"]
         text = run("compose", memory, files / "silk.csv").stdout
-        assert "constituent" in text and "a material never felt" in text
+        assert "constituent" in text and "a material never observed" in text
         for wrong, said in (("wool", "came 'wool'"), ("wool=much", "NAME=SHARE"), ("wool=0.7", "sum to one")):
             refused = run("describe", memory, "silk", wrong)
             assert refused.exit_code != 0 and said in refused.output
-        assert "taken back; observed 2 times" in run("describe", memory, "silk").stdout
+        assert "its description is removed; observed 2 times" in run("describe", memory, "silk").stdout
 
     def test_an_empty_memory_answers_unknown(self, tmp_path: Path, files: Path) -> None:
         from scroll_tactile import TactileLearner
@@ -112,7 +112,7 @@ class TestMemory:
         assert "'oak'" in refused("predict", memory, silk, "--scene", "oak,silk")
         assert "at least one material" in refused("predict", memory, silk, "--scene", ",")
         assert "not there" in refused("predict", memory, files / "none.npy")
-        assert "no store" in refused("predict", tmp_path / "none", silk)
+        assert "there is no memory" in refused("predict", tmp_path / "none", silk)
         assert "file" in refused("inspect", silk)
         (tmp_path / "bad.csv").write_text("1,2\n1,two\n")
         assert "row 2, column 2" in refused("predict", memory, tmp_path / "bad.csv")

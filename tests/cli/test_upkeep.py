@@ -89,14 +89,12 @@ class TestCheckAndRepair:
         assert not (tmp_path / "none").exists()
 
 
-class TestTakingBack:
+class TestRetracting:
     def test_retract_and_forget(self, path):
-        assert "observation 2 was taken back; 11 are left" in words(run("memory", "retract", path, 2))
-        assert "b/ü: 3 observations were taken back; 2 materials are left" in words(
-            run("memory", "forget", path, "b/ü")
-        )
-        assert "was taken back already" in refused("memory", "retract", path, 2)
-        assert "'b/ü' was never felt" in refused("memory", "forget", path, "b/ü")
+        assert "observation 2 was retracted; 11 are left" in words(run("memory", "retract", path, 2))
+        assert "b/ü: 3 observations were retracted; 2 materials are left" in words(run("memory", "forget", path, "b/ü"))
+        assert "was retracted already" in refused("memory", "retract", path, 2)
+        assert "'b/ü' was never observed" in refused("memory", "forget", path, "b/ü")
         with TactileLearner.open(path, **SETTINGS) as learner:
             require_same(learner, [one for one in FELT if one[0] != "b/ü"])
 
@@ -105,7 +103,7 @@ class TestTakingBack:
             for name, touch in [("a", (0, 60)), ("d", (1, 60))]:
                 other.observe(name, stream(touch))
         result = words(run("memory", "merge", path, tmp_path / "other", "--shared", "once"))
-        assert "1 observations came in; 1 streams were felt by both; 13 are there now" in result
+        assert "1 observations came in; 1 streams were observed by both; 13 are there now" in result
         with TactileLearner.open(path, **SETTINGS) as learner:
             require_same(learner, [*FELT, ("d", (1, 60))])
             assert f"digest: {learner.digest()}" in result
@@ -195,7 +193,7 @@ class TestAnyEmbedding:
     def test_other_kernels_than_usual_are_no_matter(self, tmp_path):
         with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Kernels(seed=3, dimension=64)) as learner:
             learner.observe("a", stream((0, 60)))
-        assert "1 observations were taken back" in words(run("memory", "forget", tmp_path / "m", "a"))
+        assert "1 observations were retracted" in words(run("memory", "forget", tmp_path / "m", "a"))
 
 
 def whole_image(touch):

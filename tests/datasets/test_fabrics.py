@@ -1,4 +1,4 @@
-"""Simulated fabrics: what they are made of is what is felt, a robot touches evenly, a hand does not."""
+"""Simulated fabrics: what they are made of is what is observed, a robot touches evenly, a hand does not."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Maps: where a touch is felt, and in what order."""
+"""Maps: where a touch is observed, and in what order."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_parts_are_means_in_their_order():
     image = np.arange(20, dtype=np.float32).reshape(2, 10) / 20
     features = Maps(layout=(2,), parts=5).embed(image).reshape(5, 2)
     np.testing.assert_allclose(features, image.reshape(2, 5, 2).mean(axis=2).T, atol=1e-7)
-    short = Maps(layout=(2,), parts=5).embed(image[:, :2])  # fewer readings than parts: some are felt twice
+    short = Maps(layout=(2,), parts=5).embed(image[:, :2])  # fewer readings than parts: some are observed twice
     assert set(short.tolist()) <= set(image[:, :2].ravel().tolist())
 
 

@@ -5,7 +5,7 @@ Of a memory that was closed, and of one left as after a crash, with a log. Each 
 1. `check_store` looks at it, and must change nothing.
 2. It is opened to write. It is refused with a StoreError, or passed over with a warning, or not noticed.
 3. Where it opens, what can be seen of it must be right. Then rows are read again: one observation and one material
-   are taken back, and all must be right, or refused with a StoreError.
+   are retracted, and all must be right, or refused with a StoreError.
 
 Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Of a
 damaged log SQLite drops the end (FORMAT.md): where the memory is then as it was at an earlier instant, without a
@@ -228,7 +228,7 @@ class Flipping:
                 self._require(where, "opened at last", learner, state, right=True)
         except Exception as error:
             self.failures.append(
-                f"{where}: could be opened, and no more after one of its observations was taken back: {error!r}"
+                f"{where}: could be opened, and no more after one of its observations was retracted: {error!r}"
             )
             return ", LATER UNREADABLE"
         return later

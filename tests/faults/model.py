@@ -82,7 +82,7 @@ def stream(touch: Touch) -> npt.NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Felt:
-    """An observation; fixed: it can no longer be taken back."""
+    """An observation; fixed: it can no longer be retracted."""
 
     sequence: int
     material: str
@@ -91,7 +91,7 @@ class Felt:
 
     @property
     def pair(self) -> tuple[str, Touch]:
-        """What was felt, whenever it was."""
+        """What was observed, whenever it was."""
         return self.material, self.touch
 
 
@@ -114,7 +114,7 @@ class State:
 
     @property
     def pairs(self) -> Pairs:
-        """What was felt, in an order of its own."""
+        """What was observed, in an order of its own."""
         return tuple(sorted(one.pair for one in self.felt))
 
     def without(self, sequences: set[int]) -> State:
@@ -137,7 +137,7 @@ class State:
 
     @property
     def loose(self) -> list[Felt]:
-        """What can still be taken back."""
+        """What can still be retracted."""
         return [one for one in self.felt if not one.fixed]
 
 

@@ -9,7 +9,7 @@ from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, aft
 
 KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune")
 
-# Few touches, so that the same stream is felt again, by this memory and by those merged into it.
+# Few touches, so that the same stream is observed again, by this memory and by those merged into it.
 SEEDS = 6
 
 SAID = (None, (("silk", 1.0),), (("silk", 0.25), ("wool", 0.75)), (("soft", True), ("wool", None)))
@@ -21,7 +21,7 @@ def touch(rng: random.Random) -> Touch:
 
 
 def prepare(home: Path) -> dict[str, Other]:
-    """Make the memories to be merged in folder `home`: as observed, with some taken back, and compacted."""
+    """Make the memories to be merged in folder `home`: as observed, with some retracted, and compacted."""
     rng = random.Random(17)
     others = {}
     for name, count, taken, keep in (("plain", 3, (), None), ("taken", 4, (1,), None), ("compacted", 4, (0,), 2)):
@@ -47,13 +47,13 @@ def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) 
     if kind == "describe":
         return kind, rng.choice(MATERIALS), rng.choice(SAID)
     if kind in ("retract", "forget"):
-        return kind, _to_take_back(rng, state, kind)
+        return kind, _to_retract(rng, state, kind)
     if kind == "merge":
         return kind, rng.choice(sorted(others)), rng.choice(("twice", "once"))
     return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)
 
 
-def _to_take_back(rng: random.Random, state: State, kind: str) -> int | str:
+def _to_retract(rng: random.Random, state: State, kind: str) -> int | str:
     """A sequence, or a material."""
     loose: list[int] | list[str] = [one.sequence for one in state.loose]
     if kind == "forget":

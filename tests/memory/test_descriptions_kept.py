@@ -1,11 +1,11 @@
-"""What materials are made of is kept as durably as what was felt, and told apart from it."""
+"""What materials are made of is kept as durably as what was observed, and told apart from it."""
 
 import csv
 import shutil
 
 import pytest
 from test_learner_machine import SETTINGS, fed, require_same, stream
-from test_taking_back import FELT, filled, spoil
+from test_retracting import FELT, filled, spoil
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
@@ -59,7 +59,7 @@ def test_forgetting_takes_it_along_and_retracting_does_not(path):
         learner.forget("b")
         require_same(learner, left[1:], said)
         with pytest.raises(UnknownMaterialError):
-            learner.forget("d")  # described, and never felt
+            learner.forget("d")  # described, and never observed
         learner.describe("b", SAID["b"])  # said again, it stays
     with TactileLearner.open(path, **SETTINGS) as again:
         require_same(again, left[1:], SAID)

@@ -1,4 +1,4 @@
-"""The buffer: herded exactly, spread evenly, and a function of what was felt, not of when."""
+"""The buffer: herded exactly, spread evenly, and a function of what was observed, not of when."""
 
 from collections import Counter
 from dataclasses import replace

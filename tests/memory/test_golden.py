@@ -58,7 +58,7 @@ def require(learner, expected):
 
 
 def write(folder):
-    """Make the store: felt, taken back, merged, compacted, fine-tuned, and left as a killed process leaves it."""
+    """Make the store: felt, retracted, merged, compacted, fine-tuned, and left as a killed process leaves it."""
     shutil.rmtree(folder, ignore_errors=True)
     names = ["felt", "Samt ü/√", "cork"]
     with open_golden(folder / "other") as other:

@@ -1,4 +1,4 @@
-"""What a touch is made of: by what it feels like, and by heads for materials that were never felt."""
+"""What a touch is made of: by what it feels like, and by heads for materials that were never observed."""
 
 import itertools
 from dataclasses import replace
@@ -21,7 +21,7 @@ RHYTHMS = (3.0, 5.0, 8.0, 13.0)  # Hz: a constituent shakes one channel in its r
 
 
 def touch(shares, seed):
-    """A simulated touch: each constituent is felt in a channel of its own, with noise on all."""
+    """A simulated touch: each constituent is observed in a channel of its own, with noise on all."""
     rng = np.random.default_rng([seed, *(round(1000 * share) for share in shares)])
     time = np.arange(50) / 50
     waves = [
@@ -50,7 +50,7 @@ def felt(names, touches=8, **settings):
 
 @pytest.fixture(scope="module")
 def learner():
-    """All mixtures but two were felt, and described afterwards."""
+    """All mixtures but two were observed, and described afterwards."""
     learner = felt([name for name in mixtures() if name not in ("cl", "lsw")])
     for name, shares in mixtures().items():
         learner.describe(name, described(shares))
@@ -112,7 +112,7 @@ class TestCompose:
 
 @pytest.mark.parametrize(("unknown", "shares"), [((), [0.25, 0.75]), (("silk",), [None, 0.75])])
 def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares):
-    """Of a touch felt through noise, which its probabilities alone compose."""
+    """Of a touch observed through noise, which its probabilities alone compose."""
     descriptions = {"a": {"wool": 1.0}, "b": {"wool": 0.5, "silk": 0.5}}
     targets = targets_of({name: checked(name, description) for name, description in descriptions.items()})
     head = ConstituentHead(np.arange(2), np.zeros(3), None)

@@ -1,4 +1,4 @@
-"""A row taken out of the statistics leaves the readout that never felt it."""
+"""A row taken out of the statistics leaves the readout that never observed it."""
 
 import numpy as np
 import pytest

@@ -211,7 +211,7 @@ def test_a_constant_feature_says_nothing(value):
     assert np.isfinite(readout.weights).all()
     for x, row in zip(groups[0], wider[0], strict=True):
         longer = row.copy()
-        longer[1] = -5000  # a value never felt there
+        longer[1] = -5000  # a value never observed there
         assert np.allclose(without.project(x), readout.project(longer), rtol=1e-9, atol=1e-9)
 
 

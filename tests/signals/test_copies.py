@@ -135,7 +135,7 @@ class TestAugmentedObservation:
         digests = {fed(order).digest() for order in permutations(few)}
         assert len(digests) == 1
 
-    def test_what_was_taken_back_was_never_felt(self, tmp_path):
+    def test_what_was_retracted_was_never_felt(self, tmp_path):
         learner, receipts = filled(tmp_path / "m", [*FELT, ("c", (5, 60))])
         with learner:
             learner.retract(receipts[1])

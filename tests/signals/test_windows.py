@@ -66,7 +66,7 @@ def test_a_long_touch_is_read_to_its_end(one):
 
 
 @pytest.mark.parametrize("one", ALL, ids=named)
-def test_scored_windows_lie_within_what_was_felt(one):
+def test_scored_windows_lie_within_what_was_observed(one):
     widths = scales(one)
     for columns in [*range(1, 400), 977, 2000]:
         read = extent(columns, widths)

@@ -136,7 +136,7 @@ def test_a_commit_that_fails_takes_the_batch_back(opened, monkeypatch):
     assert add(opened, "after") == [2]
 
 
-def test_a_batch_that_cannot_be_taken_back_at_once_hides_no_error_and_blocks_nothing(opened, monkeypatch, caplog):
+def test_a_batch_that_cannot_be_retracted_at_once_hides_no_error_and_blocks_nothing(opened, monkeypatch, caplog):
     journal, real = opened._journal, opened._journal._using
     stuck = []
 

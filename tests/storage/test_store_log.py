@@ -122,7 +122,7 @@ def test_a_log_that_was_begun_anew_over_an_older_one_is_sound(tmp_path):
                 assert damaged_frame(log_of(tmp_path / "s")) is None
 
 
-def test_rows_that_were_taken_back_leave_a_sound_log(tmp_path):
+def test_rows_that_were_retracted_leave_a_sound_log(tmp_path):
     with Store.open(tmp_path / "s", identity={}) as opened:
         opened._journal._connection.execute("PRAGMA cache_size = 5")
         for number in range(6):

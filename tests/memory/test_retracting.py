@@ -1,4 +1,4 @@
-"""What was observed is taken back, brought together, made small and made durable in bulk: exactly."""
+"""What was observed is retracted, brought together, made small and made durable in bulk: exactly."""
 
 import sqlite3
 import threading
@@ -47,7 +47,7 @@ def without(*places):
 
 
 class TestRetract:
-    def test_a_receipt_is_taken_back_for_good(self, path):
+    def test_a_receipt_is_retracted_for_good(self, path):
         learner, receipts = filled(path)
         with learner:
             learner.retract(receipts[4])
@@ -84,7 +84,7 @@ class TestRetract:
         learner, receipts = filled(path)
         with learner:
             learner.retract(receipts[2])
-            with pytest.raises(ObservationError, match=r"observation 3 .* was taken back already"):
+            with pytest.raises(ObservationError, match=r"observation 3 .* was retracted already"):
                 learner.retract(receipts[2])
             with pytest.raises(ObservationError, match=r"row 13 .* is no observation, but of kind 'retract'"):
                 learner.retract(13)
@@ -98,7 +98,7 @@ class TestRetract:
                 learner.retract(receipts[0])
             require_same(learner, FELT)
 
-    def test_without_a_journal_nothing_can_be_taken_back(self):
+    def test_without_a_journal_nothing_can_be_retracted(self):
         learner = fed(FELT)
         for call in (lambda: learner.retract(1), lambda: learner.forget("a"), learner.compact):
             with pytest.raises(InputError, match="a memory without a path keeps no journal"):
@@ -139,7 +139,7 @@ class TestForget:
             assert learner.forget("b") == 3
             left = [one for one in FELT if one[0] != "b"]
             require_same(learner, left)
-            with pytest.raises(UnknownMaterialError, match="'b' was never felt"):
+            with pytest.raises(UnknownMaterialError, match="'b' was never observed"):
                 learner.forget("b")
         with TactileLearner.open(path, **SETTINGS) as again:
             require_same(again, left)
@@ -174,7 +174,7 @@ class TestTuned:
             whole.fine_tune(epochs=1)
             assert again.tuned_digest() == whole.tuned_digest()
 
-    def test_taken_back_while_it_is_being_made(self, path):
+    def test_retracted_while_it_is_being_made(self, path):
         learner, receipts = filled(path)
         with learner:
             taken = []
@@ -183,7 +183,7 @@ class TestTuned:
                 if not taken:
                     taken.append(learner.retract(receipts[0]))
 
-            with pytest.raises(FineTuneError, match="was taken back meanwhile"):
+            with pytest.raises(FineTuneError, match="was retracted meanwhile"):
                 learner.fine_tune(epochs=1, progress=progress)
             assert learner.tuned_digest() is None
 
@@ -283,7 +283,7 @@ class TestBatch:
 
 
 class TestMerge:
-    def test_two_memories_become_the_one_that_felt_all(self, path, tmp_path):
+    def test_two_memories_become_the_one_that_observed_all(self, path, tmp_path):
         ours, _ = filled(path, FELT[:7])
         theirs, _ = filled(tmp_path / "other", FELT[5:])
         steps = []
@@ -383,7 +383,7 @@ class TestMerge:
 
 
 class TestCompact:
-    def test_what_was_learned_stays_and_can_no_longer_be_taken_back(self, path):
+    def test_what_was_learned_stays_and_can_no_longer_be_retracted(self, path):
         learner, receipts = filled(path)
         with learner:
             before = sum(learner._ledger.store.size().values())
@@ -401,7 +401,7 @@ class TestCompact:
             again.compact()
             require_same(again, without(9))
 
-    def test_what_was_taken_back_before_is_gone_from_the_disk(self, path):
+    def test_what_was_retracted_before_is_gone_from_the_disk(self, path):
         learner, receipts = filled(path)
         with learner:
             learner.retract(receipts[0])
@@ -473,7 +473,7 @@ class TestRefresh:
             require_same(reader, FELT)
 
 
-def test_many_retractions_leave_what_was_never_taken_back(path):
+def test_many_retractions_leave_what_was_never_retracted(path):
     rng = np.random.default_rng(0)
     felt = [("abcd"[at % 4], (at, 40)) for at in range(60)]
     learner, receipts = filled(path, felt, embedding=SMALL)
@@ -507,7 +507,7 @@ def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
         require_same(learner, expected[:-1])
 
 
-def test_what_damage_keeps_from_being_taken_back_is_named(path, caplog):
+def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     learner, _ = filled(path)
     learner.close()
     learner = TactileLearner.open(path, **SETTINGS)
@@ -521,7 +521,7 @@ def test_what_damage_keeps_from_being_taken_back_is_named(path, caplog):
     assert repaired.kept == 13
     with TactileLearner.open(path, **SETTINGS) as again:
         require_same(again, FELT)
-    assert "observation 1 was taken back by row 13, and is still in" in caplog.text
+    assert "observation 1 was retracted by row 13, and is still in" in caplog.text
 
 
 def learner_key(one):
@@ -572,7 +572,7 @@ def spoil(path, number):
     (path / "generations" / f"{number:08d}" / "observations" / "c" / "0" / "0").unlink()
 
 
-def test_with_a_damaged_base_nothing_is_taken_back(path):
+def test_with_a_damaged_base_nothing_is_retracted(path):
     learner, receipts = filled(path)
     with learner:
         learner.compact(keep=6)

@@ -17,9 +17,9 @@ from examples.benchmarks.interleaved import run_interleaved
 from examples.benchmarks.show_speed import show_frontier, show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.vision_speed import run_vision
-from examples.paper.commands.sets import Dataset, read, require_folders
+from examples.paper.commands.sets import Dataset, read, require_folders, write_result
 from scroll_tactile import Kernels
-from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say, write_json
+from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
 
 __all__ = ["app"]
@@ -34,17 +34,7 @@ def _written(context: typer.Context, path: Path | None, result: Mapping[str, Any
     if path is None:
         return
     load = [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None
-    write_json(path, _rounded({"command": _command(context), **result, "load_average_after": load}))
-    say(f"written to {path}")
-
-
-def _rounded(value: Any) -> Any:
-    """A result whose floats have six digits: more say nothing, and take room."""
-    if isinstance(value, float):
-        return float(f"{value:.6g}")
-    if isinstance(value, Mapping):
-        return {key: _rounded(part) for key, part in value.items()}
-    return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
+    write_result(path, {"command": _command(context), **result, "load_average_after": load})
 
 
 def _command(context: typer.Context) -> str:

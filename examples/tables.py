@@ -13,8 +13,8 @@ results, says what the table NAME holds:
 
 A cell is text with lookups in braces: `{STEM:KEY/KEY|STEP|STEP}` looks into STEM.json, `{./KEY}` into the element. A
 KEY is a name, a place in a list, or `field=value;field=value`, the first element of a list with these. STEPs are those
-of STEPS, `*N`, `/N`, or a format of Python's. A lookup that finds nothing is an error; `{?…}` then leaves its cell
-empty, or shows what stands behind `??` in it.
+of STEPS, `*N`, `/N`, or a format of Python's. `{PATH or PATH|STEP}` takes the second where the first finds nothing. A
+lookup that finds nothing is an error; `{?…}` then leaves its cell empty, or shows what stands behind `??` in it.
 """
 
 from __future__ import annotations
@@ -86,17 +86,26 @@ class _Results:
             found = _step_into(found, key)
         return found
 
+    def _first_of(self, paths: Sequence[str], element: Any) -> Any:
+        """What the first of some paths that leads to something leads to. Raises _Missing where none does."""
+        for path in paths:
+            try:
+                found = self.look_up(path, element)
+            except _Missing:
+                continue
+            if found is not None:
+                return found
+        raise _Missing(paths)
+
     def fill(self, template: str, element: Any = None) -> str:
         """A template with its lookups done; empty where an optional one found nothing and offers nothing instead."""
         parts: list[str] = []
         end = 0
         for match in LOOKUP.finditer(template):
             asked, _, instead = match[2].partition("??")
-            path, *steps = asked.strip().split("|")
+            paths, *steps = asked.strip().split("|")
             try:
-                found = self.look_up(path, element)
-                if found is None:
-                    raise _Missing(path)
+                found = self._first_of(paths.split(" or "), element)
                 for step in steps:
                     found = _apply(step, found)
             except _Missing:

@@ -54,6 +54,7 @@ def room(tmp_path):
         ("{one:all/x|/1000|.2f}", "1.50"),
         ("{one:all/x|*2|.0f}", "3000"),
         ("{?one:all/y}, never", ""),
+        ("{one:all/y or one:of/0/none or one:all/x|.0f}", "1500"),
         ("{?one:of/0/none??–} / {one:of/0/sd}", "– / 0.25"),
     ],
 )

@@ -14,7 +14,7 @@ from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar, ranked_exemplars
-from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars
+from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
 from scroll_tactile.memory.state import Memory
@@ -25,9 +25,8 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
-from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from store import NotAStoreError, Store
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
@@ -50,9 +49,7 @@ class TactileLearner:
 
     sensor: whose streams it reads. embedding: the frozen features; unless given `Kernels()`, and `Frames()` for a
     camera, of whose frames those count in which the gel is pressed (see `signals.contact`).
-    augmentation: the copies that each touch is observed with, see `Augmented`; none unless given. A touch and its
-    copies are one observation: it is retracted with them, and is as exact. Each copy costs as much time and space as
-    the touch does, when it is observed; `predict` reads what it is given and nothing else.
+    augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
     settings: readout, false_alarms, refit, solver and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
     In memory only; `TactileLearner.open` gives one with a path. Methods may be called from any thread. `pickle` and
@@ -70,7 +67,7 @@ class TactileLearner:
         augmentation: Augmented | None = None,
         **settings: Any,
     ) -> None:
-        _require_augmentable(sensor, augmentation)
+        require_augmentable(sensor, augmentation)
         chosen = usual_embedding(sensor) if embedding is None else embedding
         given = Settings(**settings)
         exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
@@ -91,7 +88,7 @@ class TactileLearner:
         self._settings = settings.model_copy(update={"exemplars": exemplars})
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
-        self._unverified: Identity | None = None
+        self._unverified: tuple[Identity, Path] | None = None
         self._snapshot_of: str | None = None
         self._current = CurrentModel(self._settings, sensor.channels, embedding.bound)
         self._tuned_reader: TunedReader | None = None
@@ -123,17 +120,16 @@ class TactileLearner:
         chosen = Settings(**settings)
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        store = _opened(path, sensor, embedding, augmentation, chosen.exemplars, mode)
+        store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, mode)
         try:
             identity = Identity.read(store)
             identity.require(store.path, sensor, augmentation)
-            if embedding is not None:
-                identity.require_embedding(store.path, embedding)
-            learner = cls.__new__(cls)
             found = identity.own_embedding(store.path) if embedding is None else embedding
+            (identity.require_plan if embedding is None else identity.require_embedding)(store.path, found)
+            learner = cls.__new__(cls)
             exemplars = identity.exemplar_count(store, chosen.exemplars)
             learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
-            learner._unverified = identity if embedding is None else None
+            learner._unverified = (identity, store.path) if embedding is None else None
             plan, most = learner._plan, learner._settings.exemplars or 0
             learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, most), store)
         except BaseException:
@@ -147,12 +143,12 @@ class TactileLearner:
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
             held = arrays, attributes, self._ledger.memory.sequence
-            return {"made_with": made_with, "held": held, "of": name}
+            return {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
         self._set_up(sensor, embedding, augmentation, settings, settings.exemplars)
-        self._snapshot_of = state["of"]
+        self._unverified, self._snapshot_of = state["unverified"], state["of"]
         self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]))
         logger.info("a snapshot of %s, in memory only", state["of"])
 
@@ -378,8 +374,9 @@ class TactileLearner:
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, once the embedding that was found for the memory has proved to be its own."""
-        if self._unverified is not None and self.path is not None:
-            self._unverified.require_embedding(self.path, self._embedding)
+        if self._unverified is not None:
+            identity, path = self._unverified
+            identity.require_embedding(path, self._embedding)
             self._unverified = None
         return self._extractor
 
@@ -451,13 +448,6 @@ class TactileLearner:
             self._ledger.require_writing()
             model, ranked, memory = self.model(), self.ranked_exemplars(), self._ledger.memory
             upto, retractions = memory.sequence, memory.retractions
-        without = sorted(set(model.names) - set(ranked))
-        if without and ranked:
-            raise InputError(
-                f"expected an exemplar of every material; the buffer has none of {without[:10]} (it was made with "
-                f"exemplars={self._settings.exemplars}). Make a new memory with room for {len(model.names)} or more, "
-                "or touch again what was observed before exemplars were kept"
-            )
         tuned, report = fine_tune(
             self._embedding,
             model,
@@ -502,36 +492,6 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _opened(
-    path: str | os.PathLike[str],
-    sensor: Sensor | None,
-    embedding: Embedding | None,
-    augmentation: Augmented | None,
-    exemplars: int | None,
-    mode: Literal["write", "read"],
-) -> Store:
-    """The store in a folder; a new one, where there is none and a sensor says what it is for."""
-    try:
-        return Store.open(path, mode=mode)
-    except NotAStoreError:
-        if sensor is None or mode == "read":
-            raise
-    _require_augmentable(sensor, augmentation)
-    chosen = usual_embedding(sensor) if embedding is None else embedding
-    identity = Identity.of(sensor, chosen, exemplars, augmentation)
-    return Store.open(path, identity=identity.to_json(), mode=mode)
-
-
-def _require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> None:
-    if augmentation is not None and not isinstance(augmentation, Augmented):
-        raise InputError(f"expected an augmentation such as Augmented(copies=4); came {augmentation!r:.60}")
-    if augmentation is not None and sensor.camera:
-        raise InputError(
-            f"the copies of an augmentation differ in speed, noise and dead channels, and camera {sensor.name!r} takes "
-            "whole frames: leave the augmentation out"
-        )
 
 
 def _silent(what: str, done: int, of: int) -> None:

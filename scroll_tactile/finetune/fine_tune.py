@@ -72,7 +72,7 @@ def fine_tune(
     """
     begun = time.perf_counter()
     most = EPOCHS if epochs is None else epochs
-    _require_settings(most, seed, device, exemplars)
+    _require_settings(most, seed, device, exemplars, model.names)
     touches = TouchFeatures(embedding, model.plan)
     samples = list(_samples(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
     names = sorted({sample.material for sample in samples})
@@ -105,12 +105,19 @@ def require_tunable(plan: WindowPlan, embedding: Embedding) -> None:
         )
 
 
-def _require_settings(epochs: int, seed: int, device: str, exemplars: Mapping[str, Sequence[Exemplar]]) -> None:
+def _require_settings(
+    epochs: int, seed: int, device: str, exemplars: Mapping[str, Sequence[Exemplar]], names: Sequence[str]
+) -> None:
     for what, number, least in (("epochs", epochs, 1), ("seed", seed, 0)):
         if isinstance(number, bool) or not isinstance(number, int) or number < least:
             raise InputError(f"expected {what} as a whole number of {least} or more; came {number!r}")
     if sum(map(len, exemplars.values())) == 0:
         raise InputError("expected exemplars to fine-tune on; the buffer is empty. Open a memory with exemplars > 0")
+    if without := sorted(set(names) - set(exemplars)):
+        raise InputError(
+            f"expected an exemplar of every material; the buffer has none of {without[:10]}. Make a new memory with "
+            f"exemplars={len(names)} or more, or touch again what was observed before exemplars were kept"
+        )
     if len(exemplars) < 2:
         raise InputError(f"expected at least two materials; the buffer has exemplars of {list(exemplars)} only")
     try:

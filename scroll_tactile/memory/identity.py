@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, Literal, Self, cast
 
@@ -14,12 +15,20 @@ from scroll_tactile.embeddings.protocol import Capabilities, Embedding, require_
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS
-from store import DamageError, Store
+from store import DamageError, NotAStoreError, Store
 
-__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "Grid", "Identity", "usual_embedding", "usual_exemplars"]
+__all__ = [
+    "AbsentEmbedding",
+    "EmbeddingIdentity",
+    "Grid",
+    "Identity",
+    "open_store",
+    "usual_embedding",
+    "usual_exemplars",
+]
 
 USUAL_EXEMPLARS = 400  # streams
 ROBUST = "robust kernels"
@@ -181,19 +190,19 @@ class Identity(_Kept):
             )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
-        """Raise EmbeddingMismatchError for another embedding than it was made with; embeds the canaries of both."""
-        mine, plan = EmbeddingIdentity.of(embedding), window_plan(self.sensor, embedding)
-        made = self.embedding
-        if (made.name, made.dimension, made.bound, made.fingerprint) != (
-            mine.name,
-            mine.dimension,
-            mine.bound,
-            mine.fingerprint,
-        ):
+        """Raise EmbeddingMismatchError for another embedding than it was made with; it embeds its canaries."""
+        mine, made = EmbeddingIdentity.of(embedding), self.embedding
+        fields = ("name", "dimension", "bound", "fingerprint")
+        if any(getattr(mine, field) != getattr(made, field) for field in fields):
             raise EmbeddingMismatchError(
                 f"{path} was made with embedding {made}; it was opened with {mine}. Features of one mean nothing to "
                 "the other: open it with the embedding that made it, or take another path"
             )
+        self.require_plan(path, embedding)
+
+    def require_plan(self, path: Path, embedding: Embedding) -> None:
+        """Raise MismatchError for an embedding that reads other windows, or another grid; nothing is embedded."""
+        plan = window_plan(self.sensor, embedding)
         if self.reading is not None and self.reading != (plan.partial, plan.judged):
             raise EmbeddingMismatchError(
                 f"{path} was made with an embedding whose partial_windows and judged_scales are {list(self.reading)}; "
@@ -236,3 +245,23 @@ def usual_embedding(sensor: Sensor) -> Embedding:
 def usual_exemplars(sensor: Sensor) -> int:
     """Streams in the buffer of a memory that asks for no number; a camera's are large, and none are kept."""
     return 0 if sensor.camera else USUAL_EXEMPLARS
+
+
+def open_store(
+    path: str | os.PathLike[str],
+    sensor: Sensor | None,
+    embedding: Embedding | None,
+    augmentation: Augmented | None,
+    exemplars: int | None,
+    mode: Literal["write", "read"],
+) -> Store:
+    """The store in a folder; a new one, where there is none and a sensor says what it is for."""
+    try:
+        return Store.open(path, mode=mode)
+    except NotAStoreError:
+        if sensor is None or mode == "read":
+            raise
+    require_augmentable(sensor, augmentation)
+    chosen = usual_embedding(sensor) if embedding is None else embedding
+    identity = Identity.of(sensor, chosen, exemplars, augmentation)
+    return Store.open(path, identity=identity.to_json(), mode=mode)

@@ -15,10 +15,11 @@ import numpy.typing as npt
 from pydantic import Field, FiniteFloat
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import FrozenModel
 from scroll_tactile.signals.augmentation import Image, crop, resize
 
-__all__ = ["Augmented", "hiss", "silence", "wander"]
+__all__ = ["Augmented", "hiss", "require_augmentable", "silence", "wander"]
 
 FEWEST = 2  # columns of a copy: a touch is not sped up until nothing of it is left
 
@@ -132,3 +133,14 @@ class Augmented(FrozenModel):
     def _thinned(self, image: Image) -> Image:
         step = min(math.floor(self.speed), max(1, image.shape[1] // FEWEST))
         return np.ascontiguousarray(image[:, ::step])
+
+
+def require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> None:
+    """Raise InputError for what is no augmentation, and for a camera, whose frames are not slid along time."""
+    if augmentation is not None and not isinstance(augmentation, Augmented):
+        raise InputError(f"expected an augmentation such as Augmented(copies=4); came {augmentation!r:.60}")
+    if augmentation is not None and sensor.camera:
+        raise InputError(
+            f"the copies of an augmentation differ in speed, noise and dead channels, and camera {sensor.name!r} takes "
+            "whole frames: leave the augmentation out"
+        )

@@ -80,7 +80,8 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     except (InputError, NotAStoreError) as error:
         if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
             raise
-        raise InputError(f"{error}. To make a new memory, say whose readings these are, with --sensor") from error
+        what = f"there is no memory in {path}; to make one, say which sensor it is for, with --sensor"
+        raise InputError(what) from error
 
 
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import expit
 
 __all__ = ["GAMMAS", "Curve", "RidgeSystem", "fit_curve", "solve"]
 
@@ -70,6 +69,8 @@ class Curve:
 
     def __call__(self, values: npt.ArrayLike) -> FloatArray:
         """Probabilities, of the same shape."""
+        from scipy.special import expit
+
         probabilities: FloatArray = expit(self.slope * np.asarray(values, dtype=np.float64) + self.offset)
         return probabilities
 
@@ -82,6 +83,8 @@ def fit_curve(
     values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: what the prior counts as. turning: whether the value
     at which it passes a half may be another than the prior's.
     """
+    from scipy.special import expit
+
     truth = np.asarray(targets, dtype=np.float64)
     if not len(truth):
         return prior

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
 from scroll_tactile.signals.windows import Scale
@@ -38,6 +37,8 @@ def leave_one_out_scores(
 
     Raises numpy.linalg.LinAlgError where the scatter with its ridge is not positive definite to working precision.
     """
+    from scipy.linalg.lapack import dpotrf, dpotrs
+
     counts, sums = statistics.totals(scale)
     total = int(counts.sum())
     _, means = centred_means(counts, sums)

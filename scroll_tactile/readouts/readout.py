@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpotrf, dpotrs
 
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
@@ -127,6 +126,8 @@ def fit_readout(task: Task, penalty: float) -> Readout:
 
     Raises numpy.linalg.LinAlgError where Σ is not positive definite to working precision: λ is too small.
     """
+    from scipy.linalg.lapack import dpotrf, dpotrs
+
     system = task.covariance.copy(order="F")
     system[np.diag_indices_from(system)] += penalty
     with one_thread():

@@ -26,8 +26,6 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import dger, dtrsv
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
 from scroll_tactile.signals.windows import Scale
@@ -87,6 +85,8 @@ class WoodburyReadout(RecursiveReadout):
 
         Raises numpy.linalg.LinAlgError where S_w + P is not positive definite to working precision.
         """
+        from scipy.linalg.lapack import dpotrf, dpotrs
+
         counts, sums = statistics.totals(self._scale)
         system = within_scatter(statistics.total_second(self._scale), counts, sums)
         system[np.diag_indices_from(system)] += self._penalties
@@ -137,6 +137,9 @@ class WoodburyReadout(RecursiveReadout):
 
     def _solve(self, new: FloatArray) -> FloatArray:
         """K₀⁻¹ times each of the rows, shape (k, d)."""
+        from scipy.linalg.blas import dtrsv
+        from scipy.linalg.lapack import dpotrs
+
         if len(new) > FEW:
             solved: FloatArray = dpotrs(self._factor, new.T, lower=0)[0].T
             return solved
@@ -182,6 +185,8 @@ class RecursiveLeastSquares(RecursiveReadout):
 
         Raises numpy.linalg.LinAlgError where S + P is not positive definite to working precision.
         """
+        from scipy.linalg.lapack import dpotrf, dpotri
+
         counts, sums = statistics.totals(self._scale)
         scatter = within_scatter(statistics.total_second(self._scale), counts, sums)
         self._origin, self._means = centred_means(counts, sums)
@@ -214,6 +219,8 @@ class RecursiveLeastSquares(RecursiveReadout):
 
     def _update(self, row: FloatArray, targets: FloatArray) -> None:
         """One step of the recursion, with x̃ of shape (d + 1,) and y of shape (C,)."""
+        from scipy.linalg.blas import dger
+
         # Where P has lost its definiteness numbers grow without bound: the scores show it, not a warning.
         with np.errstate(all="ignore"):
             projected = row @ self._covariance

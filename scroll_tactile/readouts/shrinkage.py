@@ -17,9 +17,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import dsymm
-from scipy.linalg.lapack import dormqr, dptsv, dsytrd
-from scipy.special import log_ndtr, logsumexp
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, fit_readout, require_definite
 from scroll_tactile.signals.windows import Scale
@@ -121,6 +118,8 @@ def _fold_task(
 
 
 def _losses(held: _FoldTask, readouts: Sequence[Readout], kind: ReadoutName) -> list[float]:
+    from scipy.linalg.blas import dsymm
+
     # The weights of all λ side by side: one product in place of many thin ones.
     weights = np.hstack([readout.weights for readout in readouts])
     spreads = np.split(dsymm(1.0, held.scatter, weights, lower=0), len(readouts), axis=1)
@@ -146,6 +145,8 @@ def _pairwise_error(held: _FoldTask, readout: Readout, z: FloatArray, spread: Fl
     Class y loses to k with probability Φ(−Δ/σ), Δ the difference of its scores' held-out mean and σ² the held-out
     variance of that difference.
     """
+    from scipy.special import log_ndtr, logsumexp
+
     own = np.flatnonzero(held.counts)
     scores = readout.scores(z, "lda")[own]
     margins = scores[np.arange(len(own)), own][:, None] - scores
@@ -163,6 +164,8 @@ def fit_readouts(task: Task, penalties: Sequence[float]) -> list[Readout]:
 
     Raises numpy.linalg.LinAlgError where Σ + λ I is not positive definite to working precision: λ is too small.
     """
+    from scipy.linalg.lapack import dptsv, dsytrd
+
     dimension, classes = task.means.shape[1], len(task.means)
     if dimension == 1:  # of which LAPACK makes no tridiagonal matrix
         return [fit_readout(task, penalty) for penalty in penalties]
@@ -188,4 +191,6 @@ def fit_readouts(task: Task, penalties: Sequence[float]) -> list[Readout]:
 
 def _turn(reflectors: FloatArray, tau: FloatArray, columns: FloatArray, way: str) -> None:
     """Put Q times the columns in their place, or with way "T" Qᵀ times them."""
+    from scipy.linalg.lapack import dormqr
+
     columns[1:], _, _ = dormqr("L", way, reflectors, tau, columns[1:], REDUCED * max(REDUCED, columns.shape[1]))

@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import dsyrk
 from threadpoolctl import ThreadpoolController
 
 from scroll_tactile.errors import CapacityError
@@ -27,6 +26,8 @@ PIECE = 2**13  # entries of a triangle
 
 @lru_cache(maxsize=1)
 def _controller() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401  # a controller governs the libraries that are there when it is made: BLAS first
+
     return ThreadpoolController()
 
 
@@ -116,6 +117,9 @@ class SecondMoment:
 
 def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) -> None:
     """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
+    # Late, here and in `readouts`: a fifth of a second, that whoever only looks at a memory is spared.
+    from scipy.linalg.blas import dsyrk
+
     # The transposed view is Fortran's order, and its upper triangle our lower one. With BLAS's own threads: exact
     # all the same, and switching to one and back took longer than the product.
     upper = dsyrk(1.0, codes.astype(np.float64).T, lower=0)

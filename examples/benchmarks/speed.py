@@ -35,6 +35,7 @@ from scroll_tactile.signals.windows import Scale, extent, scales
 from scroll_tactile.statistics.grid import to_codes
 from scroll_tactile.statistics.moments import SecondMoment, one_thread
 from scroll_tactile.statistics.statistics import Statistics
+from store import Store
 
 __all__ = ["run_speed"]
 
@@ -273,20 +274,18 @@ def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
 
 def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLearner:
     """A learner on disk with so many touches of one window a scale, of made-up codes: only their number matters."""
-    learner = TactileLearner.open(path, sensor=scene.sensor)
+    with TactileLearner.open(path, sensor=scene.sensor) as learner:
+        dimension = learner.embedding.dimension
     rng = np.random.default_rng([seed, observations])
     widths = scales(scene.sensor)
     of_touch = extent(widths[-1], widths)
-    store, memory = learner._ledger.store, learner.memory
-    assert store is not None
-    for i in range(observations):
-        codes = {
-            Scale("window", width): rng.integers(0, 23, size=(1, learner.embedding.dimension), dtype=np.int32) * 2**14
-            for width in of_touch
-        }
-        key = rng.bytes(32)
-        material = scene.materials[i % len(scene.materials)]
-        columns = widths[0]
-        record = store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=pack_codes(codes))
-        memory.add(material, key, columns, codes, record.sequence)
-    return learner
+    with Store.open(path) as store:
+        for i in range(observations):
+            codes = {
+                Scale("window", width): rng.integers(0, 23, size=(1, dimension), dtype=np.int32) * 2**14
+                for width in of_touch
+            }
+            material = scene.materials[i % len(scene.materials)]
+            attributes = {"columns": widths[0]}
+            store.append(OBSERVE, material, rng.bytes(32), attributes=attributes, arrays=pack_codes(codes))
+    return TactileLearner.open(path)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["MOST_DEPTH", "MOST_PARTS", "configuration_of", "from_configuration", "guess", "picture_to_json"]
 
 MOST_DEPTH: Final = 16  # mappings and lists within each other
+LIKELY_SEEDS = 8  # of kernels, a few milliseconds each
 MOST_PARTS: Final = 8  # of a Joined
 MOST_COSINES = 2**14
 MOST_WEIGHTS = 2**27  # of all cosines together: 1 GiB
@@ -293,6 +294,7 @@ def _candidates(name: str, dimension: int, sensor: Sensor) -> Iterator[Callable[
 
     if name == "kernels":
         yield lambda: Kernels(dimension=dimension)
+        yield from (partial(Kernels, dimension=dimension, seed=seed) for seed in range(LIKELY_SEEDS))
     elif name == "robust kernels":
         yield lambda: Robust(Kernels(dimension=dimension))
     elif name == "frames":

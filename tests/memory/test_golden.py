@@ -1,7 +1,7 @@
 """Memories written by earlier releases are read: run as a test it reads them, run as a script it writes this one's.
 
-`python tests/test_golden.py` makes `tests/data/<version>/`: a store that has all kinds of rows and generations, and
-`expected.json`, what was in it. A release adds its own and never touches those of others.
+`python tests/memory/test_golden.py` makes `tests/data/<version>/`: a store that has all kinds of rows and generations,
+and `expected.json`, what was in it. A release adds its own and never touches those of others.
 """
 
 import json
@@ -9,13 +9,12 @@ import shutil
 import sqlite3
 import sys
 from contextlib import closing
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Kernels, Sensor, TactileLearner, __version__
 from scroll_tactile.errors import MismatchError
 from store import Store, VersionError
 
@@ -99,6 +98,12 @@ def test_it_is_read(golden):
         require(learner, expected)
 
 
+def test_it_opens_from_its_path_alone(golden):
+    path, expected = golden
+    with TactileLearner.open(path, mode="read") as learner:
+        require(learner, expected)
+
+
 def test_it_is_written_on(golden):
     path, expected = golden
     with open_golden(path) as learner:
@@ -123,7 +128,7 @@ def test_every_kind_of_row_and_generation_is_in_it(golden):
 
 def test_it_is_what_this_release_writes(tmp_path):
     """Where the format changes, a new version and a new golden store are due."""
-    current = DATA / version("scroll-tactile")
+    current = DATA / __version__
     write(tmp_path / "again")
     again, expected = (json.loads((one / "expected.json").read_text()) for one in (tmp_path / "again", current))
     for exact in ("digest", "materials", "exemplars", "descriptions"):  # an f* is not the same on every machine
@@ -159,6 +164,6 @@ def test_a_row_of_an_unknown_kind_is_refused_with_what_to_do(golden):
 
 
 if __name__ == "__main__":
-    write(DATA / version("scroll-tactile"))
-    print((DATA / version("scroll-tactile") / "expected.json").read_text())
+    write(DATA / __version__)
+    print((DATA / __version__ / "expected.json").read_text())
     sys.exit()

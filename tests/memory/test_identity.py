@@ -73,7 +73,7 @@ def test_a_memory_made_before_configurations_were_kept_opens_alone_too(tmp_path,
 
 
 def test_a_memory_of_settings_that_nobody_noted_is_still_inspected(tmp_path):
-    embedding = Kernels(dimension=64, seed=3)
+    embedding = Kernels(dimension=64, seed=99)
     prepare(tmp_path / "m", embedding, lambda identity: identity["embedding"].pop("configuration"))
     with filled(tmp_path / "m", embedding=embedding) as learner:
         digest = learner.digest()

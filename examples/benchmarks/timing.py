@@ -17,6 +17,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from scroll_tactile import __version__
+
 __all__ = ["CLOCKS", "Clock", "Timing", "circumstances", "take_turns", "timed"]
 
 Clock = Literal["wall", "processor"]
@@ -87,7 +89,8 @@ def circumstances(seed: int) -> dict[str, Any]:
         "machine": f"{platform.machine()}, {platform.processor() or platform.system()}",
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load_average": [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None,
-        "versions": {name: _version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy", "zarr")},
+        "versions": {"scroll-tactile": __version__}
+        | {name: _version(name) for name in ("torch", "numpy", "scipy", "zarr")},
     }
 
 

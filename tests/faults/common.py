@@ -15,17 +15,19 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile import __version__
+
 # Folders that are harmed by the shim and not by the disk may lie in memory, where nothing is waited for.
 IN_MEMORY = Path("/dev/shm")
 
-PACKAGES = ("scroll-tactile", "numpy", "torch", "zarr", "numcodecs", "filelock")
+PACKAGES = ("numpy", "torch", "zarr", "numcodecs", "filelock")
 
 
 def parser(about: str | None, **defaults: Any) -> argparse.ArgumentParser:
@@ -110,6 +112,11 @@ def _machine() -> dict[str, Any]:
     return {"system": platform.platform(), "processor": model, "cores": os.cpu_count()}
 
 
+def _without_folders(words: Sequence[str]) -> list[str]:
+    """The words of a command without the folders of the machine that it ran on."""
+    return [Path(word).name if "/" in word else word for word in words]
+
+
 def run(
     name: str, options: argparse.Namespace, work: Callable[[argparse.Namespace], Mapping[str, Any]]
 ) -> dict[str, Any]:
@@ -122,10 +129,13 @@ def run(
     failures = figures.pop("failures", [])
     record = {
         "name": name,
-        "command": shlex.join(["python", f"tests/faults/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        "command": shlex.join(
+            ["python", f"tests/faults/{Path(sys.argv[0]).name}", *map(_without_folders, sys.argv[1:])]
+        ),
         "seed": options.seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"python": platform.python_version(), "sqlite": sqlite3.sqlite_version}
+        | {"scroll-tactile": __version__}
         | {package: version(package) for package in PACKAGES},
         "machine": _machine(),
         "seconds": round(time.perf_counter() - begun, 1),

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from examples.paper import drawing
+from scroll_tactile import __version__
 from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
@@ -117,7 +118,7 @@ def require_folders(*files: Path | None) -> None:
 
 def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]:
     """What made a result: the command, when, with which versions, on what machine, and from which sensor, of one."""
-    versions = {name: version(name) for name in ("scroll-tactile", "torch", "numpy", "scipy")}
+    versions = {"scroll-tactile": __version__} | {name: version(name) for name in ("torch", "numpy", "scipy")}
     versions |= {name: version(name) for name, module in _OPTIONAL.items() if find_spec(module)}
     made = {
         "command": command,

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from images import image
 
-from scroll_tactile import Joined, Kernels, Maps, TactileLearner, Vision, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile import Joined, Kernels, Maps, Vision
 from scroll_tactile.errors import InputError
 
 KERNELS = Kernels(dimension=64)
@@ -20,40 +20,23 @@ class Loud:
         return np.array([8.0 * float(image.mean()), -8.0])
 
 
-def image(channels=19, columns=100):
-    return np.random.default_rng([channels, columns]).uniform(-1, 1, (channels, columns)).astype(np.float32)
-
-
-def judged(embedding):
-    return embedding.capabilities.partial_windows, embedding.capabilities.judged_scales
-
-
 def test_it_is_its_parts_side_by_side():
     joined = Joined(KERNELS, VISION)
     assert (joined.name, joined.dimension, joined.bound) == ("kernels+vision", 64 + 192, 1.0)
     assert joined.parts == (KERNELS, VISION)
-    features = joined.embed(image())
-    assert features[:64].tobytes() == KERNELS.embed(image()).tobytes()
-    assert features[64:].tobytes() == VISION.embed(image()).tobytes()
-    windows = {30: [0, 7], 75: [0, 20]}
-    embedded = joined.embed_windows(image(), windows)
-    for width in windows:
-        assert embedded[width][:, :64].tobytes() == KERNELS.embed_windows(image(), windows)[width].tobytes()
-        assert embedded[width][:, 64:].tobytes() == VISION.embed_windows(image(), windows)[width].tobytes()
+    declared = joined.capabilities
+    assert (declared.partial_windows, declared.judged_scales) == (False, "widest")  # the most demanding part's
+    picture, windows = image(19, 100), {30: [0, 7], 75: [0, 20]}
+    parts = [part.embed_windows(picture, windows) for part in (KERNELS, VISION)]
+    for width, rows in joined.embed_windows(picture, windows).items():
+        assert rows[:, :64].tobytes() == parts[0][width].tobytes()
+        assert rows[:, 64:].tobytes() == parts[1][width].tobytes()
 
 
 def test_each_part_is_divided_by_its_bound():
-    features = Joined(KERNELS, Loud()).embed(image())
+    features = Joined(KERNELS, Loud()).embed(image(19, 100))
     assert features[-1] == -1.0
-    assert features[-2] == pytest.approx(float(image().mean()))
-
-
-def test_the_most_demanding_part_decides_on_windows():
-    assert judged(VISION) == (False, "widest")
-    both = Joined(KERNELS, VISION)
-    assert judged(both) == (False, "widest")
-    plain = Joined(Loud(), Loud())
-    assert judged(plain) == (True, "all")
+    assert features[-2] == pytest.approx(float(image(19, 100).mean()))
 
 
 def test_the_fingerprint_depends_on_the_parts_and_their_order():
@@ -62,24 +45,13 @@ def test_the_fingerprint_depends_on_the_parts_and_their_order():
     assert Joined(KERNELS, VISION).fingerprint == Joined(Kernels(dimension=64), VISION).fingerprint
 
 
-def test_a_learner_learns_with_it():
-    scene = Scene(sensor=sensors.ROBOSKIN)
-    learner = TactileLearner(sensor=scene.sensor, embedding=Joined(KERNELS, VISION))
-    for at in range(3):
-        for name in scene.materials[:3]:
-            learner.observe(name, scene.touch(name, at))
-    assert all(learner.predict(scene.touch(name, 9)).material == name for name in scene.materials[:3])
-
-
-@pytest.mark.parametrize("parts", [(), (KERNELS,)])
-def test_fewer_than_two_are_refused(parts):
-    with pytest.raises(InputError, match="at least two"):
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [((), "at least two"), ((KERNELS,), "at least two"), ((KERNELS, "vision"), "expected embeddings")],
+)
+def test_what_cannot_be_joined_is_refused(parts, message):
+    with pytest.raises(InputError, match=message):
         Joined(*parts)
-
-
-def test_what_is_no_embedding_is_refused():
-    with pytest.raises(InputError, match="expected embeddings"):
-        Joined(KERNELS, "vision")
 
 
 def test_penalties_are_named_only_where_every_part_names_some():

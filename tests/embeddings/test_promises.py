@@ -12,9 +12,9 @@ from scroll_tactile.testing import check_embedding
 
 NETWORK = ResNet.random(0).state_dict()
 KERNELS = Kernels(dimension=64)
-SIZES = ((1, 19), (1, 9, 30, 100))
+SIZES = ((1, 19), (1, 9, 60))
 SKIN = ((20,), (9, 30, 75))
-EYE = ((3, 180), (1, 9, 80))
+EYE = ((3, 60), (1, 9, 40))
 
 
 class Loud:
@@ -34,7 +34,7 @@ def pool():
 SHIPPED = {
     "kernels": (KERNELS, SIZES),
     "default kernels": (Kernels(), ((19,), (30, 400))),
-    "frames": (Frames(), ((3, 180, 360), (1, 9, 160))),
+    "frames": (Frames(), ((3, 180), (1, 9, 80))),
     "frames by cosines": (Frames(cosines=64), EYE),
     "frames by a network": (Frames(NETWORK), EYE),
     "maps of channels": (Maps(layout=(20,), parts=3), SKIN),
@@ -42,7 +42,7 @@ SHIPPED = {
     "maps of a grid": (Maps(layout=(4, 5), parts=2), SKIN),
     "maps of a grid by cosines": (Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64), SKIN),
     "vision": (Vision(NETWORK), SIZES),
-    "vision, all stages": (Vision(None, seed=1, stages=(0, 1, 2, 3, 4)), ((19,), (30, 100))),
+    "vision, all stages": (Vision(None, seed=1, stages=(0, 1, 2, 3, 4)), ((19,), (9, 60))),
     "vision, bfloat16": (Vision(NETWORK, stages=(0, 4), precision="bfloat16"), ((19,), (9, 60))),
     "robust": (Robust(KERNELS), SIZES),
     "joined": (Joined(KERNELS, Vision(NETWORK, stages=(1, 2))), ((19,), (9, 60))),

@@ -129,9 +129,9 @@ def test_a_hostile_configuration_is_refused_before_anything_is_made(configuratio
         from_configuration(configuration)
 
 
-def test_a_configuration_of_a_million_levels_is_refused():
+def test_a_configuration_of_very_many_levels_is_refused():
     nested = KERNELS
-    for _ in range(10**6):
+    for _ in range(10**5):
         nested = {"kind": "robust", "inner": nested, "seed": 0}
     with pytest.raises(EmbeddingError, match="at most 16 levels"):
         from_configuration(nested)
@@ -145,7 +145,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.sampled_from([KERNELS, MAPS, FRAMES, VISION | {"weights": {"name": None, "sha256": "0" * 64}}]), st.data())
 def test_any_one_field_of_any_value_gives_an_embedding_or_a_typed_error(configuration, data):
     changed = configuration | {data.draw(st.sampled_from(sorted(configuration))): data.draw(JSON)}

@@ -5,6 +5,7 @@ import builtins
 import numpy as np
 import pytest
 import torch
+from images import image
 
 from scroll_tactile import Vision
 from scroll_tactile.embeddings.resnet import ResNet
@@ -20,10 +21,6 @@ def vision(runtime, **settings):
         pytest.importorskip(runtime, reason=f"{runtime} is not installed, and needed by few")
         pytest.importorskip("onnx", reason="onnx is not installed")
     return Vision(STATE, runtime=runtime, **settings)
-
-
-def image(channels, columns):
-    return np.random.default_rng([channels, columns]).uniform(-1, 1, (channels, columns)).astype(np.float32)
 
 
 def test_onnxruntime_gives_torchs_features_for_any_size():
@@ -44,7 +41,6 @@ def test_bfloat16_is_close_to_float32():
     short = Vision(STATE, precision="bfloat16")
     error = np.linalg.norm(short.embed(image(19, 100)) - Vision(STATE).embed(image(19, 100)))
     assert 1e-5 < error < 0.05
-    check_embedding(short, columns=(9, 60))
 
 
 @pytest.mark.parametrize(("depth", "stem"), [(50, "torchvision"), (18, "universal")])
@@ -58,12 +54,9 @@ def test_the_graph_is_the_network_in_other_arrangements_too(depth, stem):
     assert len(make_runtime("onnxruntime", net, 0)(planes)) == 1
 
 
-def test_onnxruntime_has_no_bfloat16_and_says_so():
+def test_what_no_runtime_has_is_refused():
     with pytest.raises(InputError, match="ONNX Runtime has no bfloat16"):
         Vision(STATE, runtime="onnxruntime", precision="bfloat16")
-
-
-def test_a_runtime_of_another_name_is_refused():
     with pytest.raises(InputError, match=r"among \['torch', 'onnxruntime'\] .*came 'openvino'"):
         Vision(STATE, runtime="openvino")
 

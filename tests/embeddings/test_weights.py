@@ -123,18 +123,15 @@ def test_a_tensor_of_another_shape_or_type_is_named(state):
     assert "torch.int32" in refusal(state)
 
 
-@pytest.mark.parametrize(("name", "value"), [("layer1.0.conv1.weight", np.nan), ("bn1.running_var", -1.0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("layer1.0.conv1.weight", np.nan), ("bn1.running_var", -1.0), ("bn1.bias", 1e300)]
+)
 def test_values_that_cannot_be_are_refused(state, name, value):
-    state[name] = state[name].clone()
+    state[name] = state[name].double()  # 1e300 overflows float32
     state[name].view(-1)[3] = value
     message = refusal(state)
     assert name in message
     assert "NaN, infinite or impossible" in message
-
-
-def test_a_double_that_overflows_float32_is_refused(state):
-    state["bn1.bias"] = torch.full((64,), 1e300, dtype=torch.float64)
-    assert "bn1.bias" in refusal(state)
 
 
 @pytest.mark.parametrize(
@@ -148,11 +145,7 @@ def test_a_double_that_overflows_float32_is_refused(state):
     ids=["nothing", "a small stem", "a transformer", "a ResNet-101"],
 )
 def test_another_architecture_is_refused(tensors):
-    message = refusal(tensors)
-    assert "expected in the given state dict a ResNet of depth 18, 34, 50" in message
-
-
-def test_names_without_tensors_are_refused():
+    assert "expected in the given state dict a ResNet of depth 18, 34, 50" in refusal(tensors)
     assert "epoch are none" in refusal({"epoch": 3})
 
 
@@ -179,19 +172,14 @@ def test_a_pickle_that_would_execute_is_refused_and_not_executed(tmp_path, how):
 
 
 @pytest.mark.parametrize("suffix", ["safetensors", "pth"])
-@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.999])
-def test_a_file_cut_off_is_refused(state, tmp_path, suffix, keep):
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.999])
+def test_a_file_cut_off_or_of_something_else_is_refused(state, tmp_path, suffix, keep):
     path = tmp_path / f"weights.{suffix}"
     small = {name: state[name] for name in ("conv1.weight", "bn1.weight", "layer1.0.conv1.weight")}
     save_file(small, path) if suffix == "safetensors" else torch.save(small, path)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * keep)])
     assert str(path) in refusal(path)
-
-
-@pytest.mark.parametrize("suffix", ["safetensors", "pth"])
-def test_a_file_of_something_else_is_refused(tmp_path, suffix):
-    path = tmp_path / f"weights.{suffix}"
     path.write_text("<html>404 not found</html>" * 20)
     assert str(path) in refusal(path)
     torch.save([1, 2, 3], tmp_path / "list.pth")
@@ -270,7 +258,7 @@ def test_a_file_with_any_byte_changed_is_refused_or_read_but_never_fails_otherwi
         path = tmp_path / "some.pth"
         torch.save(tensors, path, _use_new_zipfile_serialization=zipped)
         whole = path.read_bytes()
-        for _ in range(300):
+        for _ in range(100):
             damaged = bytearray(whole)
             damaged[rng.integers(min(len(whole), 600))] = rng.integers(256)
             path.write_bytes(bytes(damaged))

@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from real_sets import CACHE
 
 UNPACK = Path(__file__).parents[2] / "shared" / "data" / "unpack.py"
-CACHE = Path.home() / ".cache" / "scroll-tactile"
 
 
 @pytest.fixture(scope="session")

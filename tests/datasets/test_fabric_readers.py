@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 import pytest
-from conftest import CACHE
+from real_sets import CACHE
 
 from scroll_tactile.datasets import fabric_slide, letter_spike
 from scroll_tactile.datasets.fabric_slide import CPM_FINGER, CPM_RATIOS, FABRICS

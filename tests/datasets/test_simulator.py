@@ -1,7 +1,4 @@
 import random as python_random
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -24,25 +21,21 @@ def test_twenty_materials_that_differ():
     assert len({SCENE.touch(material, 0).key for material in MATERIALS}) == 20
 
 
-@pytest.mark.parametrize("sensor", [BIOTAC, ROBOSKIN, CONTACTILE])
+SMALL = {"rate": 33.0, "low": 0, "high": 1, "unit": "counts", "duration": 1}
+
+
+@pytest.mark.parametrize(
+    "sensor", [BIOTAC, ROBOSKIN, CONTACTILE, *(Sensor(name="s", channels=n, **SMALL) for n in (1, 300))]
+)
 def test_a_touch_is_a_sound_stream_of_the_usual_duration(sensor):
     stream = Scene(sensor=sensor).touch("wool", 3)
     assert stream.readings.shape == (sensor.readings, sensor.channels)
     assert stream.clipped == 0
     assert (stream.readings.std(axis=0) > 0).all()
-
-
-@pytest.mark.parametrize("channels", [1, 2, 7, 300])
-def test_any_channel_count(channels):
-    sensor = Sensor(name="s", channels=channels, rate=33.0, low=0, high=1, unit="counts", duration=1)
-    stream = Scene(sensor=sensor, seed=2**40).touch("silk", 0)
-    assert stream.readings.shape == (33, channels)
-    assert len(np.unique(stream.readings)) > 10  # a range of 0 to 1 is not read in whole counts
-
-
-def test_counts_are_whole():
-    readings = SCENE.touch("oak", 0).readings
-    assert np.array_equal(readings, np.round(readings))
+    if sensor is BIOTAC:
+        assert np.array_equal(stream.readings, np.round(stream.readings))  # counts are whole
+    if sensor.high == 1:
+        assert len(np.unique(stream.readings)) > 10  # a range of 0 to 1 is not read in whole counts
 
 
 def test_a_touch_depends_on_its_arguments_alone():
@@ -55,20 +48,6 @@ def test_a_touch_depends_on_its_arguments_alone():
     assert np.random.get_state()[1].tolist() == numpy_state  # noqa: NPY002 see above
     touches = [SCENE.touch("tile", 5), SCENE.touch("wool", 4), Scene(sensor=BIOTAC, seed=1).touch("tile", 4)]
     assert len({stream.key for stream in [first, *touches]}) == 4
-
-
-def test_another_process_feels_the_same():
-    code = (
-        "from scroll_tactile.datasets.simulator import Scene; from scroll_tactile.sensors import BIOTAC;"
-        "print(Scene(sensor=BIOTAC).touch('felt', 2).key.hex())"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == SCENE.touch("felt", 2).key.hex()
-
-
-def test_contact_builds_up():
-    readings = SCENE.touch("rubber", 1).readings
-    assert readings[0].mean() < readings[200:].mean() - 20
 
 
 def test_seconds_speed_and_force_do_what_they_say():
@@ -104,16 +83,6 @@ def test_materials_can_be_told_apart_by_spectrum_but_hardly_by_mean(sensor):
     lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
     assert 0.15 < cross_val_score(mean, readings.mean(axis=1), labels).mean() < 0.7
     assert cross_val_score(lda, np.log(spectra + 1e-3), labels).mean() > 0.95
-
-
-def test_a_touch_is_quick():
-    SCENE.touch("cork", 0)
-    times = []
-    for repetition in range(20):
-        start = time.perf_counter()
-        SCENE.touch("cork", repetition)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 0.01  # usually 1 ms; the machine may be shared
 
 
 def test_what_cannot_be_simulated_is_refused_with_the_reason():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from examples.paper.plots import draw_activation
 from examples.paper.studies.activation import cka, compare, first_block, maximise
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
@@ -60,12 +59,6 @@ def test_the_first_block_is_the_one_that_the_network_has(stem):
         maps = net(planes, last=0)[0]
         below = torch.nn.functional.max_pool2d(maps, 3, 2, 1) if stem == "torchvision" else maps
         assert torch.equal(first_block(net, planes), net.layer1[0](below))
-
-
-@pytest.mark.parametrize("settings", [{"size": 8}, {"steps": 0}])
-def test_what_cannot_be_maximised_is_refused(net, settings):
-    with pytest.raises(InputError, match="expected images of 16 pixels"):
-        maximise(net, **settings)
 
 
 def test_alignment_does_not_see_turns_and_scales_and_sees_everything_else():
@@ -122,11 +115,3 @@ def test_nothing_to_compare_is_refused(net):
             compare(networks, images, start=start)
     with pytest.raises(InputError, match="'c'"):
         compare({"a": net, "b": net}, [image], start="c")
-
-
-def test_the_picture_is_drawn(images, tmp_path):
-    pytest.importorskip("matplotlib")
-    draw_activation(tmp_path / "a.png", {"one": images, "two": images[:9]})
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(InputError, match="cannot be written"):
-        draw_activation(tmp_path / "none" / "a.png", {"one": images})

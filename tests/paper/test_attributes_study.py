@@ -1,7 +1,6 @@
 """Grades of materials held out are predicted from the others."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,15 +64,6 @@ def test_grades_that_are_missing_or_all_one_are_refused(recordings):
             Attributes(recordings, grades)
 
 
-def test_a_run_is_not_gone_on_with_other_touches(recordings, tmp_path):
-    pytest.importorskip("sklearn")
-    next(Attributes(recordings, {"shaking": GRADE}, 64, folder=tmp_path).run())
-    streams = [*recordings.streams[1:], recordings.streams[0]]
-    other = replace(recordings, streams=streams)
-    with pytest.raises(InputError, match="begun on other recordings"):
-        next(Attributes(other, {"shaking": GRADE}, 64, folder=tmp_path).run())
-
-
 def test_a_table_of_grades_is_read(tmp_path):
     table = tmp_path / "grades.csv"
     table.write_text("\ufeffmaterial, stiffness,foam\nmat1,2,0\n\nmat2, 0 ,1\n", encoding="utf-8")
@@ -102,13 +92,6 @@ def test_a_table_that_says_no_grades_is_named(text, said, tmp_path):
     with pytest.raises(DatasetError, match=r"grades\.csv") as raised:
         read_grades(table)
     assert said in str(raised.value)
-
-
-def test_a_folder_without_the_data_is_one_red_line(tmp_path):
-    grades = tmp_path / "grades.csv"
-    grades.write_text("material,foam\nmat1,1\nmat2,0\n")
-    words = ("fabric", "attributes", "--data", tmp_path, "--grades", grades, "--sets", "biotac-20")
-    assert "Get it from github.com" in refused(*words)
 
 
 def test_the_command_reports_and_writes(recordings, tmp_path, monkeypatch):

@@ -46,9 +46,9 @@ def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatc
 
 
 def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
-    catalogue = Catalogue(course=Course(epochs=30, batch=8))
+    catalogue = Catalogue(course=Course(epochs=15, batch=8))
     make, settings = baseline("conv-lstm", catalogue, augmentation=Augmentation(0, (1, 1), 1, noise=0.3, drift=0))
-    assert settings["epochs"] == 30
+    assert settings["epochs"] == 15
     asked = [noise(stream, 0.4, 0) for _, stream in TEST]
     plain, tough = (make(TRAIN, augmented, silent) for augmented in (False, True))
     shares = [accuracy([name for name, _ in TEST], list(system.predict(asked))) for system in (plain, tough)]
@@ -66,14 +66,6 @@ def test_some_touches_stay_as_they_were_recorded():
     for share, (least, most) in {0.0: (1, 1), 0.3: (0.5, 0.9), 1.0: (0, 0)}.items():
         made = Sometimes(share=share).streams([stream] * 60, np.random.default_rng(0))
         assert least <= np.mean([same(item) for item in made]) <= most
-
-
-def test_the_validation_is_drawn_by_the_seed_alone():
-    first, second = (baseline("svm", Catalogue(), seed=seed)[1] for seed in (0, 1))
-    assert first["seed"] != second["seed"]
-    before = np.random.get_state()[1].copy()  # noqa: NPY002 (it is looked at only)
-    baseline("svm-spikes", Catalogue())[0](TRAIN, True, silent)
-    assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
 
 
 def test_systems_that_are_no_baselines_are_refused():

@@ -164,12 +164,8 @@ class TestRefusals:
     def test_settings_that_cannot_be(self, fabrics, settings, message):
         with pytest.raises(InputError, match=message):
             Contactile(fabrics, **({"rows": ("kernels",)} | settings))
-
-    def test_one_protocol_alone_and_other_parts(self, fabrics):
         with pytest.raises(InputError, match=r"protocols 1 and 2; came \[1\]"):
             Contactile(replace(fabrics, protocol=np.ones_like(fabrics.protocol)), ("kernels",))
-        with pytest.raises(InputError, match="expected parts"):
-            list(Contactile(fabrics, ("kernels",)).run(["foot"]))
 
 
 class TestCommand:

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import refused, run
+from commands import run
 
 from examples.paper.fabric.fabric_study import Letters, SlideTransfer, directions, summary
 from scroll_tactile.datasets import Recordings
@@ -162,8 +162,3 @@ def test_the_commands_report_write_and_resume(letters, slides, tmp_path, monkeyp
     assert reported.exit_code == 0, reported.output
     assert "slow → fast" in reported.output
     assert len(json.loads((tmp_path / "slide.json").read_text())["parts"]) == 9
-
-
-def test_a_folder_without_the_data_is_one_red_line(tmp_path):
-    for what in ("letters", "slide"):
-        assert "Get it from github.com" in refused("fabric", what, "--data", tmp_path)

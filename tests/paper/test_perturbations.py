@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from paper_touches import PAD
 
-from examples.paper.studies.robustness_study import PERTURBED
-from scroll_tactile import Sensor, sensors
+from scroll_tactile import sensors
 from scroll_tactile.errors import InputError, StreamTooShortError
 from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
 from scroll_tactile.signals.stream import validate
 
-PAD = Sensor(name="pad", channels=10, rate=50.0, low=-2.0, high=6.0, unit="N", duration=2.0)
 DRAWN = (noise, dead, drift)
 
 
@@ -97,10 +96,3 @@ def test_what_cannot_be_is_refused():
     frame = validate(np.zeros((1, *sensors.GELSIGHT.shape)), sensors.GELSIGHT)
     with pytest.raises(InputError, match="whole frames"):
         noise(frame, 0.5, 0)
-
-
-def test_every_study_has_the_strengths_that_are_quoted():
-    for name, strength in (("length", 0.3), ("speed", 0.5), ("speed", 2.0), ("noise", 0.5), ("dead", 0.2)):
-        for quick in (True, False):
-            assert strength in PERTURBED[name].of(sensors.BIOTAC, quick=quick)
-    assert PERTURBED["length"].of(sensors.ROBOSKIN)[-1] == sensors.ROBOSKIN.duration

@@ -46,13 +46,6 @@ class TestReplay:
         resumed = list(task.run([0, 1]))
         assert untimed(resumed) == untimed(whole)
 
-    def test_no_schedule_makes_a_difference(self, recordings: Recordings) -> None:
-        digests = {
-            next(Replay(recordings, schedule, features=64).run([0]))["digest"]
-            for schedule in ("reversed", "interleaved")
-        }
-        assert len(digests) == 1
-
     def test_what_cannot_be_is_refused(self, recordings: Recordings) -> None:
         with pytest.raises(InputError, match="folds out of"):
             list(Replay(recordings).run([2]))

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from commands import refused, run
-from test_perturbations import PAD
+from commands import run
+from paper_touches import PAD
 
 from examples.paper import drawing as plots
 from examples.paper.plots import draw_robustness, robustness_curves
@@ -92,14 +92,6 @@ def test_an_interrupted_run_goes_on(tmp_path):
         list(study(tmp_path / "run", seed=1).run([0]))
 
 
-def test_a_run_is_not_gone_on_with_other_touches(tmp_path):
-    list(study(tmp_path / "run", studies=["dead"]).run([0]))
-    other = recordings()
-    other.streams[0] = other.streams[1]
-    with pytest.raises(InputError, match="begun on other recordings"):
-        list(Robustness(other, {"loudest": Loudest}, studies=["dead"], quick=True, folder=tmp_path / "run").run([0]))
-
-
 def test_a_cameras_frames_are_refused():
     gel = Gel()
     streams = [gel.touch(name, i) for name in gel.materials[:2] for i in range(4)]
@@ -152,12 +144,20 @@ def test_the_picture(tmp_path):
         draw_robustness(tmp_path / "p.png", [], title="nothing")
 
 
-def test_the_command_says_what_is_missing(tmp_path):
-    assert "biotac_slide_20_50" in refused("robustness", "noise", "--data", tmp_path)
-
-
 def test_the_command_on_real_touches(real_data, tmp_path):
-    words = ["robustness", "dead", "--sets", "roboskin-20", "--data", real_data, "--quick", "--materials", 2]
+    words = [
+        "robustness",
+        "dead",
+        "--sets",
+        "roboskin-20",
+        "--data",
+        real_data,
+        "--quick",
+        "--materials",
+        2,
+        "--folds",
+        0,
+    ]
     result = run(*words, "--json", tmp_path / "r.json", "--plot", tmp_path / "r.png", "--run", tmp_path / "run")
     assert result.exit_code == 0, result.output
     reported = json.loads((tmp_path / "r.json").read_text())

@@ -26,7 +26,6 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Augmentation
-from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.2)
@@ -84,12 +83,6 @@ class TestSpikes:
         with pytest.raises(InputError, match="threshold above 0"):
             decode(np.zeros((2, 5), np.float32), threshold)
 
-    def test_other_shapes_are_refused(self):
-        with pytest.raises(InputError, match=r"\(C, T\)"):
-            encode(np.zeros(5, np.float32), 0.1)
-        with pytest.raises(InputError, match="OFF"):
-            decode(np.zeros((3, 5), np.float32), 0.1)
-
 
 class TestInputs:
     def test_a_frame_keeps_its_colours(self):
@@ -98,9 +91,6 @@ class TestInputs:
         image = picture(validate(frames, HALF_SIZE))
         assert image.shape == (3, 120, 160)
         assert np.allclose(image[0], 0) and np.allclose(image[1:], -1)
-
-    def test_a_stream_is_its_tactile_image(self):
-        assert np.array_equal(picture(TEST[0][1]), tactile_image(TEST[0][1]))
 
     def test_columns_are_averaged(self):
         image = np.arange(14, dtype=np.float32).reshape(2, 7)
@@ -167,6 +157,8 @@ class TestCatalogue:
         for key in ("resnet-pretrained", "least-squares", "kernels+vision-lda"):
             with pytest.raises(InputError, match="needs weights"):
                 Catalogue().make(key)
+        with pytest.raises(InputError, match="came 'tpu'"):
+            Catalogue(device="tpu").make("conv-lstm")
 
     def test_a_missing_library_is_named_with_its_extra(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setitem(sys.modules, "snntorch", None)
@@ -175,10 +167,6 @@ class TestCatalogue:
         monkeypatch.setitem(sys.modules, "sklearn.svm", None)
         with pytest.raises(InputError, match=r"scroll-tactile\[bench\]"):
             fit(Catalogue().make("svm"))
-
-    def test_a_device_that_is_not_there(self):
-        with pytest.raises(InputError, match="came 'tpu'"):
-            Catalogue(device="tpu").make("conv-lstm")
 
 
 def test_the_validation_chooses_and_is_learned_then():
@@ -210,11 +198,7 @@ def state(system: TrainedNetwork) -> list[bytes]:
 
 
 class TestTraining:
-    def test_the_seed_makes_the_weights(self):
-        assert state(trained()) == state(trained())
-        assert state(trained()) != state(trained(seed=1))
-
-    def test_global_generators_are_left_alone(self):
+    def test_the_seed_makes_the_weights_and_global_generators_are_left_alone(self):
         torch.manual_seed(5)
         before, numpys = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002 (it is looked at only)
         trained(augmentation=Augmentation())
@@ -222,9 +206,8 @@ class TestTraining:
         assert np.array_equal(numpys, np.random.get_state()[1])  # noqa: NPY002
         first = state(trained())
         torch.manual_seed(6)
-        assert state(trained()) == first
+        assert state(trained()) == first != state(trained(seed=1))
 
-    def test_an_interrupted_fit_gives_the_generator_back(self):
         def interrupt() -> None:
             raise KeyboardInterrupt
 
@@ -284,13 +267,6 @@ class TestTraining:
         assert torch.equal(net.weight, kept[0])
         assert not torch.equal(kept[0], kept[-1])
 
-    def test_without_validation_the_training_loss_is_judged(self):
-        system = TrainedNetwork(
-            "net", lambda shape, count, _: ConvLSTM(shape[0], count), course=Course(epochs=2, batch=8)
-        )
-        system.fit([stream for _, stream in TRAIN], [name for name, _ in TRAIN], [], 0)
-        assert [epoch.validation_loss for epoch in system.epochs] == [None, None]
-
     def test_a_loss_that_is_not_finite_stops_it(self):
         images = torch.full((4, 2), torch.nan)
         batches = Batches(lambda places: images[torch.from_numpy(places)], torch.zeros(4, dtype=torch.long))
@@ -323,10 +299,6 @@ class TestTraining:
         catalogue = Catalogue(weights, Course(epochs=1, precision="bfloat16"))
         precision = {key: catalogue.make(key).course.precision for key in ("resnet", "resnet-pretrained", "conv-lstm")}  # type: ignore[attr-defined]
         assert precision == {"resnet": "bfloat16", "resnet-pretrained": "bfloat16", "conv-lstm": "float32"}
-
-    def test_a_course_in_proportion_is_the_papers_where_it_has_its_epochs(self):
-        assert Course.in_proportion(100) == Course()
-        assert [Course.in_proportion(epochs).patience for epochs in (1, 20, 200)] == [1, 2, 20]
 
     @pytest.mark.parametrize(
         "wrong", [{"epochs": 0}, {"batch": 1}, {"rate": 0.0}, {"factor": 1.0}, {"momentum": 1.0}, {"precision": "half"}]
@@ -370,7 +342,3 @@ class TestNetworks:
             assert torch.allclose(net(images), before, rtol=1e-3, atol=1e-3 * float(before.abs().max()))
             trained = net.train()(images)  # the batch has the statistics that the network now has
         assert torch.allclose(trained, before, rtol=1e-2, atol=1e-2 * float(before.abs().max()))
-
-    def test_a_colour_frame_is_read(self):
-        net = ResNetClassifier(ResNet.random(0), 4).eval()
-        assert net(torch.rand(2, 3, 24, 32)).shape == (2, 4)

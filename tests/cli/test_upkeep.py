@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from commands import refused, run
-from test_learner_machine import PAD, SETTINGS, fed, require_same, stream
+from touches import PAD, SETTINGS, fed, require_same, stream
 
 from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
 from scroll_tactile.cli.terminal import opened_for_upkeep

@@ -1,19 +1,151 @@
 """Ten thousand steps of random histories against the model: `python tests/faults/history.py --steps 10000 --seed 0`."""
 
 import argparse
+import itertools
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import numpy as np
+import pytest
 from hypothesis import HealthCheck, Phase, seed, settings
-from hypothesis.stateful import invariant, run_state_machine_as_test
-from test_learner_machine import History
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from touches import SMALL, SmallSample, contents, fed, stream
 
-from faults.common import parser, progress, run  # after the path to the tests
+from faults.common import parser, progress, run
+from faults.model import MATERIALS, State, after, expected, opened, perform, seen
+from faults.plans import KINDS, draw, prepare, touch
+from scroll_tactile.errors import StreamError
+from scroll_tactile.statistics.statistics import Statistics
 
 LENGTH = 50
+readouts = st.sampled_from(["lda", "ridge"])
+randoms = st.randoms(use_true_random=False)
+
+
+class History(RuleBasedStateMachine):
+    """Random operations on a memory with a reader beside it; the model is a list of touches that cannot go wrong."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pools = mock.patch("scroll_tactile.memory.state.TouchSample", SmallSample)
+        self.pools.start()
+        self.home = Path(tempfile.mkdtemp())
+        self.others = prepare(self.home)
+        self.names = itertools.count()
+        self.state = State()
+
+    @initialize()
+    def create(self) -> None:
+        self.path = self.home / f"memory-{next(self.names)}"
+        self.learner = opened(self.path)
+        self.reader = opened(self.path, "read")
+
+    def do(self, operation: Any) -> None:
+        self.state, result = after(self.state, operation, self.others)
+        assert perform(self.learner, operation, self.home) == result
+
+    @rule(kind=st.sampled_from(KINDS), rng=randoms)
+    def change(self, kind: str, rng: Any) -> None:
+        self.do(draw(rng, self.state, self.others, kind))
+
+    @rule(rng=randoms)
+    def fail_in_a_batch(self, rng: Any) -> None:
+        """What came before the error is kept."""
+        _, operations = draw(rng, self.state, self.others, "batch")
+        with pytest.raises(StreamError), self.learner.batch():
+            for operation in operations:
+                self.do(operation)
+            self.learner.observe("a", [])
+
+    @rule()
+    def refuse(self) -> None:
+        for observation in self.state.felt:
+            if observation.fixed:
+                self.do(("retract", observation.sequence))
+        for material, readings in (("a", np.full((50, 2), np.nan)), ("a", []), ("", np.zeros((50, 2)))):
+            with pytest.raises(ValueError, match="expected"):
+                self.learner.observe(material, readings)
+
+    @rule(rng=randoms, scene=st.none() | st.lists(st.sampled_from(MATERIALS), min_size=1))
+    def predict(self, rng: Any, scene: list[str] | None) -> None:
+        observed = {observation.material for observation in self.state.felt}
+        chosen = observed.intersection(scene or ())
+        prediction = self.learner.predict(stream(touch(rng)), scene=chosen or None)
+        assert {name for name, _ in prediction.ranking} == (chosen or observed)
+        shares = [share for _, share in prediction.ranking]
+        assert np.isfinite(shares).all()
+        assert not shares or abs(sum(shares) - 1) < 1e-9
+
+    @rule(readout=readouts)
+    def reopen(self, readout: str) -> None:
+        self.learner.close()
+        self.learner = opened(self.path, readout=readout)
+        self.agrees(self.learner)
+
+    @rule(readout=readouts)
+    def abandon(self, readout: str) -> None:
+        """Leave the memory as it lies on the disk, as a kill would, and go on from there."""
+        before, self.path = self.path, self.home / f"memory-{next(self.names)}"
+        shutil.copytree(before, self.path, ignore=shutil.ignore_patterns("*-shm", "lock"))
+        self.learner.close()
+        self.reader.close()
+        self.learner, self.reader = opened(self.path, readout=readout), opened(self.path, "read")
+
+    @rule()
+    def refresh(self) -> None:
+        self.reader.refresh()
+        self.agrees(self.reader)
+        assert not self.reader.refresh()
+
+    @rule(rng=randoms)
+    def split_and_add(self, rng: Any) -> None:
+        """The statistics of two memories that share the touches are, together, those of the one that observed all."""
+        sides: tuple[list[Any], list[Any]] = ([], [])
+        for observation in self.state.felt:
+            sides[rng.randrange(2)].append(observation.pair)
+        ours, theirs = (fed(side).memory.statistics for side in sides)
+        whole = self.learner.memory.statistics
+        assert ours + theirs == whole
+        assert whole - ours == theirs
+        assert whole - whole == Statistics(SMALL.dimension, whole.scales)
+
+    @invariant()
+    @precondition(lambda self: hasattr(self, "learner"))
+    def is_counted(self) -> None:
+        assert sum(self.learner.materials.values()) == len(self.state.felt)
+
+    def agrees(self, learner: Any) -> None:
+        """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
+        assert seen(learner) == expected(self.state)
+        whole = fed(self.state.pairs, learner.descriptions, readout=learner.settings.readout)
+        if self.state.tuned is None:
+            assert contents(learner) == contents(whole)
+        assert repr(learner.descriptions) == repr({name: dict(parts) for name, parts in self.state.said})
+        if self.state.said:
+            assert repr(learner.compose(stream((7, 25)))) == repr(whole.compose(stream((7, 25))))
+
+    def teardown(self) -> None:
+        if hasattr(self, "learner"):
+            self.agrees(self.learner)
+            self.reopen(self.learner.settings.readout)
+            self.learner.close()
+            self.reader.close()
+        self.pools.stop()
+        shutil.rmtree(self.home)
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:

@@ -16,29 +16,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
+from touches import PAD, SETTINGS, SmallSample, fed, stream
 
 import scroll_tactile.memory.state
-from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.errors import InputError
-from scroll_tactile.statistics.sample import TouchSample
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError, MismatchError
 
-PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 MATERIALS = ("a", "b", "c", "ü")
 LENGTHS = (9, 16, 25, 40, 60, 90, 90)  # the widest scale needs 37, a fine-tune some of two materials
 
 Touch = tuple[int, int]
 Constituents = tuple[tuple[str, float | bool | None], ...]
 Operation = tuple[Any, ...]
-
-
-class SmallSample(TouchSample):
-    """A pool that is soon full, so that what was left out of it has to come back."""
-
-    def __init__(self, capacity: int = 5) -> None:
-        super().__init__(capacity)
 
 
 def warm() -> None:
@@ -56,7 +46,7 @@ def warm() -> None:
     from numcodecs import blosc  # noqa: F401
 
 
-_settings: dict[str, Any] = {"sensor": PAD, "embedding": Kernels(seed=0, dimension=64), "exemplars": 4}
+_settings: dict[str, Any] = dict(SETTINGS)
 
 
 def settings() -> dict[str, Any]:
@@ -69,15 +59,9 @@ def one_scale() -> None:
     _settings["sensor"] = PAD.model_copy(update={"duration": 0.3})
 
 
-def opened(path: Path, mode: Any = "write") -> TactileLearner:
+def opened(path: Path, mode: Any = "write", **more: Any) -> TactileLearner:
     """The memory in folder `path`."""
-    return TactileLearner.open(path, mode=mode, **settings())
-
-
-def stream(touch: Touch) -> npt.NDArray[np.float64]:
-    """The readings of a touch, the same for the same numbers."""
-    seed, readings = touch
-    return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
+    return TactileLearner.open(path, mode=mode, **settings(), **more)
 
 
 @dataclass(frozen=True)
@@ -143,15 +127,19 @@ class State:
 
 @dataclass(frozen=True)
 class Other:
-    """A memory to be merged. felt: what it holds, of which the first `fixed` were compacted. based: any row was."""
+    """A memory to be merged. felt: what it holds, of which the first `fixed` were compacted. based: any row was.
+
+    said: what it says that materials are made of.
+    """
 
     felt: Pairs
     fixed: int
     based: bool
+    said: tuple[tuple[str, Constituents], ...] = ()
 
 
 def after(state: State, operation: Operation, others: dict[str, Other]) -> tuple[State, Any]:
-    """What an operation makes of a state, and what the call returns: JSON, or the name of the InputError it raises."""
+    """What an operation makes of a state, and what the call returns: JSON, or the name of the error that it raises."""
     kind, *rest = operation
     return _AFTER[kind](state, others, *rest)
 
@@ -189,17 +177,26 @@ def _describe(state: State, _: Any, material: str, constituents: Constituents | 
     return replace(state.with_said(material, constituents), last=state.last + changed), None
 
 
-def _merge(state: State, others: dict[str, Other], name: str, shared: str) -> tuple[State, Any]:
-    other = others[name]
+def _merge(
+    state: State, others: dict[str, Other], name: str, shared: str, descriptions: str = "same"
+) -> tuple[State, Any]:
+    other, said = others[name], dict(state.said)
     ours = {one.pair for one in state.felt}
-    both = [at for at, pair in enumerate(other.felt) if pair in ours]
-    if shared == "once" and any(at < other.fixed for at in both):
+    both = [i for i, pair in enumerate(other.felt) if pair in ours]
+    if shared == "once" and any(i < other.fixed for i in both):
         return state, "ObservationError"
-    coming = [at for at in range(len(other.felt)) if shared == "twice" or at not in both]
-    state = replace(state, last=state.last + other.based)
-    for at in coming:
-        state = state.with_one(*other.felt[at], fixed=at < other.fixed)
-    return state, [len(coming), len(both)]
+    new = {material: parts for material, parts in other.said if repr(said.get(material)) != repr(parts)}
+    if descriptions == "same" and new.keys() & said.keys():
+        return state, "MismatchError"
+    if descriptions == "ours":
+        new = {material: parts for material, parts in new.items() if material not in said}
+    coming = [i for i in range(len(other.felt)) if shared == "twice" or i not in both]
+    for material, parts in new.items():
+        state = state.with_said(material, parts)
+    state = replace(state, last=state.last + len(new) + other.based)
+    for i in coming:
+        state = state.with_one(*other.felt[i], fixed=i < other.fixed)
+    return state, [len(coming), len(both), len(new)]
 
 
 def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
@@ -234,7 +231,7 @@ def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
     kind, *rest = operation
     try:
         return _CALLS[kind](learner, home, *rest)
-    except InputError as error:
+    except (InputError, MismatchError) as error:
         return type(error).__name__
 
 
@@ -247,9 +244,9 @@ def _do_batch(learner: TactileLearner, home: Path, operations: tuple[Operation, 
         return [perform(learner, one, home) for one in operations]
 
 
-def _do_merge(learner: TactileLearner, home: Path, name: str, shared: Any) -> list[int]:
-    merged = learner.merge(home / name, shared=shared)
-    return [merged.observations, merged.shared]
+def _do_merge(learner: TactileLearner, home: Path, name: str, shared: Any, descriptions: Any = "same") -> list[int]:
+    merged = learner.merge(home / name, shared=shared, descriptions=descriptions)
+    return [merged.observations, merged.shared, merged.described]
 
 
 _CALLS = {
@@ -301,22 +298,15 @@ def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None
     return next((state for state, keys in zip(states, differ, strict=True) if not keys), None), differ
 
 
-def _taught(pairs: Pairs) -> TactileLearner:
-    learner = TactileLearner(**settings())
-    for material, touch in pairs:
-        learner.observe(material, stream(touch))
-    return learner
-
-
 @functools.lru_cache(maxsize=4096)
 def _felt(pairs: Pairs) -> dict[str, Any]:
-    return seen(_taught(pairs))
+    return seen(fed(pairs, **settings()))
 
 
 @functools.lru_cache(maxsize=4096)
 def tuned_digest(pairs: Pairs) -> str | None:
     """The digest of the f* that is made from touches; None where none can be."""
     try:
-        return _taught(pairs).fine_tune(epochs=1).digest
+        return fed(pairs, **settings()).fine_tune(epochs=1).digest
     except InputError:
         return None

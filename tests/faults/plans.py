@@ -5,7 +5,9 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened, stream
+from touches import stream
+
+from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
 
 KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune")
 
@@ -34,7 +36,10 @@ def prepare(home: Path) -> dict[str, Other]:
             if keep is not None:
                 learner.compact(keep=keep)
             fixed = 0 if keep is None else max(0, len(left) - keep)
-            others[name] = Other(left, fixed, learner._ledger.memory.base > 0)
+            said = {"plain": (), "taken": (("b", SAID[1]),), "compacted": (("a", SAID[1]), ("ü", SAID[3]))}[name]
+            for material, constituents in said:  # of one that was compacted behind its base
+                learner.describe(material, dict(constituents))
+            others[name] = Other(left, fixed, learner._ledger.memory.base > 0, said)
     return others
 
 
@@ -49,7 +54,7 @@ def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) 
     if kind in ("retract", "forget"):
         return kind, _to_retract(rng, state, kind)
     if kind == "merge":
-        return kind, rng.choice(sorted(others)), rng.choice(("twice", "once"))
+        return kind, rng.choice(sorted(others)), rng.choice(("twice", "once")), rng.choice(("same", "ours", "theirs"))
     return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)
 
 

@@ -26,9 +26,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from touches import stream
+
 import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, State, after, expected, opened, perform, seen, stream, warm
+from faults.model import Operation, State, after, expected, opened, perform, seen, warm
 from faults.plans import draw
 from faults.zygote import Zygote
 from store import LockedError

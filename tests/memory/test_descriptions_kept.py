@@ -1,14 +1,12 @@
 """What materials are made of is kept as durably as what was observed, and told apart from it."""
 
 import csv
-import shutil
 
 import pytest
-from test_learner_machine import SETTINGS, fed, require_same, stream
-from test_retracting import FELT, filled, spoil
+from touches import OBSERVED, SETTINGS, fed, filled, require_same, spoil, stream
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
+from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
 from store import ReadOnlyError, Store, StoreClosedError, StoreError, StoreFullError
 
@@ -20,25 +18,11 @@ def path(tmp_path):
     return tmp_path / "m"
 
 
-def told(path, felt=FELT, said=SAID):
+def told(path, felt=OBSERVED, said=SAID):
     learner, receipts = filled(path, felt)
     for name, one in said.items():
         learner.describe(name, one)
     return learner, receipts
-
-
-def test_it_is_in_the_journal_when_it_returns(path, tmp_path):
-    learner, _ = told(path)
-    shutil.copytree(path, tmp_path / "copy", ignore=shutil.ignore_patterns("*-shm", "lock"))
-    with TactileLearner.open(tmp_path / "copy", **SETTINGS) as again:  # as after a kill
-        require_same(again, FELT, SAID)
-    learner.close()
-    with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, FELT, SAID)
-        again.describe("a", None)
-        again.describe("c", SAID["a"])
-    with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, FELT, {"b": SAID["b"], "c": SAID["a"], "d": SAID["d"]})
 
 
 def test_the_same_twice_changes_nothing_and_one_is_not_true(path):
@@ -49,36 +33,7 @@ def test_the_same_twice_changes_nothing_and_one_is_not_true(path):
         assert learner._ledger.store.last == rows
         learner.describe("b", {"silk": True})
         assert learner._ledger.store.last == rows + 1
-        require_same(learner, FELT, SAID | {"b": {"silk": True}})
-
-
-def test_forgetting_takes_it_along_and_retracting_does_not(path):
-    left, said = [one for one in FELT if one[0] != "b"], {name: one for name, one in SAID.items() if name != "b"}
-    with told(path)[0] as learner:
-        learner.retract(1)
-        learner.forget("b")
-        require_same(learner, left[1:], said)
-        with pytest.raises(UnknownMaterialError):
-            learner.forget("d")  # described, and never observed
-        learner.describe("b", SAID["b"])  # said again, it stays
-    with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, left[1:], SAID)
-        with pytest.raises(ObservationError, match="of kind 'describe'"):
-            again.retract(13)
-
-
-@pytest.mark.parametrize("keep", [0, 3])
-def test_it_stays_over_a_compaction(path, keep):
-    with told(path)[0] as learner:
-        learner.forget("b")
-        learner.describe("c", SAID["b"])
-        learner.compact(keep=keep)
-        learner.describe("a", {"soft": False})
-        expected = {"a": {"soft": False}, "c": SAID["b"], "d": SAID["d"]}
-        left = [one for one in FELT if one[0] != "b"]
-        require_same(learner, left, expected)
-    with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, left, expected)
+        require_same(learner, OBSERVED, SAID | {"b": {"silk": True}})
 
 
 def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
@@ -94,23 +49,23 @@ def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
             spoil(path, int(folder.name))
     with TactileLearner.open(path, **SETTINGS) as again:
         assert again.memory.generation == base
-        require_same(again, FELT, {name: one for name, one in SAID.items() if name != "a"})
+        require_same(again, OBSERVED, {name: one for name, one in SAID.items() if name != "a"})
 
 
 def test_a_batch_is_durable_as_a_whole(path):
     with TactileLearner.open(path, **SETTINGS) as learner:
         reader = TactileLearner.open(path, mode="read", **SETTINGS)
         with learner.batch():
-            learner.observe(*[FELT[0][0], stream(FELT[0][1])])
+            learner.observe(*[OBSERVED[0][0], stream(OBSERVED[0][1])])
             learner.describe("a", SAID["a"])
             assert not reader.refresh()
         assert reader.refresh()
-        require_same(reader, FELT[:1], {"a": SAID["a"]})
+        require_same(reader, OBSERVED[:1], {"a": SAID["a"]})
         learner.describe("a", SAID["b"])
         before = reader.compose(stream((7, 25)))
         assert reader.refresh()
         assert reader.compose(stream((7, 25))) != before
-        require_same(reader, FELT[:1], {"a": SAID["b"]})
+        require_same(reader, OBSERVED[:1], {"a": SAID["b"]})
         with pytest.raises(ReadOnlyError):
             reader.describe("a", None)
         reader.close()
@@ -131,55 +86,35 @@ def test_a_full_disk_changes_nothing(path, monkeypatch):
                 learner.forget("b")
             with pytest.raises(StoreError), learner.batch():
                 learner.describe("a", SAID["b"])
-        require_same(learner, FELT, SAID)
+        require_same(learner, OBSERVED, SAID)
         learner.describe("a", None)
     with pytest.raises(StoreClosedError):
         learner.describe("a", SAID["a"])
 
 
 class TestMerge:
-    def test_descriptions_come_in_and_stay(self, path, tmp_path):
-        ours, _ = told(path, FELT[:6], {"a": SAID["a"]})
-        theirs, _ = told(tmp_path / "other", FELT[6:], SAID)
-        with ours, theirs:
-            theirs.compact(keep=2)
-            assert ours.merge(theirs, shared="once").described == 2
-            require_same(ours, FELT, SAID)
-            require_same(theirs, FELT[6:], SAID)
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, FELT, SAID)
-
     def test_of_two_descriptions_one_is_chosen_by_name(self, path, tmp_path):
         other = SAID | {"a": {"wool": 1.0}}
-        ours, _ = told(path, FELT[:6])
-        theirs, _ = told(tmp_path / "other", FELT[6:], other)
+        ours, _ = told(path, OBSERVED[:6])
+        theirs, _ = told(tmp_path / "other", OBSERVED[6:], other)
         with ours, theirs:
             with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
                 ours.merge(theirs, shared="once")
             with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
                 ours.merge(theirs, shared="once", descriptions="both")
-            require_same(ours, FELT[:6], SAID)
+            require_same(ours, OBSERVED[:6], SAID)
             ours.merge(theirs, shared="once", descriptions="ours")
-            require_same(ours, FELT, SAID)
+            require_same(ours, OBSERVED, SAID)
             assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
-            require_same(ours, FELT, other)
-
-    def test_what_was_taken_away_there_does_not_come_in(self, path, tmp_path):
-        ours, _ = told(path, FELT[:6], {})
-        theirs, _ = told(tmp_path / "other", FELT[6:])
-        with ours, theirs:
-            theirs.compact()
-            theirs.describe("a", None)
-            ours.merge(theirs, shared="once")
-            require_same(ours, FELT, {"b": SAID["b"], "d": SAID["d"]})
+            require_same(ours, OBSERVED, other)
 
 
 def test_without_a_path_it_is_said_all_the_same():
-    learner = fed(FELT, SAID)
+    learner = fed(OBSERVED, SAID)
     sequence = learner.memory.sequence
     learner.describe("c", {"silk": 1.0})
-    assert learner.memory.sequence == sequence == len(FELT)
-    require_same(learner, FELT, SAID | {"c": {"silk": 1.0}})
+    assert learner.memory.sequence == sequence == len(OBSERVED)
+    require_same(learner, OBSERVED, SAID | {"c": {"silk": 1.0}})
 
 
 def test_it_is_written_out_plain(path, tmp_path):
@@ -206,4 +141,4 @@ def test_a_memory_of_before_has_none(path):
         attributes = {name: value for name, value in newest.attributes.items() if name != "descriptions"}
         store.commit(newest.arrays, upto=newest.upto, attributes=attributes)
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, FELT)
+        require_same(again, OBSERVED)

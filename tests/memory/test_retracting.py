@@ -4,9 +4,8 @@ import sqlite3
 import threading
 from contextlib import closing
 
-import numpy as np
 import pytest
-from test_learner_machine import PAD, SETTINGS, SMALL, SmallSample, fed, require_same, stream
+from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_same, spoil, stream, without
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import (
@@ -14,8 +13,6 @@ from scroll_tactile.errors import (
     InputError,
     MismatchError,
     ObservationError,
-    StreamError,
-    UnknownMaterialError,
 )
 from scroll_tactile.signals.stream import validate
 from store import (
@@ -29,46 +26,18 @@ from store import (
     repair_store,
 )
 
-FELT = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
-
 
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "m"
 
 
-def filled(path, felt=FELT, **settings):
-    learner = TactileLearner.open(path, **SETTINGS | settings)
-    return learner, [learner.observe(name, stream(touch)) for name, touch in felt]
-
-
-def without(*places):
-    return [one for at, one in enumerate(FELT) if at not in places]
-
-
 class TestRetract:
-    def test_a_receipt_is_retracted_for_good(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            learner.retract(receipts[4])
-            require_same(learner, without(4))
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, without(4))
-            again.retract(receipts[0].sequence)
-            require_same(again, without(0, 4))
-
-    def test_it_is_in_the_journal_when_it_returns(self, path):
-        learner, receipts = filled(path)
-        learner.retract(receipts[4])
-        with TactileLearner.open(path, mode="read", **SETTINGS) as reader:
-            require_same(reader, without(4))
-        learner.close()
-
     def test_of_a_stream_felt_twice_one_stays(self, path):
-        learner, receipts = filled(path, [*FELT, FELT[1]])
+        learner, receipts = filled(path, [*OBSERVED, OBSERVED[1]])
         with learner:
             learner.retract(receipts[1])
-            require_same(learner, FELT)
+            require_same(learner, OBSERVED)
             learner.retract(receipts[-1])
             require_same(learner, without(1))
 
@@ -78,7 +47,7 @@ class TestRetract:
         with learner:
             with pytest.raises(ObservationError, match="there is no observation"):
                 learner.retract(wrong)
-            require_same(learner, FELT)
+            require_same(learner, OBSERVED)
 
     def test_twice_is_refused(self, path):
         learner, receipts = filled(path)
@@ -92,14 +61,14 @@ class TestRetract:
 
     def test_a_receipt_of_another_memory_is_refused(self, path, tmp_path):
         learner, _ = filled(path)
-        other, receipts = filled(tmp_path / "other", FELT[::-1])
+        other, receipts = filled(tmp_path / "other", OBSERVED[::-1])
         with learner, other:
             with pytest.raises(ObservationError, match=r"receipt is of another memory: .* of 'c'.* it is of 'a'"):
                 learner.retract(receipts[0])
-            require_same(learner, FELT)
+            require_same(learner, OBSERVED)
 
     def test_without_a_journal_nothing_can_be_retracted(self):
-        learner = fed(FELT)
+        learner = fed(OBSERVED)
         for call in (lambda: learner.retract(1), lambda: learner.forget("a"), learner.compact):
             with pytest.raises(InputError, match="a memory without a path keeps no journal"):
                 call()
@@ -111,7 +80,7 @@ class TestRetract:
             for call in (lambda: reader.retract(receipts[0]), lambda: reader.forget("a"), reader.compact):
                 with pytest.raises(ReadOnlyError):
                     call()
-            require_same(reader, FELT)
+            require_same(reader, OBSERVED)
 
     def test_a_full_disk_changes_nothing(self, path, monkeypatch):
         learner, receipts = filled(path)
@@ -126,34 +95,9 @@ class TestRetract:
                     learner.retract(receipts[0])
                 with pytest.raises(StoreFullError):
                     learner.forget("b")
-            require_same(learner, FELT)
+            require_same(learner, OBSERVED)
             learner.retract(receipts[0])
             require_same(learner, without(0))
-
-
-class TestForget:
-    def test_a_material_was_never_felt(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            learner.retract(receipts[1])
-            assert learner.forget("b") == 3
-            left = [one for one in FELT if one[0] != "b"]
-            require_same(learner, left)
-            with pytest.raises(UnknownMaterialError, match="'b' was never observed"):
-                learner.forget("b")
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, left)
-
-    def test_all_of_them_leave_an_empty_memory(self, path):
-        learner, _ = filled(path)
-        with learner:
-            for name in "abc":
-                learner.forget(name)
-            assert learner.materials == {}
-            assert learner.predict(stream((1, 60))).material is None
-            assert learner.digest() == fed([]).digest()
-            learner.observe("a", stream((0, 60)))
-            require_same(learner, [("a", (0, 60))])
 
 
 class TestTuned:
@@ -187,25 +131,13 @@ class TestTuned:
                 learner.fine_tune(epochs=1, progress=progress)
             assert learner.tuned_digest() is None
 
-    def test_it_stays_over_a_compaction(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            learner.fine_tune(epochs=1)
-            made = learner.tuned_digest()
-            learner.compact(keep=2)
-            assert learner.tuned_digest() == made
-        with TactileLearner.open(path, **SETTINGS) as again:
-            assert again.tuned_digest() == made
-            again.retract(receipts[-1])
-            assert again.tuned_digest() is None
-
 
 class TestBatch:
     def test_all_are_there_at_its_end_and_none_before(self, path):
         with TactileLearner.open(path, **SETTINGS) as learner:
             reader = TactileLearner.open(path, mode="read", **SETTINGS)
             with learner.batch():
-                receipts = [learner.observe(name, stream(touch)) for name, touch in FELT]
+                receipts = [learner.observe(name, stream(touch)) for name, touch in OBSERVED]
                 learner.retract(receipts[5])
                 require_same(learner, without(5))
                 assert not any(receipt.durable for receipt in receipts)
@@ -216,20 +148,8 @@ class TestBatch:
         with TactileLearner.open(path, **SETTINGS) as again:
             require_same(again, without(5))
 
-    def test_what_came_before_an_error_is_kept(self, path):
-        with TactileLearner.open(path, **SETTINGS) as learner:
-            with pytest.raises(StreamError), learner.batch():
-                for name, touch in FELT[:3]:
-                    learner.observe(name, stream(touch))
-                learner.observe("a", [])
-            require_same(learner, FELT[:3])
-            with pytest.raises(FileNotFoundError), learner.batch():
-                (path / "nothing").read_bytes()
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, FELT[:3])
-
     def test_one_that_cannot_be_made_durable_never_was(self, path, monkeypatch):
-        learner, _ = filled(path, FELT[:3])
+        learner, _ = filled(path, OBSERVED[:3])
         with learner:
             journal = learner._ledger.store._journal
             insert, calls = journal.insert, []
@@ -244,11 +164,11 @@ class TestBatch:
             with monkeypatch.context() as broken:
                 broken.setattr(journal, "insert", full)
                 with pytest.raises(StoreError), learner.batch():
-                    for name, touch in FELT[3:]:
+                    for name, touch in OBSERVED[3:]:
                         learner.observe(name, stream(touch))
-            require_same(learner, FELT[:3])
-            learner.observe(*[FELT[3][0], stream(FELT[3][1])])
-            require_same(learner, FELT[:4])
+            require_same(learner, OBSERVED[:3])
+            learner.observe(*[OBSERVED[3][0], stream(OBSERVED[3][1])])
+            require_same(learner, OBSERVED[:4])
 
     def test_within_it_nothing_that_needs_a_generation(self, path):
         learner, _ = filled(path)
@@ -261,7 +181,7 @@ class TestBatch:
                     learner.merge(path, shared="once")
                 with learner.batch():  # a batch in a batch is the same batch
                     learner.observe("a", stream((9, 60)))
-            require_same(learner, [*FELT, ("a", (9, 60))])
+            require_same(learner, [*OBSERVED, ("a", (9, 60))])
 
     def test_other_threads_wait_for_its_end(self, path):
         with TactileLearner.open(path, **SETTINGS) as learner:
@@ -275,50 +195,8 @@ class TestBatch:
             thread.join()
             assert receipts[0].durable
 
-    def test_without_a_path_it_is_nothing(self):
-        learner = TactileLearner(**SETTINGS)
-        with learner.batch():
-            learner.observe("a", stream((0, 60)))
-        require_same(learner, [("a", (0, 60))])
-
 
 class TestMerge:
-    def test_two_memories_become_the_one_that_observed_all(self, path, tmp_path):
-        ours, _ = filled(path, FELT[:7])
-        theirs, _ = filled(tmp_path / "other", FELT[5:])
-        steps = []
-        with ours, theirs:
-            merged = ours.merge(theirs, shared="once", progress=lambda *step: steps.append(step))
-            assert (merged.observations, merged.shared) == (5, 2)
-            require_same(ours, FELT)
-            require_same(theirs, FELT[5:])
-            assert steps[-1] == ("merging", 5, 5)
-            assert ours.merge(theirs, shared="once").observations == 0
-            assert ours.merge(theirs, shared="twice").observations == 7
-            require_same(ours, FELT + FELT[5:])
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, FELT + FELT[5:])
-            assert again.forget("a") == 4 + 2
-
-    def test_a_compacted_memory_comes_in_as_a_whole(self, path, tmp_path):
-        ours, _ = filled(path, FELT[:4])
-        theirs, _ = filled(tmp_path / "other", FELT[4:])
-        with ours, theirs:
-            theirs.compact(keep=2)
-            ours.merge(tmp_path / "other", shared="once")
-            require_same(ours, FELT)
-            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 2 of its 4"):
-                ours.forget("a")
-            with pytest.raises(ObservationError, match=r"6 streams that both .* cannot be counted once"):
-                ours.merge(theirs, shared="once")
-            ours.compact()
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, FELT)
-            third = TactileLearner.open(tmp_path / "third", **SETTINGS)
-            with third:
-                third.merge(again, shared="once")
-                require_same(third, FELT)
-
     @pytest.mark.parametrize(
         ("settings", "said"),
         [
@@ -332,26 +210,26 @@ class TestMerge:
     )
     def test_memories_of_another_making_are_refused(self, path, tmp_path, settings, said):
         ours, _ = filled(path)
-        theirs, _ = filled(tmp_path / "other", FELT[:3], **settings)
+        theirs, _ = filled(tmp_path / "other", OBSERVED[:3], **settings)
         with ours, theirs:
             with pytest.raises(MismatchError, match=said) as caught:
                 ours.merge(theirs, shared="twice")
             assert str(path) in str(caught.value)
             assert str(tmp_path / "other") in str(caught.value)
-            require_same(ours, FELT)
+            require_same(ours, OBSERVED)
 
     def test_without_readings_its_exemplars_cannot_be_had(self, path, tmp_path):
         ours, _ = filled(path)
-        theirs, _ = filled(tmp_path / "other", FELT[:3], exemplars=0)
+        theirs, _ = filled(tmp_path / "other", OBSERVED[:3], exemplars=0)
         with ours, theirs:
             with pytest.raises(MismatchError, match="kept no readings"):
                 ours.merge(theirs, shared="twice")
             theirs.merge(ours, shared="once")  # the other way round nothing is missing
-            assert theirs.digest() == fed(FELT).digest()
+            assert theirs.digest() == fed(OBSERVED).digest()
             theirs.compact()
             with pytest.raises(MismatchError, match="was compacted and keeps exemplars"):
                 ours.merge(theirs, shared="twice")
-            require_same(ours, FELT)
+            require_same(ours, OBSERVED)
 
     def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
         ours, _ = filled(path)
@@ -361,14 +239,14 @@ class TestMerge:
             with pytest.raises(StoreError, match="holds no store"):
                 ours.merge(tmp_path / "none", shared="twice")
             with pytest.raises(InputError, match="without a path"):
-                ours.merge(fed(FELT), shared="twice")
+                ours.merge(fed(OBSERVED), shared="twice")
             with pytest.raises(InputError, match="'once' or 'twice'"):
                 ours.merge(path, shared="thrice")
-            require_same(ours, FELT)
+            require_same(ours, OBSERVED)
 
     def test_cut_off_in_the_middle_it_never_began(self, path, tmp_path):
-        ours, _ = filled(path, FELT[:4])
-        theirs, _ = filled(tmp_path / "other", FELT[4:])
+        ours, _ = filled(path, OBSERVED[:4])
+        theirs, _ = filled(tmp_path / "other", OBSERVED[4:])
 
         def stop(what, done, of):
             if done == 3:
@@ -377,9 +255,9 @@ class TestMerge:
         with ours, theirs:
             with pytest.raises(KeyboardInterrupt):
                 ours.merge(theirs, shared="once", progress=stop)
-            require_same(ours, FELT[:4])
+            require_same(ours, OBSERVED[:4])
             ours.merge(theirs, shared="once")
-            require_same(ours, FELT)
+            require_same(ours, OBSERVED)
 
 
 class TestCompact:
@@ -389,7 +267,7 @@ class TestCompact:
             before = sum(learner._ledger.store.size().values())
             done = learner.compact(keep=3)
             assert (done.upto, done.bytes_before) == (9, before)
-            require_same(learner, FELT)
+            require_same(learner, OBSERVED)
             with pytest.raises(ObservationError, match="rows 1 to 9 were compacted"):
                 learner.retract(receipts[8])
             with pytest.raises(ObservationError, match="'a' cannot be forgotten: 3 of its 4"):
@@ -413,14 +291,7 @@ class TestCompact:
                 again.retract(receipts[0])
         with Store.open(path, mode="read") as store:
             assert store.compacted == 13
-            assert [head.label for head in store.heads(kind="observe")] == [name for name, _ in FELT]
-
-    def test_it_shrinks_the_journal(self, path):
-        learner, _ = filled(path, [("a", (seed, 90)) for seed in range(300)], embedding=Kernels(seed=0, dimension=256))
-        with learner:
-            size = learner._ledger.store.size()["journal"]
-            learner.compact()
-            assert learner._ledger.store.size()["journal"] < size / 5
+            assert [head.label for head in store.heads(kind="observe")] == [name for name, _ in OBSERVED]
 
     @pytest.mark.parametrize("keep", [-1, True, 1.5, None])
     def test_a_keep_that_is_no_number_is_refused(self, path, keep):
@@ -435,28 +306,6 @@ class TestCompact:
 
 
 class TestRefresh:
-    def test_a_reader_takes_in_all_that_a_writer_does(self, path, tmp_path):
-        learner, receipts = filled(path)
-        filled(tmp_path / "other", [("d", (0, 60))])[0].close()
-        reader = TactileLearner.open(path, mode="read", **SETTINGS)
-        with learner, reader:
-            assert not reader.refresh()
-            for change, left in (
-                (lambda: learner.retract(receipts[0]), without(0)),
-                (lambda: learner.compact(keep=5), without(0)),
-                (lambda: learner.retract(receipts[-1]), without(0, 11)),
-                (lambda: learner.merge(tmp_path / "other", shared="once"), [*without(0, 11), ("d", (0, 60))]),
-                (learner.compact, [*without(0, 11), ("d", (0, 60))]),
-            ):
-                change()
-                assert reader.refresh()
-                require_same(reader, left)
-                assert not reader.refresh()
-            learner.fine_tune(epochs=1)
-            assert reader.tuned_digest() is None
-            assert reader.refresh()
-            assert reader.tuned_digest() == learner.tuned_digest() is not None
-
     def test_a_writer_has_nothing_to_take_in(self, path):
         learner, _ = filled(path)
         with learner:
@@ -470,18 +319,7 @@ class TestRefresh:
         with learner, reader:
             learner.retract(receipts[0])
             learner.compact()
-            require_same(reader, FELT)
-
-
-def test_many_retractions_leave_what_was_never_retracted(path):
-    rng = np.random.default_rng(0)
-    felt = [("abcd"[at % 4], (at, 40)) for at in range(60)]
-    learner, receipts = filled(path, felt, embedding=SMALL)
-    with learner:
-        gone = rng.permutation(60)[:45].tolist()
-        for at in gone:
-            learner.retract(receipts[at])
-        require_same(learner, [one for at, one in enumerate(felt) if at not in gone])
+            require_same(reader, OBSERVED)
 
 
 def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
@@ -515,12 +353,12 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     learner._ledger.store.close()  # as if the power failed: the row is there, a generation without it is not
     journal = path / "journal.sqlite"
     data = bytearray(journal.read_bytes())
-    data[data.index(bytes(FELT[4][0], "ascii") + learner_key(FELT[4]))] ^= 1
+    data[data.index(bytes(OBSERVED[4][0], "ascii") + learner_key(OBSERVED[4]))] ^= 1
     journal.write_bytes(data)
     repaired = repair_store(path)
     assert repaired.kept == 13
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, FELT)
+        require_same(again, OBSERVED)
     assert "observation 1 was retracted by row 13, and is still in" in caplog.text
 
 
@@ -539,7 +377,7 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
             broken.setattr(type(learner._ledger.store._journal), "shrink", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 learner.compact(keep=2)
-        require_same(learner, FELT)
+        require_same(learner, OBSERVED)
         with pytest.raises(ObservationError, match="rows 1 to 10 were compacted"):
             learner.retract(receipts[0])
         learner.retract(receipts[-1])
@@ -567,11 +405,6 @@ def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(p
             require_same(reader, [*without(0, 1), ("d", (9, 60))])
 
 
-def spoil(path, number):
-    """Damage a generation's array on the disk."""
-    (path / "generations" / f"{number:08d}" / "observations" / "c" / "0" / "0").unlink()
-
-
 def test_with_a_damaged_base_nothing_is_retracted(path):
     learner, receipts = filled(path)
     with learner:
@@ -581,10 +414,10 @@ def test_with_a_damaged_base_nothing_is_retracted(path):
         for call in (lambda: learner.retract(receipts[-1]), lambda: learner.forget("a")):
             with pytest.raises((DamageError, ObservationError)):
                 call()
-        require_same(learner, FELT)
+        require_same(learner, OBSERVED)
         learner.observe("a", stream((9, 60)))
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, [*FELT, ("a", (9, 60))])
+        require_same(again, [*OBSERVED, ("a", (9, 60))])
 
 
 def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
@@ -600,7 +433,7 @@ def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
         assert again.digest() == whole.digest()
         assert again.materials == whole.materials
         for at in (11, 8):
-            gone = FELT[at][0], learner_key(FELT[at])
+            gone = OBSERVED[at][0], learner_key(OBSERVED[at])
             assert gone not in {(one.material, one.key) for one in again.memory.exemplars}
             assert gone not in {(name, key) for name, key, _ in again.memory.sample}
     assert "pool and exemplars now hold only what they held" in caplog.text
@@ -625,7 +458,7 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
 
     monkeypatch.setattr(Store, "latest", slow)
     with learner, TactileLearner.open(path, mode="read", **SETTINGS) as reader:
-        require_same(reader, [*FELT, ("a", (8, 60)), ("b", (9, 60))])
+        require_same(reader, [*OBSERVED, ("a", (8, 60)), ("b", (9, 60))])
         assert reader.tuned_digest() == learner.tuned_digest()
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_learner_machine import PAD, SMALL, stream
+from touches import PAD, SMALL, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError

@@ -1,10 +1,9 @@
 """Copies are a function of the touch, and a memory of touches with copies is as exact as one without."""
 
-from itertools import permutations
-
 import numpy as np
 import pytest
-from test_learner_machine import PAD, SMALL, stream
+from touches import PAD, SMALL, contents, stream
+from touches import SETTINGS as USUAL
 
 from scroll_tactile import Augmented, TactileLearner, sensors
 from scroll_tactile.errors import InputError, MismatchError
@@ -14,7 +13,7 @@ from scroll_tactile.signals.stream import validate
 
 THREE = Augmented(copies=3, dead=0.3, offset=0.05, gain=0.2)
 NOISY = Augmented(copies=2, noisy=3, noise=0.5)
-SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4, "augmentation": THREE}
+SETTINGS = USUAL | {"augmentation": THREE}
 FELT = [(name, (seed, readings)) for seed, readings in enumerate((60, 25, 90)) for name in "ab"]
 RAMP = np.linspace(-1, 1, 60, dtype=np.float32).reshape(3, 20)
 
@@ -22,12 +21,6 @@ RAMP = np.linspace(-1, 1, 60, dtype=np.float32).reshape(3, 20)
 def both(augmentation, image, key):
     copies, noisy = augmentation.copies_of(image, key)
     return [*copies, *noisy]
-
-
-def contents(learner):
-    pool = [(name, key, touch.sums.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
-    answers = [learner.predict(stream(touch)) for touch in ((7, 25), (9, 60))]
-    return learner.digest(), learner.exemplars, pool, answers
 
 
 def fed(felt, **settings):
@@ -130,18 +123,6 @@ class TestAugmentedObservation:
         own = [touch.sums.tobytes() for *_, touch in plain.memory.sample]
         assert [touch.sums.tobytes() for *_, touch in augmented.memory.sample] == own
 
-    def test_every_order_gives_the_same_bytes(self):
-        few = FELT[:4]
-        digests = {fed(order).digest() for order in permutations(few)}
-        assert len(digests) == 1
-
-    def test_what_was_retracted_was_never_felt(self, tmp_path):
-        learner, receipts = filled(tmp_path / "m", [*FELT, ("c", (5, 60))])
-        with learner:
-            learner.retract(receipts[1])
-            assert learner.forget("c") == 1
-            assert contents(learner) == contents(fed([FELT[0], *FELT[2:]]))
-
     def test_closed_killed_and_opened_again(self, tmp_path):
         learner, _ = filled(tmp_path / "m")
         with TactileLearner.open(tmp_path / "m", embedding=SMALL, mode="read") as beside:  # replays the journal
@@ -151,14 +132,6 @@ class TestAugmentedObservation:
         with TactileLearner.open(tmp_path / "m", embedding=SMALL) as again:
             again.observe("c", stream((3, 60)))
             assert contents(again) == contents(fed([*FELT, ("c", (3, 60))]))
-
-    def test_merged_and_compacted(self, tmp_path):
-        one, other = filled(tmp_path / "a", FELT[:3])[0], filled(tmp_path / "b", FELT[2:])[0]
-        with one, other:
-            assert one.merge(other, shared="once").shared == 1
-            assert contents(one) == contents(fed(FELT))
-            one.compact()
-            assert contents(one) == contents(fed(FELT))
 
     def test_copies_make_no_touch_longer(self):
         learner = fed([("a", (seed, 16)) for seed in range(4)], augmentation=Augmented(copies=3, speed=4))

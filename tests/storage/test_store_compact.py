@@ -2,7 +2,6 @@
 
 import logging
 import sqlite3
-import threading
 from contextlib import closing
 
 import numpy as np
@@ -305,39 +304,3 @@ def test_a_reader_in_the_middle_gets_the_rest_or_is_told(opened):
         assert [row.sequence for row in late] == list(range(8, LAST + 1))
         assert [head.sequence for head in heads] == list(range(1, LAST + 1))
         assert agrees(reader, 5)
-
-
-def test_readers_beside_a_compacting_writer_get_right_answers_or_are_told(opened):
-    stop, wrong, told = threading.Event(), [], []
-
-    def read():
-        with Store.open(opened.path, mode="read") as reader:
-            while not stop.is_set():
-                try:
-                    base = reader.base()
-                    after = base.upto if base else 0
-                    rows = list(reader.records(after))
-                    good = all(row.arrays["x"].tobytes() == noise(row.sequence).tobytes() for row in rows)
-                    good = good and [row.sequence for row in rows] == list(range(after + 1, after + 1 + len(rows)))
-                    good = good and (base is None or base.arrays["sum"] == sums(after)["sum"])
-                    latest = reader.latest()
-                    good = good and latest.arrays["sum"] == sums(latest.upto)["sum"]
-                except CompactedError:
-                    told.append(True)
-                except BaseException as error:
-                    wrong.append(error)
-                else:
-                    wrong.extend([] if good else [(after, [row.sequence for row in rows])])
-
-    threads = [threading.Thread(target=read) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for number in range(LAST + 1, LAST + 15):
-        add(opened, number)
-        opened.commit(sums(number), upto=number)
-        opened.compact(sums(number - 4), upto=number - 4)
-    stop.set()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
-    assert agrees(opened, LAST + 10, LAST + 14)

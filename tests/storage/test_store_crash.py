@@ -2,37 +2,12 @@
 
 import random
 import shutil
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from store_builds import as_after_a_crash
 
-import store
 from store import Store
-
-ROOT = Path(store.__file__).parents[1]
-
-WRITER = """
-import sys
-import numpy as np
-from store import Store
-
-with Store.open(sys.argv[1], identity={"for": "crash"}) as opened:
-    total = sum(int(row.arrays["x"][0]) for row in opened.records())
-    while True:
-        sequence = opened.last + 1
-        opened.append("a", f"row {sequence}", b"k", arrays={"x": np.arange(sequence, sequence + 700)})
-        total += sequence
-        print(sequence, flush=True)
-        if sequence % 7 == 0:
-            commit = opened.commit_later if sequence % 2 else opened.commit
-            commit({"total": np.array(total), "bulk": np.full(3000, sequence)}, upto=sequence)
-"""
 
 
 def check(path, acknowledged):
@@ -51,24 +26,6 @@ def check(path, acknowledged):
             assert found.arrays["bulk"].tolist() == [found.upto] * 3000
         assert len(list((path / "generations").iterdir())) <= 2
     return last
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-def test_a_killed_writer_loses_nothing_that_it_acknowledged(tmp_path, caplog):
-    rng = random.Random(0)
-    path, last = tmp_path / "s", 0
-    for _ in range(10):
-        with subprocess.Popen(
-            [sys.executable, "-c", WRITER, path], cwd=ROOT, stdout=subprocess.PIPE, text=True
-        ) as child:
-            first = child.stdout.readline()
-            time.sleep(rng.uniform(0, 0.15))
-            child.kill()
-            lines = (first + child.stdout.read()).splitlines(keepends=True)
-        acknowledged = max((int(line) for line in lines if line.endswith("\n")), default=last)
-        assert acknowledged > last
-        last = check(path, acknowledged)
-    assert caplog.records == []
 
 
 @pytest.mark.parametrize("tail", [b"", bytes(5000), b"\xa5" * 5000], ids=["cut", "zeros", "garbage"])

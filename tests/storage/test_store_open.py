@@ -47,14 +47,6 @@ def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_
         assert (reader.path, reader.mode) == (path, "read")
 
 
-def test_a_second_writer_in_this_process_is_told_who_holds_it(tmp_path):
-    with Store.open(tmp_path, identity={}) as first:
-        with pytest.raises(LockedError, match=rf"process {os.getpid()} on .* since 20.*mode=\"read\""):
-            Store.open(tmp_path)
-        assert first.append("a", "b", b"").sequence == 1
-    Store.open(tmp_path).close()
-
-
 SECOND = """
 import sys, store
 try:
@@ -103,24 +95,6 @@ def test_readers_follow_a_writer_and_take_no_lock(tmp_path):
         assert [row.sequence for row in reader.records(1)] == [2, 3]
     with Store.open(tmp_path, mode="read") as first, Store.open(tmp_path, mode="read") as second:
         assert first.last == second.last == 3
-
-
-def test_readers_never_meet_a_half_replaced_generation(tmp_path, caplog):
-    with Store.open(tmp_path, identity={}) as writer, Store.open(tmp_path, mode="read") as reader:
-        writer.commit({"a": np.full(5, 0), "b": np.full(5, 0)}, upto=0)
-
-        def replace():
-            for value in range(1, 25):
-                writer.commit({"a": np.full(5, value), "b": np.full(5, value)}, upto=0)
-
-        thread = threading.Thread(target=replace)
-        thread.start()
-        while thread.is_alive():
-            found = reader.latest().arrays
-            assert found["a"].tolist() == found["b"].tolist()
-        thread.join()
-        assert reader.latest().arrays["a"][0] == 24
-    assert caplog.records == []
 
 
 def test_a_reader_may_do_nothing_that_writes(tmp_path):

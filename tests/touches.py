@@ -1,0 +1,66 @@
+"""Small random touches, memories that observe them, and what such a memory must hold."""
+
+import numpy as np
+
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.statistics.sample import TouchSample
+
+SMALL = Kernels(seed=0, dimension=64)
+PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
+OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
+
+
+class SmallSample(TouchSample):
+    """A pool that is soon full, so that what was left out of it has to come back."""
+
+    def __init__(self, capacity=5):
+        super().__init__(capacity)
+
+
+def stream(touch):
+    """The readings of a touch (seed, readings), the same for the same numbers."""
+    seed, readings = touch
+    return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
+
+
+def fed(observed, described=(), **settings):
+    """A memory without a path that observed these touches."""
+    learner = TactileLearner(**SETTINGS | settings)
+    for material, constituents in dict(described).items():
+        learner.describe(material, constituents)
+    for material, touch in observed:
+        learner.observe(material, stream(touch))
+    return learner
+
+
+def filled(path, observed=OBSERVED, **settings):
+    """A memory in a folder that observed these touches, and its receipts."""
+    learner = TactileLearner.open(path, **SETTINGS | settings)
+    return learner, [learner.observe(name, stream(touch)) for name, touch in observed]
+
+
+def without(*places):
+    """What was observed but at these places."""
+    return [pair for i, pair in enumerate(OBSERVED) if i not in places]
+
+
+def contents(learner):
+    """Digest, exemplars, pool and answers, to the byte."""
+    pool = [(name, key, touch.sums.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
+    answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60))]
+    return learner.digest(), learner.exemplars, pool, answers
+
+
+def require_same(learner, observed, described=()):
+    """All that is kept of what was observed is, to the byte, what a memory keeps that observed it in another order."""
+    whole = fed(sorted(observed), described, readout=learner.settings.readout)
+    assert contents(learner) == contents(whole)
+    assert repr(learner.descriptions) == repr(whole.descriptions)
+    if described:
+        assert repr(learner.compose(stream((7, 25)))) == repr(whole.compose(stream((7, 25))))
+
+
+def spoil(path, number):
+    """Damage a generation's array on the disk."""
+    (path / "generations" / f"{number:08d}" / "observations" / "c" / "0" / "0").unlink()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from touches import PAD, contents, stream
+from touches import PAD, stream
 
 from scroll_tactile import Augmented, Kernels, Robust, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene

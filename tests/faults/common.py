@@ -129,9 +129,7 @@ def run(
     failures = figures.pop("failures", [])
     record = {
         "name": name,
-        "command": shlex.join(
-            ["python", f"tests/faults/{Path(sys.argv[0]).name}", *map(_without_folders, sys.argv[1:])]
-        ),
+        "command": shlex.join(["python", f"tests/faults/{Path(sys.argv[0]).name}", *_without_folders(sys.argv[1:])]),
         "seed": options.seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"python": platform.python_version(), "sqlite": sqlite3.sqlite_version}

@@ -17,7 +17,7 @@ from scroll_tactile.memory.identity import Identity
 from scroll_tactile.signals.windows import Scale
 from store import Store
 
-few = settings(max_examples=150, deadline=None)
+few = settings(max_examples=60, deadline=None)
 LARGEST = 2**20
 
 

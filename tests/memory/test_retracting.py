@@ -462,7 +462,7 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
         assert reader.tuned_digest() == learner.tuned_digest()
 
 
-@pytest.mark.parametrize("at", range(12))
+@pytest.mark.parametrize("at", [0, 4, 8, 11])
 def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, monkeypatch):
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
     felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]

@@ -14,7 +14,7 @@ from scroll_tactile.signals.stream import fewest_readings, validate
 
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 
-few = settings(max_examples=100, deadline=None)
+few = settings(max_examples=40, deadline=None)
 images = hnp.arrays(
     np.float32, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.floats(-1, 1, width=32)
 )

@@ -114,7 +114,7 @@ def test_a_generator_is_read_to_its_end_and_its_own_error_passes():
 
 
 @given(st.data())
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_type_and_memory_layout_leave_no_trace(data):
     shape = (data.draw(st.integers(2, 6)), 3)
     values = data.draw(hnp.arrays(np.int8, shape, elements=st.integers(-16, 120)))

@@ -73,6 +73,11 @@ def flip(file, place=-9, bit=2):
     file.write_bytes(data)
 
 
+def spoil(path, number):
+    """Damage the second chunk of a generation's rows."""
+    flip_chunk(path / "generations" / f"{number:08d}" / "rows" / "c" / "0" / "0", 1, 4)
+
+
 def flip_chunk(file, chunk, chunks):
     """Flip a bit in the middle of a chunk, where the index at the end of the file says that it lies."""
     index = np.frombuffer(file.read_bytes()[-4 - 16 * chunks : -4], "<u8").reshape(chunks, 2)

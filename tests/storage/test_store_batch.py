@@ -24,18 +24,6 @@ def add(opened, *names):
     return [opened.append("a", name, b"", arrays={"x": np.arange(5)}).sequence for name in names]
 
 
-def test_a_batch_is_durable_when_it_ends_and_its_rows_are_numbered_on(opened):
-    with opened.batch():
-        assert add(opened, "one", "two") == [2, 3]
-        assert opened.last == 3
-        assert labels(opened) == ["before", "one", "two"]
-    assert add(opened, "after") == [4]
-    opened.close()
-    with Store.open(opened.path) as again:
-        assert labels(again) == ["before", "one", "two", "after"]
-        assert again.record(3).arrays["x"].tolist() == [0, 1, 2, 3, 4]
-
-
 def test_a_batch_waits_for_the_disk_once(tmp_path, opened):
     """The log grows by one commit for all the rows: pages that many of them share are in it once."""
     log = opened.path / "journal.sqlite-wal"
@@ -61,12 +49,6 @@ def test_a_large_batch_leaves_no_large_log(opened):
     for _ in range(3):
         add(opened, "after")
     assert log.stat().st_size <= 16 * 2**20
-
-
-def test_an_empty_batch_is_nothing(opened):
-    with opened.batch():
-        pass
-    assert labels(opened) == ["before"]
 
 
 class Mine(BaseException):

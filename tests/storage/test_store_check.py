@@ -379,7 +379,8 @@ def test_a_folder_without_permission_is_no_damage(path):
         path.chmod(0o700)
 
 
-def test_a_store_that_is_being_written_is_checked_beside_the_writer(path):
+def test_a_store_that_is_being_written_is_checked_beside_the_writer(compacted):
+    path = compacted
     stop, wrong = threading.Event(), []
 
     def look():

@@ -14,7 +14,7 @@ from store_builds import flip_chunk
 
 from store import DamageError, RecordError, Store, StoreError
 
-several = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+several = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 DTYPES = ["|b1", "|u1", "<i4", "<i8", "<f4", "<f8", "<U3"]
 
 

@@ -38,15 +38,6 @@ def test_the_current_and_the_one_before_it_are_kept(opened):
     assert folders(opened.path) == ["00000003", "00000004"]
 
 
-def test_committing_later_gives_what_committing_gives(opened):
-    opened.append("a", "b", b"")
-    opened.commit_later(ONE, upto=1, attributes={"a": [1]})
-    opened.flush()
-    found = opened.latest()
-    assert (found.number, found.upto, found.attributes) == (1, 1, {"a": [1]})
-    assert found.arrays["x"].tobytes() == ONE["x"].tobytes()
-
-
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
     gate = Gate(monkeypatch)
     opened.append("a", "b", b"")

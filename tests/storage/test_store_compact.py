@@ -79,16 +79,6 @@ def test_rows_give_up_their_arrays_for_the_base_and_keep_their_heads(opened):
             assert agrees(again, 5)
 
 
-@pytest.mark.parametrize("upto", [0, LAST])
-def test_none_or_all_of_the_rows_can_be_compacted(opened, upto):
-    opened.compact(sums(upto), upto=upto)
-    assert opened.compacted == upto
-    assert payloads(opened.path) == list(range(upto + 1, LAST + 1))
-    assert opened.base().arrays["sum"] == sums(upto)["sum"]
-    assert add(opened, LAST + 1) == LAST + 1
-    assert [row.sequence for row in opened.records(upto)] == list(range(upto + 1, LAST + 2))
-
-
 def test_the_space_is_given_back_to_the_disk(opened):
     before = opened.size()["journal"]
     opened.compact(sums(LAST), upto=LAST)
@@ -122,14 +112,6 @@ def test_a_compaction_leaves_the_newest_generation_and_the_base_only(opened):
     opened.compact(sums(9), upto=9)
     assert folders(opened.path) == ["00000004", "00000005"]
     assert agrees(opened, 9, LAST + 1)
-
-
-def test_compacting_again_to_the_same_row_replaces_the_base(opened):
-    opened.compact(sums(LAST), upto=LAST)
-    first = opened.base().number
-    opened.compact(sums(LAST), upto=LAST)
-    assert opened.base().number > first
-    assert agrees(opened, LAST)
 
 
 def test_a_generation_with_all_rows_has_to_be_there_first(opened):

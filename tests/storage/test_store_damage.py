@@ -175,13 +175,6 @@ def test_without_any_generation_that_verifies_there_is_none(path, caplog):
     assert "array 'x' of generation 1" in caplog.messages[1]
 
 
-def test_a_spoilt_row_of_a_generation_is_passed_over(path, caplog):
-    change(path, "UPDATE generation SET upto = 6 WHERE number = 2")
-    with Store.open(path) as opened:
-        assert opened.latest().number == 1
-    assert "row of generation 2" in caplog.text
-
-
 def test_a_spoilt_generation_does_not_push_out_the_good_one(path, caplog):
     flip(chunk_of(path / "generations" / "00000002"), -5)
     with Store.open(path) as opened:

@@ -63,7 +63,7 @@ def flipped(path, rng):
     return f"bit {bit} of byte {place} of {file.relative_to(path)}"
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_flipped_bit_is_harmless_or_found_and_then_repaired(stores, either, tmp_path, monkeypatch, which, seed):
     monkeypatch.setattr(os, "fsync", lambda _: None)  # only what is written matters here
     rng, whole = random.Random(1000 * which + seed), content(either)
@@ -111,11 +111,11 @@ def test_a_folder_copied_file_by_file_under_a_writer_gives_what_was_acknowledged
     writer = threading.Thread(target=write)
     writer.start()
     try:
-        outcomes = [end for number in range(25) for end in copied(source, tmp_path / str(number), rng, acknowledged)]
+        outcomes = [end for number in range(12) for end in copied(source, tmp_path / str(number), rng, acknowledged)]
     finally:
         stop.set()
         writer.join()
-    assert outcomes.count("right") > 10
+    assert outcomes.count("right") > 5
 
 
 def copied(source, copy, rng, acknowledged):

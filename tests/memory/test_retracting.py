@@ -77,27 +77,49 @@ class TestRetract:
         learner, receipts = filled(path)
         learner.close()
         with TactileLearner.open(path, mode="read", **SETTINGS) as reader:
-            for call in (lambda: reader.retract(receipts[0]), lambda: reader.forget("a"), reader.compact):
+            changes = (lambda: reader.observe("a", stream((9, 60))), lambda: reader.retract(receipts[0]))
+            for call in (*changes, lambda: reader.forget("a"), reader.compact):
                 with pytest.raises(ReadOnlyError):
                     call()
             require_same(reader, OBSERVED)
 
-    def test_a_full_disk_changes_nothing(self, path, monkeypatch):
-        learner, receipts = filled(path)
-        with learner:
 
-            def full(*_, **__):
-                raise StoreFullError("no space left")
+def in_a_batch(learner):
+    with learner.batch():
+        learner.describe("a", {"wool": 1.0})
 
-            with monkeypatch.context() as broken:
-                broken.setattr(learner._ledger.store, "append", full)
-                with pytest.raises(StoreFullError):
-                    learner.retract(receipts[0])
-                with pytest.raises(StoreFullError):
-                    learner.forget("b")
-            require_same(learner, OBSERVED)
-            learner.retract(receipts[0])
-            require_same(learner, without(0))
+
+CHANGES = {
+    "observe": lambda learner: learner.observe("a", stream((9, 60))),
+    "retract": lambda learner: learner.retract(1),
+    "forget": lambda learner: learner.forget("b"),
+    "describe": lambda learner: learner.describe("a", None),
+    "in a batch": in_a_batch,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_full_disk_keeps_memory_and_journal_alike(path, monkeypatch, change):
+    learner, _ = filled(path)
+    with learner:
+        learner.describe("a", {"silk": 1.0})
+
+        def full(*_, **__):
+            raise StoreFullError("no space left")
+
+        with monkeypatch.context() as broken:
+            broken.setattr(learner._ledger.store, "append", full)
+            for _ in range(2):
+                with pytest.raises(StoreError, match=r"no space left|nothing of this batch was kept"):
+                    change(learner)
+            require_same(learner, OBSERVED, {"a": {"silk": 1.0}})
+        change(learner)
+        digest, described = learner.digest(), learner.descriptions
+        assert (digest, described) != (fed(OBSERVED).digest(), {"a": {"silk": 1.0}})
+    with TactileLearner.open(path, **SETTINGS) as again:
+        assert (again.digest(), again.descriptions) == (digest, described)
+    with pytest.raises(StoreError):
+        change(learner)
 
 
 class TestTuned:

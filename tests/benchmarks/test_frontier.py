@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from commands import run
 
-from examples.benchmarks.frontier import draw_frontier, knee, measure_frontier, run_frontier, run_peers
-from examples.benchmarks.vector_peers import Ours, PseudoInverse, Refitted, lacking
+from examples.benchmarks.frontier import knee, measure_frontier, run_frontier, run_peers
+from examples.benchmarks.vector_peers import Ours, lacking
 from scroll_tactile import sensors
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.simulator import Scene
@@ -75,21 +75,6 @@ def test_ours_follows_between_fits_and_says_the_same():
     assert refitting._tracked is None
 
 
-def test_a_peer_forms_its_model_again_only_after_an_observation(monkeypatch):
-    rng = np.random.default_rng(0)
-    for peer in (PseudoInverse(2, 8), Refitted()):
-        for at in range(20):
-            peer.observe(at % 2, rng.normal(at % 2, 0.1, 8))
-        assert [peer.predict(np.full(8, float(place))) for place in (0, 1)] == [0, 1]
-    inverted = []
-    monkeypatch.setattr("torch.linalg.pinv", lambda matrix: inverted.append(1) or matrix)
-    peer = PseudoInverse(2, 8)
-    peer.observe(0, np.zeros(8))
-    for _ in range(3):
-        peer.predict(np.zeros(8))
-    assert inverted == [1]
-
-
 def test_what_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "sklearn", None)
     assert lacking("sklearn") == "scikit-learn is not installed"
@@ -127,9 +112,3 @@ def test_the_command_measures_prints_and_draws_it_all(recordings, tmp_path, monk
     assert found["command"] == "python -m examples.benchmarks frontier --data DATA --quick"
     assert (tmp_path / "r.png").read_bytes().startswith(b"\x89PNG")
     assert "the knee is at" in result.output
-
-
-def test_nothing_wrong_and_nothing_measured_can_be_drawn(tmp_path):
-    pytest.importorskip("matplotlib")
-    draw_frontier(tmp_path / "r.png", [made(64, 0.0)], [], default=64)
-    assert (tmp_path / "r.png").stat().st_size > 1000

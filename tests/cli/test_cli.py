@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import sensors
+from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -39,9 +39,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def memory(files: Path) -> Path:
     folder = files / "memory"
-    for at, file in enumerate(("silk", "silk-again", "wool", "wool-again")):
-        options = ["--sensor", "roboskin"] if at == 0 else []
-        result = run("observe", folder, file.removesuffix("-again"), files / f"{file}.npy", *options)
+    TactileLearner.open(folder, sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64)).close()
+    for file in ("silk", "silk-again", "wool", "wool-again"):
+        result = run("observe", folder, file.removesuffix("-again"), files / f"{file}.npy")
         assert result.exit_code == 0, result.output
     assert "observed 2 times" in result.output
     return folder
@@ -67,11 +67,11 @@ class TestMemory:
         assert digest_of(text) == found["digest"]
         assert "4 of 2 materials" in text
 
-    def test_what_it_is_made_of_is_told_and_asked(self, memory: Path, files: Path) -> None:
+    def test_what_it_is_made_of_is_described_and_composed(self, memory: Path, files: Path) -> None:
         assert "nothing was described yet" in run("compose", memory, files / "silk.csv").output
-        told = run("describe", memory, "silk", "silk=1.0")
-        assert told.exit_code == 0, told.output
-        assert "silk: made of silk; observed 2 times" in told.stdout
+        described = run("describe", memory, "silk", "silk=1.0")
+        assert described.exit_code == 0, described.output
+        assert "silk: made of silk; observed 2 times" in described.stdout
         run("describe", memory, "wool", "wool=0.75", "dye=0.25")
         run("describe", memory, "tweed", "wool=1", "soft=unknown")
         answer = json.loads(run("compose", memory, files / "silk.csv", "--json").stdout)
@@ -87,8 +87,6 @@ class TestMemory:
         assert "its description is removed; observed 2 times" in run("describe", memory, "silk").stdout
 
     def test_an_empty_memory_answers_unknown(self, tmp_path: Path, files: Path) -> None:
-        from scroll_tactile import TactileLearner
-
         TactileLearner.open(tmp_path / "m", sensor=sensors.ROBOSKIN).close()
         assert "never felt anything" in run("predict", tmp_path / "m", files / "silk.csv").stdout
         answer = json.loads(run("predict", tmp_path / "m", files / "silk.csv", "--json").stdout)
@@ -119,13 +117,6 @@ class TestMemory:
         np.save(tmp_path / "wide.npy", np.zeros((75, 61)))
         assert "(T, 60)" in refused("predict", memory, tmp_path / "wide.npy")
 
-    def test_two_writers_are_refused_and_readers_not(self, memory: Path, files: Path) -> None:
-        from scroll_tactile import TactileLearner
-
-        with TactileLearner.open(memory):
-            assert "being written by process" in refused("observe", memory, "silk", files / "silk.npy")
-            assert run("inspect", memory).exit_code == 0
-
 
 class TestDemo:
     def test_it_shows_all_it_promises(self) -> None:
@@ -153,7 +144,7 @@ class TestDemo:
     @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT], ids=lambda stop: stop.name)
     def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path, stop: signal.Signals) -> None:
         kept = tmp_path / "kept"
-        options = [*SMALL, "--materials", "12"]  # long enough to be stopped in
+        options = [*SMALL, "--materials", "20"]  # long enough to be stopped in
         words = [sys.executable, "-m", "scroll_tactile.cli", "demo", "--memory", str(kept), *options]
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:
@@ -166,12 +157,12 @@ class TestDemo:
             process.kill()
         if stop is signal.SIGINT:
             assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
-        assert len(_finished(kept)) < 12, "it was not stopped in time"
+        assert len(_finished(kept)) < 20, "it was not stopped in time"
         resumed = run("demo", "--memory", kept, *options)
         assert resumed.exit_code == 0, resumed.output
         observed = re.search(r"observed now: (\d+)", resumed.stdout)
         assert observed
-        assert int(observed[1]) < 36
+        assert int(observed[1]) < 60
         assert digest_of(resumed.stdout) == digest_of(run("demo", *options).stdout)
         assert digest_of(resumed.stdout) == digest_of(run("inspect", kept / "memory").stdout)
 
@@ -182,9 +173,9 @@ def _finished(kept: Path) -> list[str]:
 
 
 def test_schedules_give_one_memory() -> None:
-    result = run("schedules", "--count", "3", "--touches", "2", "--materials", "4", "--features", "64")
+    result = run("schedules", "--count", "3", "--touches", "2", "--materials", "2", "--features", "64")
     assert result.exit_code == 0, result.output
-    assert "1 digest, predictions for 4 others the same to the bit" in result.stdout
+    assert "1 digest, predictions for 2 others the same to the bit" in result.stdout
     assert "no such folder" in refused("schedules", "--data", "/nowhere")
     assert "biotac or roboskin" in refused("schedules", "--data", "/nowhere", "--sensor", "contactile")
 
@@ -211,17 +202,3 @@ class TestReplay:
         missing = tmp_path / "none" / "r.json"
         assert "folder that exists" in refused("replay", "biotac-20", "--data", tmp_path, "--json", missing)
         assert run("replay", "nose-20", "--data", tmp_path).exit_code == 2
-
-    def test_folds_are_numbers(self, real_data: Path) -> None:
-        options = ["--data", real_data, "--materials", "2"]
-        assert "--folds" in refused("replay", "roboskin-20", *options, "--folds", "first")
-        assert "folds out of" in refused("replay", "roboskin-20", *options, "--folds", "7")
-        assert "order of recording" in refused("replay", "roboskin-20", *options, "--blocked")
-
-
-def test_help_is_there_for_every_command() -> None:
-    assert run("--help").exit_code == 0
-    for command in ("demo", "observe", "predict", "inspect", "replay", "schedules"):
-        result = run(command, "--help")
-        assert result.exit_code == 0
-        assert "Usage" in result.stdout

@@ -8,7 +8,7 @@ import pytest
 from commands import refused, run
 from touches import PAD, SETTINGS, fed, require_same, stream
 
-from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
+from scroll_tactile import ModuleEmbedding, TactileLearner
 from scroll_tactile.cli.terminal import opened_for_upkeep
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
@@ -151,11 +151,6 @@ class TestExport:
             assert readings.shape == (60, 2)
         assert found == whole.exemplars
 
-    def test_a_memory_without_a_path_has_no_list_of_observations(self, tmp_path):
-        export_plain(fed(FELT), tmp_path / "out")
-        assert not (tmp_path / "out" / "observations.csv").exists()
-        assert (tmp_path / "out" / "memory.json").is_file()
-
     def test_nothing_is_written_over(self, path, tmp_path):
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / "mine").write_text("x")
@@ -189,11 +184,6 @@ class TestAnyEmbedding:
     def test_another_programs_store_is_refused(self, tmp_path):
         Store.open(tmp_path / "s", identity={"for": "other things"}).close()
         assert "holds no memory of touch" in refused("memory", "forget", tmp_path / "s", "a")
-
-    def test_other_kernels_than_usual_are_no_matter(self, tmp_path):
-        with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Kernels(seed=3, dimension=64)) as learner:
-            learner.observe("a", stream((0, 60)))
-        assert "1 observations were retracted" in words(run("memory", "forget", tmp_path / "m", "a"))
 
 
 def whole_image(touch):

@@ -121,17 +121,6 @@ def test_ours_learns_with_its_copies_and_without():
     assert found[0.2, True] >= found[0.2, False]
 
 
-def test_means_over_folds():
-    base = {"study": "speed", "system": "s", "augmented": True}
-    shares = [(0.5, 0.8), (0.5, 0.6), (1.0, 0.9), (1.0, 0.9), (4.0, 0.1)]
-    rows = summary([base | {"strength": strength, "accuracy": share} for strength, share in shares])
-    assert [(row["strength"], round(row["mean"], 9), row["folds"]) for row in rows] == [
-        (0.5, 0.7, 2),
-        (1, 0.9, 2),
-        (4, 0.1, 1),
-    ]
-
-
 def test_the_picture(tmp_path):
     rows = summary([record for fold in study().run([0, 1]) for record in fold])
     lines = robustness_curves(rows)

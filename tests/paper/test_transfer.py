@@ -15,7 +15,6 @@ from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, Shar
 from examples.paper.transfer.few_touches import (
     WidestFeatures,
     WidestReadout,
-    candidate_maker,
     draw_touches,
     few_touches,
 )
@@ -66,15 +65,6 @@ class TestFewTouches:
         predicted = [readout.name_of(stream) for stream in asked]
         assert predicted == [learner.predict(stream).material for stream in asked]
         assert len(set(predicted)) > 1
-
-    def test_an_embedding_that_other_scales_have_a_say_in_is_read_by_a_learner(self):
-        with pytest.raises(InputError, match="widest scale alone"):
-            WidestFeatures(PATCH, Kernels(dimension=64))
-        candidate = candidate_maker(PATCH, Kernels(dimension=64))()
-        candidate.observe("slow", touched(PATCH, "slow", 0))
-        assert candidate.name_of(touched(PATCH, "fast", 0)) == "slow"
-        with pytest.raises(InputError, match="45 readings or more"):
-            WidestFeatures(PATCH, Vision(None, seed=1))(touched(PATCH, "slow", 0).first(0.5))
 
     def test_draws_leave_the_tested_fold_out_and_keep_a_video_together(self):
         touches = recorded(PATCH)
@@ -167,13 +157,6 @@ class TestTasks:
         with pytest.raises(InputError, match="another run"):
             list(replace(study, epochs=2).run())
 
-    def test_without_a_folder_the_network_is_that_of_the_run(self, weights):
-        study = TaskTransfer(
-            (recorded(PATCH, 5), recorded(STRIP, 5)), weights, counts=(2,), draws=1, epochs=1, sources=("patch",)
-        )
-        found = {cell.key: figures for cell, figures in study.run()}
-        assert found[f"strip, fold 0, {TUNED}patch"]["right"]["2"]
-
     @pytest.mark.parametrize(
         ("change", "words"),
         [
@@ -254,13 +237,6 @@ class TestAligning:
         mapped = MapsAcross(lambda stream: made[stream.key], known, turned=turned)
         assert self.share(mapped, streams, [0, 1, 12, 13, 24, 25], names) > 0.9
         assert self.share(OneReadout(lambda s: made[s.key], known, unlabelled=found), streams, [], names) < 0.9
-
-    def test_the_prior_of_likeness_leaves_far_materials_apart(self, streams):
-        found, names = vectors(2)
-        made = self.features(streams, found)
-        for likeness in (0.0, 0.3):
-            prior = SharesPrior(lambda stream: made[stream.key], self.known(streams), likeness=likeness)
-            assert self.share(prior, streams, [0, 12, 24], names) > 0.9
 
     def test_its_readout_is_lda_of_the_drawn_means(self, streams):
         found, names = vectors(2, each=3)

@@ -41,17 +41,6 @@ def cut_off(monkeypatch):
     return start
 
 
-def test_closing_after_it_saves_no_half(tmp_path, cut_off):
-    learner = small(tmp_path)
-    for touch in TOUCHES[:4]:
-        learner.observe(*touch)
-    cut_off()
-    with pytest.raises(KeyboardInterrupt), learner:
-        learner.observe(*TOUCHES[4])
-    with small(tmp_path) as again:
-        assert again.digest() == expected(TOUCHES[:5])  # its journal row was durable
-
-
 def test_going_on_after_it_loses_nothing(tmp_path, cut_off):
     with small(tmp_path) as learner:
         for touch in TOUCHES[:4]:
@@ -73,3 +62,14 @@ def test_without_a_path_it_is_refused_rather_than_wrong(cut_off):
         learner.observe(*TOUCHES[1])
     with pytest.raises(ScrollTactileError, match="interrupted"):
         learner.digest()
+
+
+def test_closing_after_it_saves_no_half(tmp_path, cut_off):
+    learner = small(tmp_path)
+    for touch in TOUCHES[:4]:
+        learner.observe(*touch)
+    cut_off()
+    with pytest.raises(KeyboardInterrupt), learner:
+        learner.observe(*TOUCHES[4])
+    with small(tmp_path) as again:
+        assert again.digest() == expected(TOUCHES[:5])  # its journal row was durable

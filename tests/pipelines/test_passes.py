@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from scroll_tactile import Kernels, TactileLearner, sensors
+from scroll_tactile import sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error, confusion_counts, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 
 
@@ -111,22 +111,3 @@ class TestDemo:
         outcome.answers.predictions[:2] = wrong
         assert outcome.forgotten() == [(first.material, 1.0, 0.0)]
         assert outcome.answers.confusions() == [(first.material, outcome.answers.truth[-1], 2)]
-
-    def test_another_seed_does_not_go_on(self, tmp_path: Path) -> None:
-        small = SMALL | {"materials": 2, "touches": 1, "held_out": 1}
-        Demo(sensors.BIOTAC, **small, folder=tmp_path / "kept").run()
-        with pytest.raises(InputError, match="seed 0 there, 1 here"):
-            Demo(sensors.BIOTAC, seed=1, **small, folder=tmp_path / "kept").run()
-
-
-def test_confusion_counts() -> None:
-    counts = confusion_counts(["a", "b"], [4, 4], [("a", "b", 3)])
-    assert counts.tolist() == [[1, 3], [0, 4]]
-
-
-def test_kernels_of_another_size_are_found_again(tmp_path: Path) -> None:
-    with TactileLearner.open(tmp_path / "m", sensor=sensors.BIOTAC, embedding=Kernels(dimension=64)) as learner:
-        learner.observe("silk", Scene(sensors.BIOTAC).touch("silk", 0))
-        digest = learner.digest()
-    with TactileLearner.open(tmp_path / "m") as learner:
-        assert learner.digest() == digest

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
-from scroll_tactile.errors import DescriptionError, MaterialError, SensorMismatchError
+from scroll_tactile.errors import DescriptionError, MaterialError
 from scroll_tactile.memory.descriptions import checked, targets_of
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.constituents import ConstituentHead, StageHeads
 from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.readouts.attributes import Curve
-from scroll_tactile.signals.stream import validate
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
 PARTS = ("cotton", "linen", "silk", "wool")
@@ -91,17 +90,6 @@ class TestCompose:
             with pytest.raises(DescriptionError, match=said):
                 learner.compose(stream, constituents=wrong)
 
-    def test_a_part_of_a_touch_is_judged_at_its_stage(self, learner):
-        whole = validate(touch(mixtures()["w"], 31), SKIN)
-        said = learner.compose(whole.first(0.4))
-        assert said.prediction.seconds == 0.4
-        assert said["wool"].presence > 0.5
-
-    def test_the_wrong_sensors_stream_is_refused(self, learner):
-        other = SKIN.model_copy(update={"name": "other"})
-        with pytest.raises(SensorMismatchError):
-            learner.compose(validate(touch(mixtures()["w"], 31), other))
-
     def test_shares_are_parts_of_one_even_of_what_is_like_nothing_felt(self, learner):
         for seed in range(5):
             for stream in (touch(mixtures()["csw"], 40 + seed), touch([1.3, 0.0, 0.6, 1.3], seed)):
@@ -163,37 +151,6 @@ class TestSharpness:
             composer = taught._current.composer(taught._ledger, taught.model())
             assert (composer.stages[-1].sharpness != 1) == sharp
 
-    def test_the_only_touch_of_a_material_is_not_taken_out(self):
-        taught = self.taught("abc")
-        taught.observe("d", self.shape(3, 0))
-        for name in "abcd":
-            taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
-        composer = taught._current.composer(taught._ledger, taught.model())
-        assert np.isfinite(composer.stages[-1].sharpness)
-
-    def test_it_is_the_same_whenever_it_was_described(self):
-        before, after = self.taught([]), self.taught([])
-        for name in "dcba":
-            before.describe(name, {"hard": name in "bd"})
-        for learner, order in ((before, range(4)), (after, reversed(range(4)))):
-            for number in order:
-                for at in range(6):
-                    learner.observe("abcd"[number], self.shape(number, at))
-        for name in "abcd":
-            after.describe(name, {"hard": name in "bd"})
-        for seed in range(50, 54):
-            assert repr(before.compose(self.shape(1, seed))) == repr(after.compose(self.shape(1, seed)))
-
-    def test_of_touches_of_many_windows_nothing_is_sharpened(self):
-        taught = felt(["c", "l", "s"], 4)
-        for name in "cls":
-            taught.describe(name, described(mixtures()[name]))
-        assert [stage.sharpness for stage in taught._current.composer(taught._ledger, taught.model()).stages] == [
-            1.0,
-            1.0,
-            1.0,
-        ]
-
 
 class TestDescribing:
     def test_after_the_touching_is_as_before_to_the_byte(self):
@@ -226,20 +183,6 @@ class TestDescribing:
         said = taught.compose(stream)
         assert said["wool"].presence > 0.5
         assert "silk" not in [one.name for one in said.constituents]
-
-    def test_what_is_unknown_of_a_material_takes_no_part(self):
-        names = ["c", "l", "s", "w", "cl"]
-        whole, part = felt(names, 4), felt(names, 4)
-        for name in names:
-            values = {part: share > 0 for part, share in zip(PARTS, mixtures()[name], strict=True)}
-            whole.describe(name, values)
-            part.describe(name, {one: value for one, value in values.items() if (name, one) != ("w", "silk")})
-        stream = touch(mixtures()["lsw"], 70)
-        ours, theirs = whole.compose(stream), part.compose(stream)
-        assert all(ours[name] == theirs[name] for name in ("cotton", "linen", "wool"))
-        assert ours["silk"].presence != theirs["silk"].presence
-        part.describe("w", {"silk": None, "wool": True, "cotton": False, "linen": False})
-        assert part.compose(stream) == theirs
 
     def test_what_all_or_none_have_is_named_and_not_guessed(self):
         taught = felt(["c", "l", "s"], 4)
@@ -324,3 +267,17 @@ class TestDescribing:
         assert targets["viscose"].presence == {"felt": True, "tweed": False}
         assert targets["soft"].presence == {"felt": True, "stone": False}
         assert targets["silk"] == replace(targets["silk"], presence={}, share={})
+
+    def test_what_is_unknown_of_a_material_takes_no_part(self):
+        names = ["c", "l", "s", "w", "cl"]
+        whole, part = felt(names, 4), felt(names, 4)
+        for name in names:
+            values = {part: share > 0 for part, share in zip(PARTS, mixtures()[name], strict=True)}
+            whole.describe(name, values)
+            part.describe(name, {one: value for one, value in values.items() if (name, one) != ("w", "silk")})
+        stream = touch(mixtures()["lsw"], 70)
+        ours, theirs = whole.compose(stream), part.compose(stream)
+        assert all(ours[name] == theirs[name] for name in ("cotton", "linen", "wool"))
+        assert ours["silk"].presence != theirs["silk"].presence
+        part.describe("w", {"silk": None, "wool": True, "cotton": False, "linen": False})
+        assert part.compose(stream) == theirs

@@ -37,16 +37,6 @@ def calibrated(kind="lda", **settings):
     return calibrate(pool, STAGES, selections, kind)
 
 
-@pytest.mark.parametrize("kind", ["lda", "ridge"])
-@pytest.mark.parametrize("noise", [3_000, 40_000, 300_000])
-def test_weights_are_finite_and_not_negative(kind, noise):
-    stages = calibrated(kind, noises=(noise, noise))
-    assert [stage.weights.shape for stage in stages] == [(1,), (2,)]
-    for stage in stages:
-        assert np.isfinite(stage.weights).all()
-        assert (stage.weights >= 0).all()
-
-
 def logits(touches, classes, seed=0, size=2.0):
     """Scores whose softmax is the truth, and targets drawn from it."""
     rng = np.random.default_rng(seed)
@@ -77,14 +67,6 @@ def test_of_two_scales_the_one_that_knows_is_believed():
     assert weights[1] < 0.1
 
 
-def test_without_touches_the_prior_stays_and_a_few_move_it_little():
-    prior = np.array([0.05, 0.05])
-    assert fit_weights([], [], prior).tolist() == prior.tolist()
-    one = fit_weights([np.array([[3.0, 0.0], [3.0, 0.0]])], [0], prior)
-    assert (one > prior).all()
-    assert (one < 1000 * prior).all()
-
-
 def documented_loss(weights, scores, targets, prior):
     """Held-out log loss, and half a touch's worth of (w / prior − 1)² / 2 for each scale."""
     value = 0.25 * float(np.square(weights / prior - 1).sum())
@@ -113,13 +95,6 @@ def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
     np.testing.assert_allclose(found / prior, np.abs(expected.x), atol=2e-3)
 
 
-def test_touches_with_different_numbers_of_classes_count_together():
-    wide, targets = logits(600, 5)
-    narrow, others = logits(600, 3, seed=1)
-    weights = fit_weights(wide + narrow, targets + others, np.array([1.0]))
-    assert weights == pytest.approx(1.0, rel=0.15)
-
-
 @pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
 def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
@@ -129,11 +104,6 @@ def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, sh
     kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
     # Where not even the largest keeps it, twice that.
     assert calibration.threshold(share) == (kept[0] if kept else 2 * touches)
-
-
-def test_too_few_touches_leave_a_threshold_that_is_set_beforehand():
-    few = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(3.0))
-    assert few.threshold(0.05) == few.threshold(0.5) > 0
 
 
 def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
@@ -205,13 +175,6 @@ def test_small_and_dull_memories_calibrate_without_a_warning(kind):
             assert np.isfinite(stage.weights).all()
             assert np.isfinite(stage.threshold(0.05))
             assert np.isfinite(stage.novelty(np.array([1.0] * len(stage.weights))))
-
-
-def test_a_stage_whose_scale_was_never_felt_has_no_calibration():
-    statistics, pool = scene()
-    selections = {10: select(statistics, 10, "lda")}
-    assert len(calibrate(pool, STAGES, selections, "lda")) == 1
-    assert calibrate(TouchSample(), STAGES, {}, "lda") == []
 
 
 def test_the_order_of_what_was_felt_changes_no_bit():

@@ -48,11 +48,6 @@ def test_codes_at_the_bound_are_exact_too():
     assert added(batch, dimension=3).packed().tolist() == expected
 
 
-def test_the_most_rows_fit_int64_at_the_bound():
-    largest = MOST_ROWS * EDGE**2
-    assert largest < 2**63
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_any_split_and_order_gives_the_same_bytes(data):
@@ -79,6 +74,7 @@ def test_what_is_added_and_removed_leaves_no_trace(kept, gone, seed):
 
 
 def test_a_full_moment_refuses_before_anything_is_added():
+    assert MOST_ROWS * EDGE**2 < 2**63
     moment = SecondMoment.of(np.arange(10, dtype=np.int64), MOST_ROWS - 2, 4)
     with pytest.raises(CapacityError, match="exact"):
         moment.add(codes(3, 4))
@@ -89,19 +85,6 @@ def test_a_full_moment_refuses_before_anything_is_added():
     assert moment.packed().tolist() == [at + 2 for at in range(10)]
     with pytest.raises(CapacityError):
         moment.add(codes(1, 4))
-
-
-def test_a_large_dimension_and_read_only_rows():
-    batch = codes(40, 301)
-    batch.setflags(write=False)
-    found = added(batch, dimension=301).packed()
-    exact = batch.astype(object).T @ batch.astype(object)
-    assert found.tolist() == exact[np.tril_indices(301)].tolist()
-
-
-def test_emptiness():
-    assert SecondMoment(3).empty
-    assert not added(codes(1, 4)).empty
 
 
 # The scatter within classes
@@ -153,20 +136,6 @@ def test_the_scatter_where_the_mean_is_a_million_times_the_spread(sign):
     assert np.abs(np.mean(groups[0])) > 1e5 * np.std(groups[0])
 
 
-def test_the_scatter_with_one_step_of_spread():
-    batch = np.full((1000, 3), EDGE - 1, dtype=np.int32)
-    batch[0, 0] += 1
-    batch[7, 2] -= 1
-    compare([batch])
-
-
-def test_the_scatter_of_more_classes_than_one_block():
-    rng = np.random.default_rng(0)
-    compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(0, 4, size=1100))])
-    # At the bound, where the limbs are largest.
-    compare([codes(2, 2, seed, EDGE - 3, EDGE) for seed in range(2100)])
-
-
 def test_single_rows_and_constant_classes_have_no_scatter_at_all():
     for groups in ([codes(1, 4, seed) for seed in range(30)], [np.repeat(codes(1, 4, s), 9, axis=0) for s in range(5)]):
         moment = added(*groups)
@@ -182,3 +151,18 @@ def test_the_scatter_of_a_class_near_capacity():
     packed = np.array([many * (low**2 + high**2)], dtype=np.int64)
     found = np.triu(within_scatter(packed, np.array([2 * many]), np.array([[many * (low + high)]])))
     assert found[0, 0] == pytest.approx(many / 2, rel=1e-14)
+
+
+def test_a_large_dimension_and_read_only_rows():
+    batch = codes(40, 301)
+    batch.setflags(write=False)
+    found = added(batch, dimension=301).packed()
+    exact = batch.astype(object).T @ batch.astype(object)
+    assert found.tolist() == exact[np.tril_indices(301)].tolist()
+
+
+def test_the_scatter_of_more_classes_than_one_block():
+    rng = np.random.default_rng(0)
+    compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(0, 4, size=1100))])
+    # At the bound, where the limbs are largest.
+    compare([codes(2, 2, seed, EDGE - 3, EDGE) for seed in range(2100)])

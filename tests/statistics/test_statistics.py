@@ -46,7 +46,7 @@ def same(left, right):
 
 
 touches = st.lists(st.integers(0, 40), max_size=25)
-few = settings(max_examples=60, deadline=None)
+few = settings(max_examples=40, deadline=None)
 
 
 @few
@@ -60,7 +60,15 @@ def test_any_order_is_the_same(felt, random):
 @few
 @given(touches, touches, touches)
 def test_a_sum_is_the_union(a, b, c):
-    same(of(a) + of(b), of(a + b))
+    left, right = of(a), of(b)
+    joint = left + right
+    same(joint, of(a + b))
+    for number in (1, 2, 3):  # the sum shares nothing with its parts
+        joint.add(*touch(number))
+        left.add(*touch(number))
+    same(joint, of([*a, *b, 1, 2, 3]))
+    same(left, of([*a, 1, 2, 3]))
+    same(right, of(b))
     same(of(a) + of(b), of(b) + of(a))
     same((of(a) + of(b)) + of(c), of(a) + (of(b) + of(c)))
     same(of(a) + Statistics(DIMENSION, SCALES), of(a))
@@ -87,49 +95,18 @@ def test_what_was_removed_leaves_no_trace_even_when_more_is_felt(a, b):
 
 
 @few
-@given(touches, touches)
-def test_operands_are_left_as_they_were_and_share_nothing(a, b):
-    left, right = of(a), of(b)
-    joint = left + right
-    for one in (1, 2, 3):
-        joint.add(*touch(one))
-        left.add(*touch(one))
-    same(joint, of([*a, *b, 1, 2, 3]))
-    same(left, of([*a, 1, 2, 3]))
-    same(right, of(b))
-
-
-@few
 @given(touches)
 def test_what_a_store_keeps_is_all_of_it(felt):
     arrays, names = of(felt).to_arrays()
     assert names == sorted(of(felt).materials)
     again = Statistics.from_arrays(DIMENSION, SCALES, {name: array.copy() for name, array in arrays.items()}, names)
     same(again, of(felt))
+    before = {name: array.tobytes() for name, array in arrays.items()}
     for one in (1, 2, 3, 4, 5):
         again.add(*touch(one))
     same(again, of([*felt, 1, 2, 3, 4, 5]))
-    assert of(felt).to_arrays()[0].keys() == arrays.keys()
-
-
-def test_arrays_for_a_store_do_not_change_with_what_is_felt_later():
-    statistics = of(range(10))
-    arrays, _ = statistics.to_arrays()
-    before = {name: array.tobytes() for name, array in arrays.items()}
-    for one in range(10, 20):
-        statistics.add(*touch(one))
-        statistics.total_second(5)
     assert {name: array.tobytes() for name, array in arrays.items()} == before
-
-
-def test_a_material_taken_out_wholly_is_not_listed_and_not_kept():
-    statistics = of([])
-    statistics.add("wool", 0, {5: np.ones((1, 3), np.int32)})
-    statistics.add("felt", 0, {5: np.ones((2, 3), np.int32)})
-    statistics.remove("wool", 0, {5: np.ones((1, 3), np.int32)})
-    assert statistics.materials == {"felt": 1}
-    assert statistics.names(5) == ["felt"]
-    assert statistics.to_arrays()[1] == ["felt"]
+    assert of(felt).to_arrays()[0].keys() == arrays.keys()
 
 
 @pytest.mark.parametrize(
@@ -180,16 +157,6 @@ def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
     for statistics, touches in ((whole, ours), (part, theirs)):
         for rows in touches:
             statistics.add("wool", 0, {5: np.array(rows, np.int32)})
-    with pytest.raises(InputError, match="contain"):
-        whole - part
-
-
-def test_fewer_touches_of_as_many_rows_do_not_contain_more():
-    whole, part = of([]), of([])
-    whole.add("wool", 0, {5: np.ones((2, 3), np.int32)})
-    whole.add("felt", 0, {5: np.ones((1, 3), np.int32)})
-    for _ in range(2):
-        part.add("wool", 0, {5: np.ones((1, 3), np.int32)})
     with pytest.raises(InputError, match="contain"):
         whole - part
 
@@ -280,7 +247,11 @@ def test_a_fold_is_a_function_of_the_key(key):
     assert fold_of(key) == sum(byte << 8 * at for at, byte in enumerate(key[:8])) % FOLDS
 
 
-def test_folds_are_even():
-    rng = np.random.default_rng(0)
-    counts = np.bincount([fold_of(rng.bytes(32)) for _ in range(6000)], minlength=FOLDS)
-    assert counts.min() > 1800
+def test_fewer_touches_of_as_many_rows_do_not_contain_more():
+    whole, part = of([]), of([])
+    whole.add("wool", 0, {5: np.ones((2, 3), np.int32)})
+    whole.add("felt", 0, {5: np.ones((1, 3), np.int32)})
+    for _ in range(2):
+        part.add("wool", 0, {5: np.ones((1, 3), np.int32)})
+    with pytest.raises(InputError, match="contain"):
+        whole - part

@@ -63,16 +63,6 @@ def test_what_ships_is_made_again_from_json(kind):
     assert configuration_of(again) == configuration
 
 
-def test_no_configuration_computes_a_fingerprint_or_embeds(monkeypatch):
-    def refuse(*arguments, **named):
-        raise AssertionError("embedded")
-
-    for kind in (Kernels, Frames, Maps, Vision):
-        monkeypatch.setattr(kind, "embed", refuse)
-    for make in SHIPPED.values():
-        from_configuration(configuration_of(make()))
-
-
 def mine():
     return ModuleEmbedding(torch.nn.Flatten(), name="mine", dimension=171)
 

@@ -24,7 +24,7 @@ SMALL: dict[str, Any] = {"epochs": 1, "biotac_epochs": 1, "every": 24}
 
 @pytest.fixture(scope="module")
 def fabrics():
-    return simulated(seed=0, count=5, robot=6, hand=2)
+    return simulated(seed=0, count=5, robot=5, hand=1)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ class TestRows:
         study, results = whole
         assert [cell.system for cell, _ in results] == list(ROWS)
         for cell, figures in results:
-            assert (cell.dataset, figures["learned"] + figures["validation"], figures["tested"]) == (HAND, 30, 10)
+            assert (cell.dataset, figures["learned"] + figures["validation"], figures["tested"]) == (HAND, 25, 5)
             assert set(figures["constituents"]) == set(study.scored)
             assert 0 <= figures["exact"] <= figures["score"] <= 1
             assert 0 <= figures["share_error"] <= 1 and 0 <= figures["calibration_error"] <= 1
@@ -65,22 +65,9 @@ class TestRows:
 
     def test_what_a_robot_touched_is_known_when_it_is_touched_again(self, fabrics):
         (_, figures), *_ = Contactile(fabrics, ("kernels",)).run(["held-out"])
-        assert figures["tested"] == 10  # of six touches the first fold has two
+        assert figures["tested"] == 5
         assert figures["score"] == figures["fabric"] == 1
         assert figures["share_error"] < 0.02
-
-    def test_a_finished_run_is_read_back_and_another_setting_refused(self, whole, fabrics, biotac, weights):
-        study, results = whole
-        steps = []
-        assert list(study.run(["hand"], lambda *step: steps.append(step))) == results
-        assert steps == []
-        for other in ({"epochs": 2}, {"every": 12}, {"seed": 1}, {"take": 2}):
-            changed = Contactile(fabrics, ("resnet",), weights, biotac, **(SMALL | other), folder=study.folder)
-            with pytest.raises(InputError, match="another run"):
-                list(changed.run(["hand"]))
-        recordings = replace(fabrics.recordings, fold=fabrics.recordings.fold[::-1].copy())
-        with pytest.raises(InputError, match="other recordings"):
-            list(replace(study, fabrics=replace(fabrics, recordings=recordings)).run(["hand"]))
 
     def test_the_network_of_biotac_is_trained_once_and_a_spoilt_file_is_named(self, whole, fabrics, biotac, weights):
         study, results = whole
@@ -109,7 +96,7 @@ class TestWhatIsUnknown:
         assert {name for name, _ in study.split(HAND).test} == set(known) - {"fabric03"}
         assert "fabric03" in study.split(HAND).materials
         (_, figures), *_ = study.run(["held-out"])
-        assert figures["tested"] == 8 and figures["score"] == 1
+        assert figures["tested"] == 4 and figures["score"] == 1
 
     def test_a_constituent_that_all_or_none_have_is_not_scored(self, fabrics):
         all_have = {
@@ -182,6 +169,7 @@ class TestCommand:
         again = run(*words)
         assert again.exit_code == 0
         assert json.loads((tmp_path / "out.json").read_text())["cells"] == result["cells"]
+        assert "another run" in refused(*words, "--epochs", "2")
 
     def test_a_published_set_is_read_from_its_folder(self, tmp_path):
         FabricScene(count=4).write(tmp_path / "set", robot=5, hand=1)

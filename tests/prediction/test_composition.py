@@ -90,13 +90,6 @@ class TestCompose:
             with pytest.raises(DescriptionError, match=said):
                 learner.compose(stream, constituents=wrong)
 
-    def test_shares_are_parts_of_one_even_of_what_is_like_nothing_felt(self, learner):
-        for seed in range(5):
-            for stream in (touch(mixtures()["csw"], 40 + seed), touch([1.3, 0.0, 0.6, 1.3], seed)):
-                said = learner.compose(stream)
-                assert sum(one.share for one in said.constituents) == pytest.approx(1, abs=1e-12)
-                assert all(0 <= one.share <= 1 and 0 <= one.presence <= 1 for one in said.constituents)
-
 
 @pytest.mark.parametrize(("unknown", "shares"), [((), [0.25, 0.75]), (("silk",), [None, 0.75])])
 def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares):

@@ -53,20 +53,6 @@ def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
     assert weights * factor == pytest.approx(1.0, rel=0.12)
 
 
-def test_scores_that_mislead_get_no_weight():
-    scores, targets = logits(800, 4)
-    assert fit_weights([-one for one in scores], targets, np.array([1.0]))[0] == pytest.approx(0, abs=1e-6)
-
-
-def test_of_two_scales_the_one_that_knows_is_believed():
-    scores, targets = logits(800, 4)
-    noise = np.random.default_rng(9).normal(size=(800, 4)) * 2
-    both = [np.stack([one[0], other]) for one, other in zip(scores, noise, strict=True)]
-    weights = fit_weights(both, targets, np.array([0.5, 0.5]))
-    assert weights[0] == pytest.approx(1, rel=0.15)
-    assert weights[1] < 0.1
-
-
 def documented_loss(weights, scores, targets, prior):
     """Held-out log loss, and half a touch's worth of (w / prior − 1)² / 2 for each scale."""
     value = 0.25 * float(np.square(weights / prior - 1).sum())

@@ -1,4 +1,4 @@
-"""A memory: exact statistics, pool, exemplars and f*, and how they are kept in a store."""
+"""A memory: exact statistics, sampled touches, exemplars and f*, and how a store keeps them."""
 
 from __future__ import annotations
 
@@ -37,26 +37,38 @@ logger = logging.getLogger(__name__)
 
 # The kinds of journal rows.
 OBSERVE = "observe"  # a stream was observed; its codes and, where exemplars are kept, its readings are the arrays
-RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds them as [first, last] pairs
-MERGE = "merge"  # what a compacted memory held came in as a whole; the arrays are those of its base
-MEMBER = "felt"  # one of the streams that such a memory had observed: known by name and hash, with nothing to be added
-DESCRIBE = "describe"  # what a material is made of; the attribute "constituents" holds it, or null to take it away
+RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
+MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
+MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
+DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
-READINGS = "readings"  # the array of a row that keeps a stream raw
-ATTEMPTS = 20  # of a reader to read what a writer goes on changing
+READINGS = "readings"  # the array of a row that holds the raw stream
+ATTEMPTS = 20  # of a reader, while a writer changes the store
 
 
 class Memory:
-    """What was observed: statistics at every scale, the pool of touches that readouts are tried on, and exemplars.
+    """Everything that was learned, as far as a number of rows of the journal.
 
-    dimension: d. plan: which windows are read of a touch, and judge. exemplars: streams in its buffer, or 0.
-    tuned: f*, of the last fine-tune; None before one, or where what it was made from was retracted.
-    tuned_upto: the last sequence that f* was made from. withdrawn: sequences behind `base` that were retracted.
-    excluded: of a base, the sequences up to it that had been retracted when it was made.
-    retracted: how often anything was, since it was loaded.
-    descriptions: material → what it is made of, whether it was observed or not.
-    base: the last sequence whose codes are not in the journal any more. generation: that it was read from.
-    saved: the last sequence that a generation is known to hold.
+    dimension: d, of the features. plan: which windows of a touch are read. exemplars: streams in the buffer, or 0;
+    kept as `capacity`.
+
+    What was learned:
+
+    - statistics: exact sums by scale.
+    - sample: the touches that readouts are calibrated on.
+    - exemplars: the candidates for the buffer, which keep their readings; None with a capacity of 0.
+    - descriptions: material → what it is made of; the material need not have been observed.
+    - tuned: f*; None before a fine-tune, or after one of the observations behind it was retracted.
+    - tuned_upto: the last sequence that f* was trained on.
+
+    Where it stands in the journal:
+
+    - sequence: the last row that it holds.
+    - base: the last row whose codes were compacted; 0 before any compaction.
+    - retracted: the retracted sequences after `base`.
+    - excluded: the retracted sequences up to `base`, which the base was made without.
+    - retractions: how many observations were retracted since the memory was loaded.
+    - generation, saved: the generation that it was loaded from, and the last row in that; None and 0 without one.
     """
 
     def __init__(self, dimension: int, plan: WindowPlan, exemplars: int = 0) -> None:
@@ -86,7 +98,7 @@ class Memory:
         sequence: int,
         readings: npt.NDArray[np.float32] | None = None,
     ) -> None:
-        """Add an observation: a touch of so many columns, its codes by scale, its readings where they are wanted.
+        """Add an observation: a touch of so many columns, its codes by scale, and its readings for the exemplars.
 
         Raises CapacityError before anything is added.
         """
@@ -98,10 +110,9 @@ class Memory:
         self.sequence = sequence
 
     def replay(self, record: Record, store: Store) -> None:
-        """Do again what a journal row tells, without embedding anything again.
+        """Apply a journal row; nothing is embedded again.
 
-        After the last row `refill` has to be called. Raises MismatchError for a row of a kind that this version
-        does not know.
+        Call `refill` after the last row. Raises MismatchError for a row of a kind that this version does not know.
         """
         apply_description(self.descriptions, record)
         if record.kind == OBSERVE:
@@ -111,10 +122,10 @@ class Memory:
             for sequence in unspanned(record.attributes["sequences"]):
                 if sequence > self.base:
                     self.retract(store.record(sequence))
-                elif sequence not in self.excluded:  # not by `compact`, which leaves them out: by a repair
+                elif sequence not in self.excluded:  # a repair made the base: `compact` would have left it out
                     logger.warning(
-                        "%s: observation %d was retracted by row %d, and is still in: its features were lost to "
-                        "damage. Only a copy from before the damage can be without it",
+                        "%s: observation %d was retracted by row %d, but still counts: its features were lost to "
+                        "damage. Only a copy from before the damage can leave it out",
                         store.path,
                         sequence,
                         record.sequence,
@@ -129,11 +140,11 @@ class Memory:
         self.sequence = record.sequence
 
     def describe(self, material: str, constituents: Any) -> None:
-        """Keep what a material is made of, in place of what was said before; None: nothing is said of it any more."""
+        """Keep what a material is made of, in place of its description before; None removes the description."""
         _describe(self.descriptions, material, constituents)
 
     def retract(self, record: Record) -> None:
-        """Take an observation out of the sums; `refill` then mends the pools."""
+        """Subtract an observation from the sums; call `refill` afterwards for the sample and the exemplars."""
         material, key = record.label, record.key
         self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
         self.retracted.add(record.sequence)
@@ -144,34 +155,34 @@ class Memory:
             self.tuned = None
 
     def retractable(self, store: Store, material: str | None = None) -> list[Head]:
-        """The observations in the journal, of one material or all, that can be retracted and were not; in order."""
+        """The observations whose codes the journal still holds, of one material or all, in order."""
         rows = store.heads(self.base, kind=OBSERVE, label=material)
         return [head for head in rows if head.sequence not in self.retracted]
 
     def put_back(self, record: Record) -> None:
-        """Undo `retract` in the sums, exactly; the samples and f* are the caller's to put back."""
+        """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and f*."""
         self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), _columns(record))
         self.retracted.discard(record.sequence)
         self._stale = False
 
     def refill(self, store: Store) -> None:
-        """Choose pool and exemplars again, as if what was withdrawn had never been observed, where that can matter."""
+        """Choose sample and exemplars again without what was retracted; does nothing where they held none of it."""
         if not self._stale:
             return
         touches = {(material, key): touch for material, key, touch in self.sample}
-        kept = {(one.material, one.key): one for one in self.exemplars or ()}
+        kept = {(exemplar.material, exemplar.key): exemplar for exemplar in self.exemplars or ()}
         fresh = self._base_samples(store)
-        # No further than was read: a writer may have gone on since.
-        merged = [one for one in store.heads(self.base, kind=MERGE) if one.sequence <= self.sequence]
-        for head in merged:
-            record = store.record(head.sequence)
-            fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
-        heads = [one for one in self.retractable(store) if one.sequence <= self.sequence]
+        # Rows that a writer appended since this memory was read are left for the next `load`.
+        for head in store.heads(self.base, kind=MERGE):
+            if head.sequence <= self.sequence:
+                record = store.record(head.sequence)
+                fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
+        heads = [head for head in self.retractable(store) if head.sequence <= self.sequence]
         streams = [(head.label, head.key, head.sequence) for head in heads]
 
         def touch(material: str, key: bytes, sequence: int) -> WindowSums:
-            if (there := touches.get((material, key))) is not None:
-                return there
+            if (found := touches.get((material, key))) is not None:
+                return found
             record = store.record(sequence)
             return self._touch(_columns(record), unpack_codes(record.arrays))
 
@@ -191,28 +202,26 @@ class Memory:
         return Memory(self.statistics.dimension, self.plan, self.capacity)
 
     def _base_samples(self, store: Store) -> Memory:
-        """A memory with pool and exemplars of the base, empty ones without a base."""
+        """A memory with the sample and the exemplars of the base; empty ones without a base."""
         fresh = self._empty()
         if store.compacted != self.base:
             raise CompactedError(f"{store.path} was compacted since it was read: read it again")
         try:
             base = store.base()
         except DamageError as damage:
-            # Statistics need no base. Not to open for the samples' sake would lose more than they are.
+            # The statistics are whole without it; a memory that did not open would lose them too.
             logger.warning(
-                "%s; of what was compacted pool and exemplars now hold only what they held: repair it (scroll-tactile "
-                "memory repair)",
+                "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
+                "repair)",
                 damage,
             )
-            kinds = (OBSERVE, MEMBER)
-            compacted = {
-                (one.label, one.key) for one in store.heads() if one.sequence <= self.base and one.kind in kinds
-            }
+            heads = (head for head in store.heads() if head.sequence <= self.base and head.kind in (OBSERVE, MEMBER))
+            compacted = {(head.label, head.key) for head in heads}
             fresh.sample.update((name, key, touch) for name, key, touch in self.sample if (name, key) in compacted)
             if fresh.exemplars is not None:
-                for one in self.exemplars or ():
-                    if (one.material, one.key) in compacted:
-                        fresh.exemplars.add(one)
+                for exemplar in self.exemplars or ():
+                    if (exemplar.material, exemplar.key) in compacted:
+                        fresh.exemplars.add(exemplar)
             return fresh
         if base is not None:
             fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
@@ -220,13 +229,13 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> WindowSums:
         stages = [self.plan.scored(columns, length) for length in self.plan.stages(columns)]
-        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage behind all that a touch can reach
+        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage after all others
             unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.plan.milestones()) - len(stages))
             stages += [*unreached, {scale: [0] for scale in NOISE}]
         return WindowSums.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
-        """Add all that another memory of the same making held: arrays and attributes of one of its generations."""
+        """Add another memory of the same making: the arrays and attributes of one of its generations."""
         other = self._empty()
         other._take(arrays, attributes)
         self.statistics = self.statistics + other.statistics
@@ -235,9 +244,12 @@ class Memory:
             self.exemplars.update(other.exemplars)
 
     def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be retracted."""
+        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be retracted.
+
+        "pool" (the sample) and "withdrawn" (`retracted`) are the names that memories on disk have always had.
+        """
         arrays, names = self.statistics.to_arrays()
-        pooled, materials = self.sample.to_arrays()
+        sampled, materials = self.sample.to_arrays()
         attributes: dict[str, Any] = {
             "dimension": self.statistics.dimension,
             "scales": list(map(int, self.statistics.scales)),
@@ -247,20 +259,20 @@ class Memory:
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
-        arrays |= pooled
-        # A base is resumed from with the rows behind it, which tell again what of them was retracted.
-        gone = sorted(self.retracted if base_at is None else ())
-        out = [sequence for sequence in sorted(self.retracted) if base_at is not None and sequence <= base_at]
-        arrays["withdrawn"], arrays["excluded"] = np.array(gone, dtype=np.int64), np.array(out, dtype=np.int64)
+        arrays |= sampled
+        # The rows after a base are replayed, and say themselves which of them were retracted.
+        retracted = sorted(self.retracted if base_at is None else ())
+        excluded = [sequence for sequence in sorted(self.retracted) if base_at is not None and sequence <= base_at]
+        arrays["withdrawn"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
             if part is not None:
-                its_arrays, attributes[name] = part.to_arrays()
-                arrays |= its_arrays
+                own, attributes[name] = part.to_arrays()
+                arrays |= own
         return arrays, attributes
 
     def chunks(self) -> dict[str, int]:
-        """Rows in a chunk, of the arrays that are read piece by piece: one exemplar of the usual length is one read."""
-        lengths = [] if self.exemplars is None else [len(one.readings) for one in self.exemplars]
+        """Rows in a chunk of the arrays that are read piece by piece: an exemplar of the usual length is one read."""
+        lengths = [len(exemplar.readings) for exemplar in self.exemplars or ()]
         return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
 
     @classmethod
@@ -270,9 +282,9 @@ class Memory:
             newest = store.newest
             try:
                 memory = cls._loaded(store, dimension, plan, exemplars)
-            except CompactedError:  # a writer compacted it between two looks of this reader
+            except CompactedError:  # a writer compacted it between two reads
                 continue
-            # A generation that came between the looks may hold an f* from before the rows that were read.
+            # A generation that came between the reads may hold an f* from before the rows that were read.
             if store.newest == newest:
                 return memory
         return cls._loaded(store, dimension, plan, exemplars)
@@ -281,7 +293,7 @@ class Memory:
     def _loaded(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int) -> Memory:
         memory = cls(dimension, plan, exemplars)
         memory.base = store.compacted
-        # Where no generation verifies the base's own error says what is lost; without one all rows are there.
+        # Without a sound generation the base raises what is lost; without a base the journal has every row.
         generation = store.latest() or store.base()
         if generation is not None:
             memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
@@ -302,7 +314,7 @@ class Memory:
         return memory
 
     def until(self, store: Store, upto: int) -> Memory:
-        """The memory of the observations up to `upto` that were not retracted since: what a base there holds."""
+        """The memory of the observations up to `upto` that are not retracted: what a base at `upto` holds."""
         memory = self._empty()
         memory.base, memory.sequence = self.base, self.base
         if (base := store.base()) is not None:
@@ -336,8 +348,8 @@ class Memory:
 
 
 def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:
-    """Apply a journal row to descriptions; a material that is forgotten takes its description along."""
-    if row.kind in (DESCRIBE, RETRACT):  # of which a retraction has no constituents, and a label where all is forgotten
+    """Apply a journal row to descriptions; a forgotten material loses its description."""
+    if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
         _describe(descriptions, row.label, row.attributes.get("constituents"))
 
 

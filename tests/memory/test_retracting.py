@@ -380,7 +380,7 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     repaired = repair_store(path)
     assert repaired.kept == 13
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, FELT)
+        require_same(again, OBSERVED)
     assert "observation 1 was retracted by row 13, but still counts" in caplog.text
 
 

@@ -54,6 +54,8 @@ _Runtime = Literal["torch", "onnxruntime"]
 
 
 class Configuration(BaseModel):
+    """What makes an embedding, in JSON's types; nothing is converted, and nothing unknown is passed over."""
+
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
@@ -78,12 +80,16 @@ class PictureConfiguration(Configuration):
 
 
 class KernelsConfiguration(Configuration):
+    """Of `Kernels`."""
+
     kind: Literal["kernels"]
     seed: _Seed
     dimension: Annotated[int, Field(ge=LEAST_FEATURES, le=MOST_FEATURES)]
 
 
 class FramesConfiguration(Configuration):
+    """Of `Frames`."""
+
     kind: Literal["frames"]
     weights: WeightsConfiguration | None
     rest: Literal["first"] | PictureConfiguration | None
@@ -93,6 +99,8 @@ class FramesConfiguration(Configuration):
 
 
 class VisionConfiguration(Configuration):
+    """Of `Vision`; seed: of random weights, where there are no others."""
+
     kind: Literal["vision"]
     weights: WeightsConfiguration | None
     seed: _Seed | None
@@ -104,6 +112,8 @@ class VisionConfiguration(Configuration):
 
 
 class MapsConfiguration(Configuration):
+    """Of `Maps`."""
+
     kind: Literal["maps"]
     layout: Annotated[list[Annotated[int, Field(ge=1, le=2**12)]], Field(min_length=1, max_length=2)]
     views: Annotated[list[Literal["as-felt", "centre", "corner"]], Field(min_length=1, max_length=3)]
@@ -125,11 +135,15 @@ class MapsConfiguration(Configuration):
 
 
 class JoinedConfiguration(Configuration):
+    """Of `Joined`, part by part."""
+
     kind: Literal["joined"]
     parts: Annotated[list[AnyConfiguration], Field(min_length=2, max_length=MOST_PARTS)]
 
 
 class RobustConfiguration(Configuration):
+    """Of `Robust`, with the embedding inside it."""
+
     kind: Literal["robust"]
     inner: AnyConfiguration
     seed: _Seed

@@ -23,6 +23,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
@@ -71,11 +72,12 @@ class FeatureExtractor:
 
         Raises StreamError: see `validate` and `pressed`.
         """
-        return pressed(validate(readings, self._sensor), self._rest)
+        stream = validate(readings, self._sensor)
+        return pressed(stream, self._rest) if self._sensor.camera else stream
 
     def image(self, stream: Stream) -> Image:
         """The tactile image of a `stream`."""
-        return image_of(stream, self._rest)
+        return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
 
     def codes(self, image: Image, key: bytes) -> Codes:
         """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.

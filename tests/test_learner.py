@@ -53,9 +53,9 @@ def touch(material, repetition, sensor=PAD, readings=None):
     place = NAMES.index(material)
     rng = np.random.default_rng([place, repetition])
     count = sensor.readings if readings is None else readings
-    at = np.arange(count)[:, None]
+    i = np.arange(count)[:, None]
     phase = rng.uniform(0, 6, size=sensor.channels)
-    wave = np.sin(at * (0.3 + 0.4 * place) + phase) * (0.2 + 0.1 * place)
+    wave = np.sin(i * (0.3 + 0.4 * place) + phase) * (0.2 + 0.1 * place)
     shares = 0.5 + 0.1 * place - 0.15 + 0.3 * wave + rng.normal(size=(count, sensor.channels)) * 0.02
     values = sensor.low + np.clip(shares, 0, 1) * (sensor.high - sensor.low)
     return values.astype(np.float32).reshape(count, *sensor.shape)
@@ -121,7 +121,7 @@ def test_it_knows_again_what_it_felt(sensor, readout):
 def test_something_never_felt_is_more_novel(readout):
     learner = learner_of(repetitions=12, names=NAMES[:3], readout=readout)
     noise = np.random.default_rng(0).uniform(-1, 1, size=(100, 3))
-    known = [learner.predict(touch(name, 30 + at)) for at in range(8) for name in NAMES[:3]]
+    known = [learner.predict(touch(name, 30 + i)) for i in range(8) for name in NAMES[:3]]
     assert sum(one.known for one in known) >= 20
     strange = learner.predict(noise)
     assert not strange.known
@@ -205,7 +205,7 @@ def test_a_scene_that_cannot_be_is_refused(scene, error, said):
 def test_false_alarms_decide_what_is_known_and_nothing_else(share):
     learner, other = learner_of(repetitions=8, false_alarms=share), learner_of(repetitions=8)
     assert learner.digest() == other.digest()
-    streams = [touch(name, 30 + at) for at in range(10) for name in NAMES]
+    streams = [touch(name, 30 + i) for i in range(10) for name in NAMES]
     ours, theirs = [learner.predict(one) for one in streams], [other.predict(one) for one in streams]
     assert [one.ranking for one in ours] == [one.ranking for one in theirs]
     assert [one.novelty for one in ours] == [one.novelty for one in theirs]
@@ -303,9 +303,9 @@ def test_constant_streams_and_dead_channels(value, readout):
 def test_a_memory_of_constant_streams_only():
     for readout in ("lda", "ridge"):
         learner = TactileLearner(sensor=PAD, embedding=SMALL, readout=readout)
-        for at in range(9):
-            learner.observe("off", np.zeros((100 + at, 3)))
-            learner.observe("also off", np.zeros((100 + at, 3)))
+        for i in range(9):
+            learner.observe("off", np.zeros((100 + i, 3)))
+            learner.observe("also off", np.zeros((100 + i, 3)))
         prediction = learner.predict(np.zeros((100, 3)))
         check(prediction, ["off", "also off"])
         assert prediction.probability == pytest.approx(0.5)

@@ -44,7 +44,7 @@ except ImportError:  # a release without it
 NEVER = 2**40
 
 HISTORY: tuple[Operation, ...] = (
-    ("batch", tuple(("observe", name, (at, 90)) for at in range(3) for name in "abc")),
+    ("batch", tuple(("observe", name, (i, 90)) for i in range(3) for name in "abc")),
     ("retract", 2),
     ("merge", "compacted", "twice"),
     ("observe", "ü", (1, 60)),

@@ -34,12 +34,12 @@ from store import ReadOnlyError, StoreError, StoreFullError
 NEVER = 2**40
 SIZE = 12 * 2**20
 
-GROUND: Operation = ("batch", tuple(("observe", name, (at, 90)) for at in range(4) for name in "abü"))
+GROUND: Operation = ("batch", tuple(("observe", name, (i, 90)) for i in range(4) for name in "abü"))
 
 # Each begins from the same memory, and has something to write.
 OPERATIONS: dict[str, Operation] = {
     "observe": ("observe", "c", (1, 90)),
-    "batch": ("batch", tuple(("observe", "c", (at, 90)) for at in range(5))),
+    "batch": ("batch", tuple(("observe", "c", (i, 90)) for i in range(5))),
     "retract": ("retract", 2),
     "forget": ("forget", "ü"),
     "describe": ("describe", "a", (("silk", 1.0),)),

@@ -36,14 +36,14 @@ class Event:
 
 def events(log: Path) -> Iterator[Event]:
     """What a log tells, in order."""
-    raw, at = log.read_bytes(), 0
-    while at < len(raw):
-        line = raw.index(b"\n", at)
-        kind, inode, offset, length, path_length = raw[at:line].split()
+    raw, i = log.read_bytes(), 0
+    while i < len(raw):
+        line = raw.index(b"\n", i)
+        kind, inode, offset, length, path_length = raw[i:line].split()
         begin = line + 1
         middle = begin + int(path_length)
-        at = middle + int(length)
-        yield Event(kind.decode(), int(inode), int(offset), raw[begin:middle].decode(), raw[middle:at])
+        i = middle + int(length)
+        yield Event(kind.decode(), int(inode), int(offset), raw[begin:middle].decode(), raw[middle:i])
 
 
 @dataclass

@@ -59,7 +59,7 @@ HISTORY: tuple[tuple[str, Operation, int], ...] = (
     # name of the step, operation, rows between generations
     ("make", ("open",), NEVER),
     ("observe", ("observe", "a", (0, 90)), NEVER),
-    ("", ("batch", tuple(("observe", name, (at, 90)) for at in range(3) for name in "abü")), NEVER),
+    ("", ("batch", tuple(("observe", name, (i, 90)) for i in range(3) for name in "abü")), NEVER),
     ("observe, and a generation", ("observe", "b", (5, 60)), 1),
     ("batch", ("batch", (OBSERVE, ("observe", "a", (2, 40)), ("retract", 3), ("forget", "ü"))), NEVER),
     ("retract", ("retract", 2), NEVER),

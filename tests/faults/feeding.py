@@ -37,10 +37,10 @@ def touches(settings: dict[str, Any], materials: int, of_each: int) -> list[Felt
     """Simulated touches, embedded."""
     learner, scene = TactileLearner(**settings, exemplars=0), Scene(sensor=settings["sensor"])
     found = []
-    for at in range(of_each):
+    for i in range(of_each):
         for name in range(materials):
             felt = scene.touch(
-                scene.materials[name % len(scene.materials)], at + of_each * (name // len(scene.materials))
+                scene.materials[name % len(scene.materials)], i + of_each * (name // len(scene.materials))
             )
             image = tactile_image(felt)
             bound = learner.embedding.bound

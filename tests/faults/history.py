@@ -73,7 +73,7 @@ class History(RuleBasedStateMachine):
 
     @rule()
     def refuse(self) -> None:
-        for observation in self.state.felt:
+        for observation in self.state.observed:
             if observation.fixed:
                 self.do(("retract", observation.sequence))
         for material, readings in (("a", np.full((50, 2), np.nan)), ("a", []), ("", np.zeros((50, 2)))):
@@ -82,7 +82,7 @@ class History(RuleBasedStateMachine):
 
     @rule(rng=randoms, scene=st.none() | st.lists(st.sampled_from(MATERIALS), min_size=1))
     def predict(self, rng: Any, scene: list[str] | None) -> None:
-        observed = {observation.material for observation in self.state.felt}
+        observed = {observation.material for observation in self.state.observed}
         chosen = observed.intersection(scene or ())
         prediction = self.learner.predict(stream(touch(rng)), scene=chosen or None)
         assert {name for name, _ in prediction.ranking} == (chosen or observed)
@@ -115,7 +115,7 @@ class History(RuleBasedStateMachine):
     def split_and_add(self, rng: Any) -> None:
         """The statistics of two memories that share the touches are, together, those of the one that observed all."""
         sides: tuple[list[Any], list[Any]] = ([], [])
-        for observation in self.state.felt:
+        for observation in self.state.observed:
             sides[rng.randrange(2)].append(observation.pair)
         ours, theirs = (fed(side).memory.statistics for side in sides)
         whole = self.learner.memory.statistics
@@ -126,7 +126,7 @@ class History(RuleBasedStateMachine):
     @invariant()
     @precondition(lambda self: hasattr(self, "learner"))
     def is_counted(self) -> None:
-        assert sum(self.learner.materials.values()) == len(self.state.felt)
+        assert sum(self.learner.materials.values()) == len(self.state.observed)
 
     def agrees(self, learner: Any) -> None:
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""

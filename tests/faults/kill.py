@@ -128,7 +128,7 @@ class Killing:
         if len(begun) > len(done) > 0 and (operation := operations[len(done) - 1])[0] in KINDS:
             self.candidates.append(after(self.state, operation, self.others)[0])
         self._look(where, operations, told)
-        if len(self.state.felt) > GROWN or self.rng.random() < 0.03:
+        if len(self.state.observed) > GROWN or self.rng.random() < 0.03:
             self.begin_anew()
 
     def _acknowledge(self, operation: Operation, result: Any, where: str) -> None:

@@ -36,9 +36,9 @@ def warm() -> None:
     torch.set_num_threads(1)
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]  # for good: this process does nothing else
     learner = TactileLearner(**settings())
-    for at in range(4):
+    for i in range(4):
         for name in MATERIALS[:2]:
-            learner.observe(name, stream((at, 90)))
+            learner.observe(name, stream((i, 90)))
     learner.fine_tune(epochs=1)
     learner.predict(stream((9, 90)))
     import filelock  # noqa: F401  # what the store imports late
@@ -65,7 +65,7 @@ def opened(path: Path, mode: Any = "write", **more: Any) -> TactileLearner:
 
 
 @dataclass(frozen=True)
-class Felt:
+class Observation:
     """An observation; fixed: it can no longer be retracted."""
 
     sequence: int
@@ -89,7 +89,7 @@ class State:
     said: materials with what they are made of, in alphabetical order.
     """
 
-    felt: tuple[Felt, ...] = ()
+    observed: tuple[Observation, ...] = ()
     last: int = 0
     base: int = 0
     tuned: Pairs | None = None
@@ -99,18 +99,18 @@ class State:
     @property
     def pairs(self) -> Pairs:
         """What was observed, in an order of its own."""
-        return tuple(sorted(one.pair for one in self.felt))
+        return tuple(sorted(one.pair for one in self.observed))
 
     def without(self, sequences: set[int]) -> State:
         """The state after a row that takes observations back."""
-        left = tuple(one for one in self.felt if one.sequence not in sequences)
+        left = tuple(one for one in self.observed if one.sequence not in sequences)
         gone = any(sequence <= self.tuned_upto for sequence in sequences)
-        return replace(self, felt=left, last=self.last + 1, tuned=None if gone else self.tuned)
+        return replace(self, observed=left, last=self.last + 1, tuned=None if gone else self.tuned)
 
     def with_one(self, material: str, touch: Touch, *, fixed: bool = False) -> State:
         """The state after an observation."""
-        one = Felt(self.last + 1, material, touch, fixed)
-        return replace(self, felt=(*self.felt, one), last=self.last + 1)
+        one = Observation(self.last + 1, material, touch, fixed)
+        return replace(self, observed=(*self.observed, one), last=self.last + 1)
 
     def with_said(self, material: str, constituents: Constituents | None) -> State:
         """The state in which this is said of a material; None: nothing is."""
@@ -120,9 +120,9 @@ class State:
         return replace(self, said=tuple(sorted(said.items())))
 
     @property
-    def loose(self) -> list[Felt]:
+    def loose(self) -> list[Observation]:
         """What can still be retracted."""
-        return [one for one in self.felt if not one.fixed]
+        return [one for one in self.observed if not one.fixed]
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Other:
     said: what it says that materials are made of.
     """
 
-    felt: Pairs
+    observed: Pairs
     fixed: int
     based: bool
     said: tuple[tuple[str, Constituents], ...] = ()
@@ -164,7 +164,7 @@ def _retract(state: State, _: Any, sequence: int) -> tuple[State, Any]:
 
 
 def _forget(state: State, _: Any, material: str) -> tuple[State, Any]:
-    found = [one for one in state.felt if one.material == material]
+    found = [one for one in state.observed if one.material == material]
     if not found:
         return state, "UnknownMaterialError"
     if any(one.fixed for one in found):
@@ -181,8 +181,8 @@ def _merge(
     state: State, others: dict[str, Other], name: str, shared: str, descriptions: str = "same"
 ) -> tuple[State, Any]:
     other, said = others[name], dict(state.said)
-    ours = {one.pair for one in state.felt}
-    both = [i for i, pair in enumerate(other.felt) if pair in ours]
+    ours = {one.pair for one in state.observed}
+    both = [i for i, pair in enumerate(other.observed) if pair in ours]
     if shared == "once" and any(i < other.fixed for i in both):
         return state, "ObservationError"
     new = {material: parts for material, parts in other.said if repr(said.get(material)) != repr(parts)}
@@ -190,12 +190,12 @@ def _merge(
         return state, "MismatchError"
     if descriptions == "ours":
         new = {material: parts for material, parts in new.items() if material not in said}
-    coming = [i for i in range(len(other.felt)) if shared == "twice" or i not in both]
+    coming = [i for i in range(len(other.observed)) if shared == "twice" or i not in both]
     for material, parts in new.items():
         state = state.with_said(material, parts)
     state = replace(state, last=state.last + len(new) + other.based)
     for i in coming:
-        state = state.with_one(*other.felt[i], fixed=i < other.fixed)
+        state = state.with_one(*other.observed[i], fixed=i < other.fixed)
     return state, [len(coming), len(both), len(new)]
 
 
@@ -203,8 +203,8 @@ def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
     loose = state.loose
     upto = state.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
     upto = max(upto, state.base)
-    felt = tuple(replace(one, fixed=one.fixed or one.sequence <= upto) for one in state.felt)
-    return replace(state, felt=felt, base=upto), upto
+    observed = tuple(replace(one, fixed=one.fixed or one.sequence <= upto) for one in state.observed)
+    return replace(state, observed=observed, base=upto), upto
 
 
 def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
@@ -285,11 +285,11 @@ def _pool(learner: TactileLearner) -> str:
 
 def expected(state: State) -> dict[str, Any]:
     """What must be seen of a learner in this state."""
-    counted = dict(sorted(Counter(one.material for one in state.felt).items()))
+    counted = dict(sorted(Counter(one.material for one in state.observed).items()))
     tuned = None if state.tuned is None else tuned_digest(state.tuned)
     said = {material: dict(constituents) for material, constituents in state.said}
     told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
-    return _felt(state.pairs) | told
+    return _observed(state.pairs) | told
 
 
 def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None, list[list[str]]]:
@@ -299,7 +299,7 @@ def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None
 
 
 @functools.lru_cache(maxsize=4096)
-def _felt(pairs: Pairs) -> dict[str, Any]:
+def _observed(pairs: Pairs) -> dict[str, Any]:
     return seen(fed(pairs, **settings()))
 
 

@@ -27,12 +27,12 @@ def prepare(home: Path) -> dict[str, Other]:
     rng = random.Random(17)
     others = {}
     for name, count, taken, keep in (("plain", 3, (), None), ("taken", 4, (1,), None), ("compacted", 4, (0,), 2)):
-        felt = [(rng.choice(MATERIALS), touch(rng)) for _ in range(count)]
+        observed = [(rng.choice(MATERIALS), touch(rng)) for _ in range(count)]
         with opened(home / name) as learner:
-            receipts = [learner.observe(material, stream(one)) for material, one in felt]
-            for at in taken:
-                learner.retract(receipts[at])
-            left = tuple(one for at, one in enumerate(felt) if at not in taken)
+            receipts = [learner.observe(material, stream(one)) for material, one in observed]
+            for i in taken:
+                learner.retract(receipts[i])
+            left = tuple(one for i, one in enumerate(observed) if i not in taken)
             if keep is not None:
                 learner.compact(keep=keep)
             fixed = 0 if keep is None else max(0, len(left) - keep)
@@ -62,7 +62,7 @@ def _to_retract(rng: random.Random, state: State, kind: str) -> int | str:
     """A sequence, or a material."""
     loose: list[int] | list[str] = [one.sequence for one in state.loose]
     if kind == "forget":
-        loose = sorted({one.material for one in state.felt} - {one.material for one in state.felt if one.fixed})
+        loose = sorted({one.material for one in state.observed} - {one.material for one in state.observed if one.fixed})
     if loose and rng.random() < 0.95:
         return rng.choice(loose)
     return rng.choice(MATERIALS) if kind == "forget" else state.last + 3

@@ -47,9 +47,9 @@ class Recorded:
 
     def instants(self) -> list[tuple[int, int]]:
         """Of each operation: the first event behind its beginning, and the first behind its end."""
-        marks = [(at, event.path.split()) for at, event in enumerate(self.events) if event.kind == "M"]
-        begun = {int(number): at + 1 for at, (what, number) in marks if what == "begin"}
-        done = {int(number): at + 1 for at, (what, number) in marks if what == "done"}
+        marks = [(i, event.path.split()) for i, event in enumerate(self.events) if event.kind == "M"]
+        begun = {int(number): i + 1 for i, (what, number) in marks if what == "begin"}
+        done = {int(number): i + 1 for i, (what, number) in marks if what == "done"}
         return [(begun[number], done[number]) for number in range(len(self.operations))]
 
 
@@ -120,12 +120,12 @@ class Cutting:
         # An operation at random, and then an instant of it: by events alone nearly all would fall into compactions.
         chosen = [self.rng.choice(instants) for _ in range(count)]
         places = sorted(self.rng.randint(begin, end) for begin, end in chosen)
-        at, state = 0, None
+        i, state = 0, None
         for place in places:
-            while at < place:
-                if not self.left_out(recorded.events[at]):
-                    disk.apply(recorded.events[at])
-                at += 1
+            while i < place:
+                if not self.left_out(recorded.events[i]):
+                    disk.apply(recorded.events[i])
+                i += 1
             number = bisect.bisect_right([begin for begin, _ in instants], place) - 1
             state = self._look(disk, recorded, number, done=place >= instants[number][1], place=place)
         return state

@@ -28,12 +28,12 @@ def keys_of(count, seed=0):
 
 def herded_in_fractions(candidates, keys, mean, count):
     """Algorithm 4 of iCaRL as it is written, in rational numbers."""
-    left = sorted(range(len(keys)), key=lambda at: keys[at])
+    left = sorted(range(len(keys)), key=lambda i: keys[i])
     total, chosen = [Fraction(0)] * len(mean), []
     for step in range(1, min(count, len(keys)) + 1):
 
-        def distance(at, step=step, total=total):
-            return sum((m - (x + s) / step) ** 2 for m, x, s in zip(mean, candidates[at], total, strict=True))
+        def distance(i, step=step, total=total):
+            return sum((m - (x + s) / step) ** 2 for m, x, s in zip(mean, candidates[i], total, strict=True))
 
         best = min(left, key=distance)  # the first of equal ones
         left.remove(best)
@@ -72,8 +72,8 @@ def test_herding_depends_on_no_order_and_fewer_are_a_beginning_of_more(given, ra
     assert herd(np.array(rows), keys, np.array(mean), count) == all_of_them[:count]
     order = list(range(len(keys)))
     random.shuffle(order)
-    again = herd(np.array(rows)[order], [keys[at] for at in order], np.array(mean), len(keys))
-    assert [order[at] for at in again] == all_of_them
+    again = herd(np.array(rows)[order], [keys[i] for i in order], np.array(mean), len(keys))
+    assert [order[i] for i in again] == all_of_them
 
 
 def test_scores_beyond_64_bits_are_still_compared_exactly():
@@ -84,7 +84,7 @@ def test_scores_beyond_64_bits_are_still_compared_exactly():
     rows[np.arange(count), np.arange(count)] -= np.arange(count) % 7
     rows[count] = LARGEST
     keys = keys_of(count + 1)
-    expected = sorted(range(count), key=lambda at: (-(at % 7), keys[at]))
+    expected = sorted(range(count), key=lambda i: (-(i % 7), keys[i]))
     assert herd(rows, keys, np.full(width, -LARGEST), count + 1) == [*expected, count]
 
 
@@ -305,7 +305,7 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
     rng = np.random.default_rng(0)
     centres = rng.integers(-LARGEST // 2, LARGEST // 2, (4, 12))
     codes = np.concatenate([c + rng.integers(-LARGEST // 4, LARGEST // 4, (60, 12)) for c in centres]).astype(np.int32)
-    found = compare(codes, keys_of(240), [f"m{at // 60}" for at in range(240)], 40, seed=1)
+    found = compare(codes, keys_of(240), [f"m{i // 60}" for i in range(240)], 40, seed=1)
     assert list(found) == ["full", "pooled-2", "pooled-3", "pooled-4", "live", "random"]
     assert found["full"].shared == found[f"pooled-{CANDIDATES}"].shared == 1
     assert found["live"].shared < 0.9
@@ -322,14 +322,14 @@ def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
 
     pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
     scene = Scene(sensor=pad)
-    labelled = [(name, at) for at in range(6) for name in scene.materials[:3]]
+    labelled = [(name, i) for i in range(6) for name in scene.materials[:3]]
     recordings = Recordings(
         name="simulated",
         sensor=pad,
-        streams=[scene.touch(name, at) for name, at in labelled],
+        streams=[scene.touch(name, i) for name, i in labelled],
         materials=[name for name, _ in labelled],
-        repetition=np.array([at for _, at in labelled]),
-        fold=np.array([at % 3 for _, at in labelled]),
+        repetition=np.array([i for _, i in labelled]),
+        fold=np.array([i % 3 for _, i in labelled]),
         ordered=True,
     )
     result = run_buffers(recordings, Kernels(dimension=64), (6,))

@@ -59,8 +59,8 @@ def touch(seed):
 
 def filled(seeds):
     memory = Memory(DIMENSION, READING)
-    for at, seed in enumerate(seeds, start=1):
-        memory.add(*touch(seed), at)
+    for i, seed in enumerate(seeds, start=1):
+        memory.add(*touch(seed), i)
     return memory
 
 

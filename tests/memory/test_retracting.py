@@ -454,8 +454,8 @@ def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
         whole = fed(without(11, 8))
         assert again.digest() == whole.digest()
         assert again.materials == whole.materials
-        for at in (11, 8):
-            gone = OBSERVED[at][0], learner_key(OBSERVED[at])
+        for i in (11, 8):
+            gone = OBSERVED[i][0], learner_key(OBSERVED[i])
             assert gone not in {(one.material, one.key) for one in again.memory.exemplars}
             assert gone not in {(name, key) for name, key, _ in again.memory.sample}
     assert "no other touch can take the place of a retracted one" in caplog.text
@@ -484,8 +484,8 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
         assert reader.tuned_digest() == learner.tuned_digest()
 
 
-@pytest.mark.parametrize("at", [0, 4, 8, 11])
-def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, monkeypatch):
+@pytest.mark.parametrize("i", [0, 4, 8, 11])
+def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, i, monkeypatch):
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
     felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]
     learner, receipts = filled(path, felt)
@@ -494,8 +494,8 @@ def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, at, m
             connection.execute("UPDATE payload SET bytes = x'00' WHERE sequence > 12")
         left = felt
         try:
-            learner.retract(receipts[at])
-            left = felt[:at] + felt[at + 1 :]
+            learner.retract(receipts[i])
+            left = felt[:i] + felt[i + 1 :]
         except DamageError as damage:
             assert "fail their checksum" in str(damage)
         require_same(learner, left)

@@ -232,7 +232,7 @@ def test_a_batch_is_changed_as_each_of_it(batch, factor, columns):
 
 def test_streams_are_changed_each_by_its_own_draw_of_the_seed():
     scene = Scene(PATCH, seed=0)
-    streams = [scene.touch("felt", at) for at in range(3)]
+    streams = [scene.touch("felt", i) for i in range(3)]
     made, again = (Augmentation().streams(streams, np.random.default_rng(5)) for _ in range(2))
     assert made == again
     assert len({len(stream) for stream in made}) > 1

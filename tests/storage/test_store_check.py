@@ -68,26 +68,16 @@ def test_a_problem_is_plain_data(path):
         problem.kind = "lost"
 
 
-HEADS = {
-    "a column": ("UPDATE record SET label = 'z' WHERE sequence = 18", "row 18 fails its checksum"),
-    "a checksum": ("UPDATE record SET checksum = x'00' WHERE sequence = 18", "row 18 fails its checksum"),
-    "a head": ("DELETE FROM record WHERE sequence = 18", "row 18 is missing"),
-    "several heads": ("DELETE FROM record WHERE sequence IN (17, 18)", "rows 17 to 18 are missing"),
-    "the last": ("DELETE FROM record WHERE sequence = 20", "row 20 is missing"),
-    "arrays": ("UPDATE payload SET bytes = zeroblob(9) WHERE sequence = 18", "row 18 has arrays that fail"),
-    "no arrays": ("DELETE FROM payload WHERE sequence = 18", "row 18 has lost its arrays"),
-    "a compacted head": ("UPDATE record SET key = x'' WHERE sequence = 2", "row 2 fails its checksum"),
-}
-
-
-@pytest.mark.parametrize(("statement", "said"), HEADS.values(), ids=HEADS)
-def test_damaged_rows_are_lost(path, statement, said):
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("DELETE FROM record WHERE sequence = 20", "row 20 is missing"),
+        ("UPDATE record SET key = x'' WHERE sequence = 2", "row 2 fails its checksum"),
+    ],
+)
+def test_a_lost_last_or_compacted_row_is_named_once(path, statement, said):
     change(path, statement)
-    problems = check_store(path)
-    assert {problem.path for problem in problems} == {path / "journal.sqlite"}
-    assert f"lost: {said}" in texts(problems)
-    # The arrays that belong to a missing row are told of, too, but not as another loss.
-    assert [problem.kind for problem in problems].count("lost") == 1
+    assert [said in problem.what for problem in check_store(path) if problem.kind == "lost"] == [True]
 
 
 def test_exchanged_arrays_are_found(path):

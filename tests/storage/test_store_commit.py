@@ -179,11 +179,11 @@ def test_every_file_and_folder_is_durable_before_the_generation_counts(opened, m
     opened.commit({"x": np.arange(10), "y": np.array(1.5)}, upto=0)
     parent = opened.path / "generations"
     final = parent / "00000001"
-    at = events.index(("rename", str(final)))
+    i = events.index(("rename", str(final)))
     written = {final, *final.rglob("*")}
     draft = f"{final}.partial"
-    assert {name.replace(draft, str(final)) for kind, name in events[:at] if kind == "fsync"} >= set(map(str, written))
-    assert events[at + 1 :] == [("fsync", str(parent)), ("make_current", "")]
+    assert {name.replace(draft, str(final)) for kind, name in events[:i] if kind == "fsync"} >= set(map(str, written))
+    assert events[i + 1 :] == [("fsync", str(parent)), ("make_current", "")]
 
 
 def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):

@@ -100,9 +100,9 @@ def test_the_last_commit_may_be_cut_anywhere_in_any_order(crashed, tmp_path):
     for number in range(20):
         last = rng.randrange(1, ROWS)
         cut = bytearray(data[: sizes[last]])
-        for at in range(sizes[last - 1], sizes[last], 512):
+        for i in range(sizes[last - 1], sizes[last], 512):
             if rng.random() < 0.5:
-                cut[at : at + 512] = bytes(len(cut[at : at + 512]))
+                cut[i : i + 512] = bytes(len(cut[i : i + 512]))
         copy = shutil.copytree(path, tmp_path / str(number))
         log_of(copy).write_bytes(cut + rng.choice([b"", bytes(5000), b"\xa5" * 9000]))
         assert damaged_frame(log_of(copy)) is None

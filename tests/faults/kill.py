@@ -168,7 +168,7 @@ class Killing:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """Kill as often as asked."""
-    kills = 15 if options.quick else options.kills
+    kills = 10 if options.quick else options.kills
     warm()
     with Zygote() as zygote, folder(options) as home:
         killing = Killing(home, options.seed, zygote, prepare(home))

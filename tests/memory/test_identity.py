@@ -159,7 +159,7 @@ def test_an_identity_that_is_none_is_damage(tmp_path, change):
 
 class TestSnapshots:
     def test_a_learner_pickles_into_another_process(self, tmp_path):
-        with filled(tmp_path / "m") as learner:
+        with filled(tmp_path / "m", embedding=Kernels(dimension=64)) as learner:
             (tmp_path / "learner").write_bytes(pickle.dumps(learner))
             answer = repr(learner.predict(touch(9)))
             digest = learner.digest()

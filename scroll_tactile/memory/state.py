@@ -262,7 +262,7 @@ class Memory:
         arrays |= sampled
         # The rows after a base are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if base_at is None else ())
-        excluded = [sequence for sequence in sorted(self.retracted) if base_at is not None and sequence <= base_at]
+        excluded = sorted(row for row in self.retracted | self.excluded if base_at is not None and row <= base_at)
         arrays["withdrawn"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
             if part is not None:

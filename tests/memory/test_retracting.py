@@ -384,6 +384,22 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     assert "observation 1 was retracted by row 13, but still counts" in caplog.text
 
 
+def test_a_base_of_a_base_still_knows_what_both_left_out(path, caplog):
+    learner, receipts = filled(path)
+    learner.retract(receipts[0])  # row 13, behind both bases
+    learner.compact(keep=8)
+    learner.compact(keep=5)
+    learner._ledger.store.close()  # as if the power failed
+    with Store.open(path) as store:
+        newest, base = store.newest, store.base().number
+    if newest != base:
+        (path / "generations" / f"{newest:08d}" / "observations" / "c" / "0" / "0").unlink()
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        assert learner.memory.generation == base
+        require_same(learner, without(0))
+    assert "still counts" not in caplog.text
+
+
 def learner_key(one):
     return validate(stream(one[1]), PAD).key
 

@@ -35,7 +35,9 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
             f"came {type(constituents).__name__} {constituents!r:.60}"
         )
     if not constituents:
-        raise DescriptionError(f"expected at least one constituent in {where}; came none. None takes it away")
+        raise DescriptionError(
+            f"expected at least one constituent in {where}; came none. None in place of the mapping removes it"
+        )
     for name in constituents:
         if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
             raise DescriptionError(

@@ -1,9 +1,9 @@
 """Exemplars: the bounded set of raw streams for fine-tuning, a function of what was observed and not of the order.
 
 S. Rebuffi et al. (iCaRL, CVPR 2017, algorithm 4) herd: they pick streams whose mean stays next to the class mean.
-Herding at every observation, as SCROLL does, makes the choice depend on the order. Here candidates are kept that only
-their content hashes chose, a few for each place in the buffer, and the herding is done on them, when it is asked for,
-against the exact mean that the statistics hold.
+Herding at every observation, as SCROLL does, makes the choice depend on the order. Here content hashes alone choose
+candidates, a few for each place in the buffer. When the buffer is needed, these are herded towards the exact mean that
+the statistics hold.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class ExemplarSample:
     """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
 
     capacity: streams in the buffer; `ratio` times as many candidates are kept.
-    ratio: the nearer to 1, the less there is to herd; at 1 the buffer is a random choice.
+    ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
 
     Raises InputError for a capacity or ratio below 1.
     """
@@ -209,7 +209,7 @@ class ExemplarSample:
             "exemplar-codes": np.stack(codes) if codes else np.zeros((0, 0), np.int32),
             "exemplar-readings": np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
         }
-        # Version 0.1 reads in "felt" what a limit in bytes had dropped.
+        # Version 0.1 expects "felt": what a limit in bytes had dropped.
         return arrays, {"materials": [exemplar.material for exemplar in exemplars], "felt": {}}
 
     @classmethod
@@ -237,8 +237,8 @@ def rank(sample: ExemplarSample, means: Callable[[str, Scale], IntArray]) -> dic
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.
-    Herded are the candidates of the widest scale that the material has; those too brief for it come behind, by scale
-    and key. A smaller buffer is a beginning of a larger one.
+    The candidates of the material's widest scale are herded; briefer ones come after them, by scale and key. A smaller
+    buffer is the beginning of a larger one.
     """
     candidates: dict[str, list[Exemplar]] = {}
     for exemplar in sample:

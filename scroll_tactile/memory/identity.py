@@ -35,13 +35,13 @@ ROBUST = "robust kernels"
 
 
 class _Kept(BaseModel):
-    """A part of an identity, as JSON keeps it; what a later version adds is passed over."""
+    """A part of an identity, as JSON keeps it; fields that a later version adds are ignored."""
 
     model_config = ConfigDict(frozen=True)
 
 
 class EmbeddingIdentity(_Kept):
-    """An embedding as a memory names it; its configuration, from which it can be made again, None for a user's own."""
+    """What a memory knows of its embedding; configuration: what makes it again, None for a user's own embedding."""
 
     name: str
     dimension: int
@@ -74,10 +74,10 @@ class Grid(_Kept):
 
 
 class Identity(_Kept):
-    """All that a memory is made with, for good.
+    """Everything that a memory is made with and that never changes.
 
     reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
-    exemplars: streams in the buffer, and a limit of bytes that is not used any more; None likewise.
+    exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
     """
 
     sensor: Sensor
@@ -125,7 +125,7 @@ class Identity(_Kept):
             ) from error
 
     def to_json(self) -> dict[str, Any]:
-        """In JSON's types, as a store keeps it; what is not there is left out, as the versions before it left it."""
+        """Its fields in JSON's types, as a store keeps them; absent ones are left out, as earlier versions did."""
         kept = self.model_dump(mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars"})
         kept["grid"] = self.grid.model_dump(mode="json", exclude={"frames"} if not self.grid.frames else None)
         if self.exemplars is not None:
@@ -136,10 +136,10 @@ class Identity(_Kept):
         return kept
 
     def exemplar_count(self, store: Store, asked: int | None) -> int:
-        """Streams in the buffer: as the memory was made with. Raises MismatchError where another number is asked for.
+        """Streams in the buffer, as the memory was made. Raises MismatchError where `asked` is another number.
 
-        A memory from before there were exemplars keeps those of what was observed since it was first opened with some.
-        One that was made with a limit of bytes keeps what it has, and from now on the usual number.
+        A memory older than exemplars takes `asked`, and keeps exemplars of what it observes from then on. One that was
+        made with a limit in bytes takes the usual number.
         """
         kept = self.exemplars
         if kept is None and (generation := store.latest()) is not None:
@@ -149,15 +149,15 @@ class Identity(_Kept):
         count = usual_exemplars(self.sensor) if kept[0] is None else kept[0]
         if asked not in (None, count):
             raise MismatchError(
-                f"{store.path} was made with exemplars={count}; it was opened with {asked}. What was not kept cannot "
-                "be had back: leave them out"
+                f"{store.path} was made with exemplars={count}; it was opened with {asked}. Readings that were not "
+                "kept are gone: leave exemplars out"
             )
         return count
 
     def own_embedding(self, path: Path) -> Embedding:
-        """The embedding that it was made with, made again from its configuration; nothing is embedded.
+        """The memory's embedding, made again from its configuration; nothing is embedded.
 
-        Raises EmbeddingMismatchError for a user's own, which only the user has.
+        Raises EmbeddingMismatchError for a user's own embedding, which has no configuration.
         """
         made = self.embedding
         if made.configuration is not None:
@@ -171,7 +171,7 @@ class Identity(_Kept):
         return found
 
     def require(self, path: Path, sensor: Sensor | None, augmentation: Augmented | None) -> None:
-        """Raise MismatchError for what was asked for (not None) and differs from what the memory was made with."""
+        """Raise MismatchError for a sensor or an augmentation, if given, that the memory was not made with."""
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -190,7 +190,7 @@ class Identity(_Kept):
             )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
-        """Raise EmbeddingMismatchError for another embedding than it was made with; it embeds its canaries."""
+        """Raise EmbeddingMismatchError for another embedding than the memory's; computing its fingerprint may embed."""
         mine, made = EmbeddingIdentity.of(embedding), self.embedding
         fields = ("name", "dimension", "bound", "fingerprint")
         if any(getattr(mine, field) != getattr(made, field) for field in fields):
@@ -201,7 +201,7 @@ class Identity(_Kept):
         self.require_plan(path, embedding)
 
     def require_plan(self, path: Path, embedding: Embedding) -> None:
-        """Raise MismatchError for an embedding that reads other windows, or another grid; nothing is embedded."""
+        """Raise MismatchError for an embedding that reads other windows, or a memory of another grid."""
         plan = window_plan(self.sensor, embedding)
         if self.reading is not None and self.reading != (plan.partial, plan.judged):
             raise EmbeddingMismatchError(
@@ -214,7 +214,7 @@ class Identity(_Kept):
 
 
 class AbsentEmbedding:
-    """Stands for the embedding that a memory was made with, where nothing is to be embedded."""
+    """Takes the place of a memory's embedding where nothing is embedded."""
 
     def __init__(self, identity: Identity) -> None:
         made = identity.embedding
@@ -222,13 +222,13 @@ class AbsentEmbedding:
         self.fingerprint = made.fingerprint
         partial, judged = identity.reading or (True, "all")
         self.capabilities = Capabilities(partial_windows=partial, judged_scales=judged)
-        if made.name == ROBUST:  # the one kind that has more scales than its windows, and so more statistics
+        if made.name == ROBUST:  # the only embedding with scales beside its windows
             from scroll_tactile.embeddings.robust import Robust
 
             self.capabilities = Robust(Kernels(dimension=made.dimension)).capabilities
 
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
-        """Raise MismatchError: there is nothing to embed with."""
+        """Raise MismatchError: nothing can be embedded."""
         raise MismatchError(
             f"the memory was opened without its embedding {self.name!r}, to look after it only: open it with "
             "TactileLearner.open(path, embedding=...)"
@@ -236,14 +236,14 @@ class AbsentEmbedding:
 
 
 def usual_embedding(sensor: Sensor) -> Embedding:
-    """The embedding of a memory that asks for none."""
+    """The default embedding for a sensor."""
     from scroll_tactile.embeddings.frames import Frames
 
     return Frames() if sensor.camera else Kernels()
 
 
 def usual_exemplars(sensor: Sensor) -> int:
-    """Streams in the buffer of a memory that asks for no number; a camera's are large, and none are kept."""
+    """The default number of streams in the buffer: none for a camera, whose streams are large."""
     return 0 if sensor.camera else USUAL_EXEMPLARS
 
 
@@ -255,7 +255,7 @@ def open_store(
     exemplars: int | None,
     mode: Literal["write", "read"],
 ) -> Store:
-    """The store in a folder; a new one, where there is none and a sensor says what it is for."""
+    """The store in a folder; a new one where there is none and a sensor is given."""
     try:
         return Store.open(path, mode=mode)
     except NotAStoreError:

@@ -1,4 +1,4 @@
-"""A memory and the store that keeps it: each change is durable before it is told, and there whole or not at all."""
+"""A memory and the store that keeps it: a change is durable when its method returns, and whole or not there at all."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ __all__ = ["Ledger"]
 
 logger = logging.getLogger(__name__)
 
-MOST_ADDED = 256  # touches to be followed: more of them are dearer than fitting again
-SNAPSHOT_EVERY = 1024  # rows between generations: replaying so many takes about a second on opening
+MOST_ADDED = 256  # touches: updating a model with more of them takes longer than fitting it again
+SNAPSHOT_EVERY = 1024  # rows between generations: opening replays so many in about a second
 
 
 class Ledger:
-    """The memory of one learner, and what is written down of it.
+    """The memory of one learner and the store that keeps it.
 
-    load: makes the memory as it is in the store, or an empty one where there is no store. lock: held by whoever looks
-    at the memory or changes it. version: another number after each change of what was observed, and only then.
-    described: likewise of what is said of materials. added: the observations
-    since it was last cleared, where `follow` says that they are wanted; None where anything else has changed.
+    load: reads the memory from the store, or makes an empty one without a store.
+
+    lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
+    described: grows with each change of a description. added: where `follow` is set, the observations since it was last
+    cleared; None where they are too many, or anything else has changed.
     """
 
     def __init__(self, load: Callable[[], Memory], store: Store | None = None) -> None:
@@ -55,15 +56,15 @@ class Ledger:
 
     @property
     def memory(self) -> Memory:
-        """The memory; read anew from the store where ctrl-C, say, came in the middle of a change.
+        """The memory; read again from the store after a change that was cut short, by ctrl-C, say.
 
         Raises ScrollTactileError where there is no store to read it from.
         """
         if not self._whole:
             if self.store is None:
                 raise ScrollTactileError(
-                    "an observation was interrupted while it was added, and a memory without a path has nothing to go "
-                    "back to: make a new one"
+                    "an observation was interrupted while it was added, and a memory without a path cannot be read "
+                    "again: make a new one"
                 )
             self._memory = self._load()
             self._whole = True
@@ -72,9 +73,9 @@ class Ledger:
 
     @contextmanager
     def _mutation(self, revert: Callable[[], None] | None = None) -> Iterator[None]:
-        """A change of the memory and its journal: cut short anywhere, the memory is read anew before its next use.
+        """A change of the memory and its journal: where it is cut short, the memory is read again before its next use.
 
-        revert: undoes in the memory what the journal refused; None where a StoreError leaves the memory half changed.
+        revert: undoes in the memory what the journal refused; None where only reading again can.
         """
         self._whole = False
         try:
@@ -100,7 +101,7 @@ class Ledger:
             raise StoreClosedError(f"the memory {where} is closed: open its path again")
 
     def require_store(self, doing: str) -> Store:
-        """The store. Raises InputError where there is none, and so no journal to go by."""
+        """The store. Raises InputError where there is none: what asks for it needs the journal."""
         self.require_open()
         if self.store is None:
             raise InputError(
@@ -110,7 +111,7 @@ class Ledger:
         return self.store
 
     def require_writing(self) -> None:
-        """Raise beforehand what would keep a generation from being written."""
+        """Raise, before any work is done, what would keep a generation from being written."""
         self.require_open()
         if self.store is None:
             return
@@ -123,14 +124,14 @@ class Ledger:
     def _pass_over_failures(self, store: Store) -> None:
         try:
             store.flush()
-        except StoreError as error:  # of an earlier generation; a commit would raise it in place of committing
+        except StoreError as error:  # of an earlier generation: the next commit would raise it instead of committing
             logger.warning("%s: no generation could be written: %s", store.path, error)
 
     def observe(self, material: str, stream: Stream, columns: int, codes: Codes) -> Receipt:
-        """Write an observation down, then add it."""
+        """Append an observation to the journal, then add it to the memory."""
         with self.lock:
             self.require_open()
-            # Before the journal has it: what is acknowledged, or found there at the next opening, must fit.
+            # Before the journal has it: every row there must fit at the next opening.
             self.memory.statistics.require_room(codes)
             readings = stream.readings if self._memory.exemplars is not None else None
             with self._mutation(_nothing):
@@ -148,7 +149,7 @@ class Ledger:
             return self._memory.sequence + 1
         attributes, arrays = {"columns": columns}, pack_codes(codes)
         if readings is not None:
-            # All, and not only those that are exemplars now: one retracted leaves its place to any other.
+            # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
             attributes["nbytes"], arrays[READINGS] = readings.nbytes, readings
         return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
 
@@ -157,7 +158,7 @@ class Ledger:
         with self.lock:
             self.require_open()
             memory = self.memory
-            if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but says another thing
+            if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
                 return
             with self._mutation(_nothing):
                 if self.store is not None:
@@ -171,30 +172,30 @@ class Ledger:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_store("retract anything")
-            self._withdraw(store, [observation_of(store, self.memory, receipt)], "")
+            self._retract(store, [observation_of(store, self.memory, receipt)], "")
 
     def forget(self, material: str) -> int:
         """As `TactileLearner.forget`."""
         with self.lock:
             store = self.require_store("forget anything")
             found = observations_of(store, self.memory, material)
-            self._withdraw(store, [store.record(sequence) for sequence in found], material)
+            self._retract(store, [store.record(sequence) for sequence in found], material)
         return len(found)
 
-    def _withdraw(self, store: Store, taken: list[Record], material: str) -> None:
-        # In the memory first: what that reads again may be damaged, and once it is written down that they are taken
-        # back, every opening would have to read it.
+    def _retract(self, store: Store, records: list[Record], material: str) -> None:
+        # In the memory first: it reads rows again that may be damaged, and after a retraction is in the journal every
+        # opening would have to read them.
         store.base()
-        memory, sequences = self._memory, spans(record.sequence for record in taken)
+        memory, sequences = self._memory, spans(record.sequence for record in records)
         before = memory.sample, memory.exemplars, memory.tuned
 
         def revert() -> None:
-            for record in taken:
+            for record in records:
                 memory.put_back(record)
             memory.sample, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
-            for record in taken:
+            for record in records:
                 memory.retract(record)
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
@@ -216,7 +217,7 @@ class Ledger:
                 with self.store.batch():
                     try:
                         yield
-                    except BaseException as error:  # not the store's: it would take all of the batch back
+                    except BaseException as error:  # the store must not see it: it would undo the batch
                         raised = error
             except BaseException:
                 self._whole = False
@@ -274,16 +275,16 @@ class Ledger:
                 return False
             if (store.newest, store.last) == (memory.generation, memory.sequence):
                 return False
-            # Anew, and not only the rows since: a fine-tune is in a new generation alone, and a compaction may have
-            # taken away what a retraction needs.
+            # As a whole, not only the rows since: f* is in no row, and a compaction may have removed what a retraction
+            # needs.
             self._memory = self._load()
             self._changed()
             return True
 
     def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
-        """Make f* the memory's, durably, where nothing was retracted of what it was made from.
+        """Keep f*, durably. Raises FineTuneError where something was retracted since its training began.
 
-        made_from, upto, retracted: the memory, its sequence and its count when the training began.
+        made_from, upto, retractions: the memory, its sequence and its count of retractions when the training began.
         """
         with self.lock:
             self.require_writing()
@@ -295,7 +296,7 @@ class Ledger:
             try:
                 self._snapshot()
             except BaseException:
-                # Ctrl-C may have come after the generation was current: closing writes the f* before again.
+                # Ctrl-C may come when the generation is already current: closing writes the earlier f* again.
                 (memory.tuned, memory.tuned_upto), self._saved = before, -1
                 raise
 
@@ -307,7 +308,7 @@ class Ledger:
             chunks = self._memory.chunks()
             self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes, chunks=chunks)
         except StoreError as error:
-            # What was done is durable; only the next opening has more to replay.
+            # The journal has it all; only the next opening has more to replay.
             logger.warning("%s: no generation could be written: %s", self.store.path, error)
         self._saved = self._memory.sequence
         del arrays
@@ -328,7 +329,7 @@ class Ledger:
             if store is None:
                 return
             try:
-                # Half a change is never saved: the journal has the whole of it, or nothing.
+                # A change that was cut short is never saved: the journal holds all of it, or nothing.
                 if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
                     self._pass_over_failures(store)
                     self._snapshot()
@@ -338,4 +339,4 @@ class Ledger:
 
 
 def _nothing() -> None:
-    """The memory never had what the journal refused."""
+    """Nothing to revert: the journal refused the row before the memory was changed."""

@@ -1,4 +1,4 @@
-"""What was observed, as the journal tells it: which observations can be retracted, and how two memories become one."""
+"""What a journal says of observations: which of them can be retracted, and how two memories become one."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
 def observations(store: Store) -> list[Observation]:
     """All observations of a journal, in order, and what became of them."""
     heads, compacted = list(store.heads()), store.compacted
-    gone = _retracted_in(heads)
+    retracted = _retracted_in(heads)
 
     def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
-        if head.sequence in gone:
+        if head.sequence in retracted:
             return "retracted"
         return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
 
@@ -82,7 +82,7 @@ def observations(store: Store) -> list[Observation]:
 
 
 def compaction_point(store: Store, memory: Memory, keep: int) -> int:
-    """The last row to be compacted where the newest `keep` observations are to stay as they are."""
+    """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     if keep == 0:
@@ -92,14 +92,14 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
 
 
 Choice = Literal["same", "ours", "theirs"]
-"""Whose description of a material is kept where two memories have one each; "same": it must be the same."""
+"""Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
 
 @dataclass(frozen=True)
 class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: its heads. shared: streams that both observed. descriptions: those that are not ours already, by material.
+    rows: heads of its journal. shared: streams that both observed. descriptions: by material, those that we have not.
     Made by `Incoming.of`.
     """
 
@@ -117,9 +117,9 @@ class Incoming:
         shared stream cannot be left out.
         """
         _require_mergeable(ours, memory, theirs)
-        base, there = theirs.compacted, _standing(theirs)
+        base, incoming = theirs.compacted, _standing(theirs)
         known = {(head.label, head.key) for head in _standing(ours) if head.kind != MERGE}
-        both = [head for head in there if head.kind != MERGE and (head.label, head.key) in known]
+        both = [head for head in incoming if head.kind != MERGE and (head.label, head.key) in known]
         fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
             raise ObservationError(
@@ -127,24 +127,24 @@ class Incoming:
                 f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
                 'or count them twice, with shared="twice"'
             )
-        rows = there if not once else [head for head in there if (head.label, head.key) not in known]
+        rows = incoming if not once else [head for head in incoming if (head.label, head.key) not in known]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
-                "exemplars: feel it again, or merge into a memory made with exemplars=0"
+                "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
         return cls(theirs, rows, len(both), _descriptions(ours, memory, theirs, descriptions))
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
 
-        The caller makes a batch of it, and tells `each` (rows done, rows in all) what is shown.
+        The caller opens a batch around it. each: called with (rows done, rows in all).
         """
         total = len(self.rows)
-        for material, one in self.descriptions.items():
-            memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": one}).sequence
-            memory.describe(material, one)
+        for material, description in self.descriptions.items():
+            memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": description}).sequence
+            memory.describe(material, description)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != MEMBER:
@@ -156,7 +156,7 @@ class Incoming:
     def _rows_to_append(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         base = self.source.base()
         if base is not None:
-            left_out = ("tuned", "descriptions")  # these come as rows of their own, where they do
+            left_out = ("tuned", "descriptions")  # f* stays there; descriptions come as rows of their own
             attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
@@ -171,31 +171,32 @@ class Incoming:
 
 def _retracted_in(heads: Iterable[Head]) -> set[int]:
     """All sequences that these rows retracted."""
-    return {at for head in heads if head.kind == RETRACT for at in unspanned(head.attributes["sequences"])}
+    return {row for head in heads if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
 def _standing(store: Store) -> list[Head]:
-    """The rows by which anything is known, compacted ones too, without what was ever retracted."""
+    """The rows that something was learned from, compacted ones too, without the retracted ones."""
     heads = list(store.heads())
-    gone = _retracted_in(heads)
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in gone]
+    retracted = _retracted_in(heads)
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
 
 
 def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
-    """Their descriptions that are to come in."""
+    """Those of their descriptions that come in."""
     base = theirs.base()
     theirs_now = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
     for head in theirs.heads(0 if base is None else base.upto):
         apply_description(theirs_now, head)
-    new = {name: one for name, one in sorted(theirs_now.items()) if repr(memory.descriptions.get(name)) != repr(one)}
-    differing = [name for name in new if name in memory.descriptions]
+    ours_now = memory.descriptions
+    new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}
+    differing = [name for name in new if name in ours_now]
     if differing and choice == "same":
         name = differing[0]
         raise MismatchError(
             f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
-            f"here it is {memory.descriptions[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
+            f"here it is {ours_now[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
         )
-    return {name: one for name, one in new.items() if choice != "ours" or name not in memory.descriptions}
+    return {name: new[name] for name in new if choice != "ours" or name not in ours_now}
 
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
@@ -203,22 +204,22 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)
     for part in ("sensor", "embedding", "reading", "grid", "augmentation"):
-        here, there = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
-        if here != there:
+        own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
+        if own != incoming:
             raise MismatchError(
                 f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is "
-                f"{_formatted(here)}, there {_formatted(there)}. Merge memories of one sensor and one embedding"
+                f"{_formatted(own)}, there {_formatted(incoming)}. Merge memories of one sensor and one embedding"
             )
     whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
     if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
         raise MismatchError(
             f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
-            f"{ours.path} keeps {mine.exemplars}, and those that are missing cannot be had back"
+            f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
         )
 
 
 def _without_configuration(part: Any) -> Any:
-    """The part of an identity; of an embedding what tells two apart, for memories made before have no configuration."""
+    """The part of an identity, of an embedding without its configuration: older memories have none."""
     return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
 
 

@@ -1,4 +1,4 @@
-"""What a fine-tune leaves: f*, as arrays, and the word on whether it is used."""
+"""The result of a fine-tune: f* as arrays, and the report that says whether it is used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TuneMode = Literal["head", "adapters", "network"]
 
 @dataclass(frozen=True)
 class TuneReport:
-    """What came of a fine-tune.
+    """The report of a fine-tune.
 
     kept: whether `predict(tuned=True)` answers with f*; f answers where it did worse on exemplars held out.
     reason: why. mode: what was trained. exemplars: trained on. epochs: chosen on exemplars held out.

@@ -16,7 +16,7 @@ from scroll_tactile.datasets.simulator import Scene
 
 @pytest.fixture(scope="module")
 def recordings():
-    """Four materials, felt nine times, in three folds."""
+    """Four materials, observed nine times, in three folds."""
     scene = Scene(sensor=sensors.BIOTAC, seed=3)
     names = [name for name in scene.materials[:4] for _ in range(9)]
     at = np.tile(np.arange(9), 4)
@@ -82,8 +82,8 @@ def test_what_is_missing_is_named(monkeypatch):
 
 
 def made(width, wrong, touches=1000, **more):
-    told = {"width": width, "wrong": wrong, "touches": touches, "predict_ms": width / 100, "observe_ms": 1.0}
-    return told | {"dataset": "x", "readout": "lda", "length": "all"} | more
+    record = {"width": width, "wrong": wrong, "touches": touches, "predict_ms": width / 100, "observe_ms": 1.0}
+    return record | {"dataset": "x", "readout": "lda", "length": "all"} | more
 
 
 def test_the_knee_is_where_no_wider_one_gains_more_than_chance():

@@ -13,7 +13,7 @@ def test_its_embedding_keeps_the_promises_of_one():
     check_embedding(AsIs(), columns=(8,))
 
 
-def test_every_learner_is_taught_and_timed(tmp_path):
+def test_every_learner_is_trained_and_timed(tmp_path):
     pytest.importorskip("sklearn")
     result = run(
         "bench", "interleaved", "--streams", 120, "--pairs", 10, "--interleavings", 200, "--json", tmp_path / "r"

@@ -14,13 +14,13 @@ from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
 from store import Store
 
-FELT = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
+OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
 
 
 @pytest.fixture
 def path(tmp_path):
     with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-        for name, touch in FELT:
+        for name, touch in OBSERVED:
             learner.observe(name, stream(touch))
     return tmp_path / "m"
 
@@ -61,18 +61,18 @@ class TestCheckAndRepair:
         assert "damaged journal was put aside" in repaired
         assert run("memory", "check", path).exit_code == 0
         with TactileLearner.open(path, **SETTINGS) as learner:
-            require_same(learner, FELT)  # the generation holds what the row had
+            require_same(learner, OBSERVED)  # the generation holds what the row had
 
     def test_what_no_generation_holds_is_lost_up_to_there(self, tmp_path):
         learner = TactileLearner.open(tmp_path / "m", **SETTINGS)
-        for name, touch in FELT:
+        for name, touch in OBSERVED:
             learner.observe(name, stream(touch))
         learner._ledger.store.close()  # as if the power failed: no generation is written
         damage(tmp_path / "m")
         result = words(run("memory", "repair", tmp_path / "m"))
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
             kept = sum(learner.materials.values())
-            require_same(learner, FELT[:kept])
+            require_same(learner, OBSERVED[:kept])
         assert f"kept up to row {kept}" in result
         assert 0 < kept < 12
 
@@ -96,7 +96,7 @@ class TestRetracting:
         assert "was retracted already" in refused("memory", "retract", path, 2)
         assert "'b/ü' was never observed" in refused("memory", "forget", path, "b/ü")
         with TactileLearner.open(path, **SETTINGS) as learner:
-            require_same(learner, [one for one in FELT if one[0] != "b/ü"])
+            require_same(learner, [one for one in OBSERVED if one[0] != "b/ü"])
 
     def test_merge(self, path, tmp_path):
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
@@ -105,7 +105,7 @@ class TestRetracting:
         result = words(run("memory", "merge", path, tmp_path / "other", "--shared", "once"))
         assert "1 observations came in; 1 streams were observed by both; 13 are there now" in result
         with TactileLearner.open(path, **SETTINGS) as learner:
-            require_same(learner, [*FELT, ("d", (1, 60))])
+            require_same(learner, [*OBSERVED, ("d", (1, 60))])
             assert f"digest: {learner.digest()}" in result
 
     def test_compact_asks_first(self, path):
@@ -124,13 +124,13 @@ class TestExport:
         run("memory", "compact", path, "--keep", "4", "--yes")
         run("memory", "retract", path, 12)
         assert "written" in words(run("memory", "export", path, tmp_path / "out"))
-        out, left = tmp_path / "out", [one for at, one in enumerate(FELT) if at not in (2, 11)]
+        out, left = tmp_path / "out", [one for at, one in enumerate(OBSERVED) if at not in (2, 11)]
         whole = fed(left)
         about = json.loads((out / "memory.json").read_text())
         assert (about["digest"], about["materials"]) == (whole.digest(), whole.materials)
         with (out / "observations.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
-        assert [row["material"] for row in rows] == [name for name, _ in FELT]
+        assert [row["material"] for row in rows] == [name for name, _ in OBSERVED]
         states = ["compacted"] * 8 + ["kept"] * 3 + ["retracted"]
         states[2] = "retracted"
         assert [row["state"] for row in rows] == states
@@ -157,7 +157,7 @@ class TestExport:
         assert "holds something already" in refused("memory", "export", path, tmp_path / "out")
         assert [one.name for one in (tmp_path / "out").iterdir()] == ["mine"]
         with pytest.raises(InputError, match="cannot be written"):
-            export_plain(fed(FELT), tmp_path / "out" / "mine")
+            export_plain(fed(OBSERVED), tmp_path / "out" / "mine")
 
 
 class TestAnyEmbedding:
@@ -167,12 +167,12 @@ class TestAnyEmbedding:
         module = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d((1, 8)), torch.nn.Flatten(), torch.nn.Tanh())
         embedding = ModuleEmbedding(module, name="means", dimension=8, channels=[2])
         with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=embedding) as learner:
-            for name, touch in FELT:
+            for name, touch in OBSERVED:
                 learner.observe(name, stream(touch))
             learner.forget("c")
             digest = learner.digest()
         with TactileLearner.open(tmp_path / "n", sensor=PAD, embedding=embedding) as learner:
-            for name, touch in FELT:
+            for name, touch in OBSERVED:
                 learner.observe(name, stream(touch))
         assert "c: 4 observations" in words(run("memory", "forget", tmp_path / "n", "c"))
         assert words(run("memory", "compact", tmp_path / "n", "--yes"))

@@ -107,14 +107,14 @@ class TestLetters:
             letter_spike.load(letters, seed=-1)
 
     def test_the_dots_are_those_of_braille(self):
-        told = {letter: "".join(dot[-1] for dot, there in dots_of(letter).items() if there) for letter in LETTERS}
-        assert told["A"] == "1"
-        assert told["J"] == "245"
-        assert told["T"] == "2345"
-        assert told["W"] == "2456"
-        assert told["Z"] == "1356"
-        assert told["space"] == ""
-        assert len(set(told.values())) == 27
+        dots = {letter: "".join(dot[-1] for dot, there in dots_of(letter).items() if there) for letter in LETTERS}
+        assert dots["A"] == "1"
+        assert dots["J"] == "245"
+        assert dots["T"] == "2345"
+        assert dots["W"] == "2456"
+        assert dots["Z"] == "1356"
+        assert dots["space"] == ""
+        assert len(set(dots.values())) == 27
         assert tuple(dots_of("G")) == DOTS
         with pytest.raises(InputError):
             dots_of("Ä")
@@ -184,15 +184,15 @@ class TestSlides:
         places = np.linspace(0, 1, 2000)[:, None]
         pattern = 100 + 40 * np.sin(2 * np.pi * (places + np.arange(16) / 16))
         slow, fast = validate(pattern, CPM_FINGER), validate(pattern[::13], CPM_FINGER)
-        told = fabric_slide.ratios(slow)
-        assert told.sensor == CPM_RATIOS
-        assert told.readings.shape == (144, 16)
-        np.testing.assert_allclose(told.readings, fabric_slide.ratios(fast).readings, atol=0.02)
+        shares = fabric_slide.ratios(slow)
+        assert shares.sensor == CPM_RATIOS
+        assert shares.readings.shape == (144, 16)
+        np.testing.assert_allclose(shares.readings, fabric_slide.ratios(fast).readings, atol=0.02)
         harder = validate(pattern * 2.5, CPM_FINGER)
-        np.testing.assert_allclose(told.readings, fabric_slide.ratios(harder).readings, atol=1e-5)
-        np.testing.assert_allclose(told.readings.mean(axis=1), 0, atol=1e-6)
+        np.testing.assert_allclose(shares.readings, fabric_slide.ratios(harder).readings, atol=1e-5)
+        np.testing.assert_allclose(shares.readings.mean(axis=1), 0, atol=1e-6)
         with pytest.raises(SensorMismatchError):
-            fabric_slide.ratios(told)
+            fabric_slide.ratios(shares)
 
 
 class TestReal:

@@ -59,13 +59,13 @@ class TestTouches:
         assert load[HAND].std() > 4 * load[ROBOT].std()
         assert np.ptp(way[ROBOT]) < 5 < np.ptp(way[HAND])
 
-    def test_yarn_is_felt(self):
+    def test_yarn_is_observed(self):
         """Elastane drags most of all and polyester least; linen is rougher than polyester in the same kind of weave."""
         made_of = SCENE.compositions
 
         def friction(name):
-            felt = forces(name, ROBOT)[150:200]
-            return float((np.linalg.norm(felt[..., :2].sum(axis=1), axis=1) / felt[..., 2].sum(axis=1)).mean())
+            settled = forces(name, ROBOT)[150:200]
+            return float((np.linalg.norm(settled[..., :2].sum(axis=1), axis=1) / settled[..., 2].sum(axis=1)).mean())
 
         pure = {next(iter(shares)): name for name, shares in made_of.items() if len(shares) == 1}
         assert friction(pure["polyester"]) < friction(pure["linen"]) < friction(pure["cotton"])

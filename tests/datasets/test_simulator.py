@@ -71,7 +71,7 @@ def test_channels_farther_along_feel_the_surface_earlier():
 
 
 @pytest.mark.parametrize("sensor", [BIOTAC, ROBOSKIN])
-def test_materials_can_be_told_apart_by_spectrum_but_hardly_by_mean(sensor):
+def test_materials_differ_by_spectrum_but_hardly_by_mean(sensor):
     scene = Scene(sensor=sensor)
     streams = [scene.touch(material, repetition) for material in MATERIALS for repetition in range(20)]
     labels = np.repeat(np.arange(20), 20)

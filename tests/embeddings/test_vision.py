@@ -50,8 +50,8 @@ def test_dimension_is_the_sum_of_the_stages_widths():
 def test_a_narrow_window_sees_nothing_of_what_comes_later():
     early, late = image(19, 200), image(19, 200)
     late[:, 30:] = 1.0
-    asked = {30: [0], 150: [0]}
-    one, other = RANDOM.embed_windows(early, asked), RANDOM.embed_windows(late, asked)
+    windows = {30: [0], 150: [0]}
+    one, other = RANDOM.embed_windows(early, windows), RANDOM.embed_windows(late, windows)
     assert one[30].tobytes() == other[30].tobytes()
     assert one[150].tobytes() != other[150].tobytes()
 

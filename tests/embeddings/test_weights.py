@@ -239,16 +239,16 @@ def test_a_damaged_download_is_noticed(cache, monkeypatch):
 def test_the_downloader_itself_is_asked_for_the_right_file(cache, monkeypatch):
     import pooch
 
-    asked = {}
+    retrieved = {}
 
     def retrieve(url, **settings):
-        asked.update(settings, url=url)
+        retrieved.update(settings, url=url)
         raise OSError("no route to host")
 
     monkeypatch.setattr(pooch, "retrieve", retrieve)
     assert "no route to host" in refusal("resnet34")
-    assert asked["url"] == weights.PUBLISHED["resnet34"]
-    assert asked["path"] / asked["fname"] == cache / "resnet34-b627a593.pth"
+    assert retrieved["url"] == weights.PUBLISHED["resnet34"]
+    assert retrieved["path"] / retrieved["fname"] == cache / "resnet34-b627a593.pth"
 
 
 def test_a_file_with_any_byte_changed_is_refused_or_read_but_never_fails_otherwise(tmp_path):

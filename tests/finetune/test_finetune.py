@@ -303,4 +303,4 @@ def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):
         TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"](), mode="read") as reader,
         pytest.raises(StoreError, match="open it to write"),
     ):
-        reader.fine_tune(progress=lambda *told: pytest.fail("it trained"))
+        reader.fine_tune(progress=lambda *reported: pytest.fail("it trained"))

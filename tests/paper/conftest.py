@@ -1,5 +1,9 @@
 """What several tests of the studies share."""
 
+import json
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 
@@ -12,3 +16,22 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("weights") / "random.pth"
     torch.save(ResNet.random(3).state_dict(), path)
     return str(path)
+
+
+@pytest.fixture
+def gelsight(tmp_path: Path) -> Path:
+    """A folder laid out as PhysiCLeAR: three objects of stripes, three videos of four frames each, and attributes."""
+    image = pytest.importorskip("PIL.Image")
+    rng = np.random.default_rng(0)
+    for i, name in enumerate(("apple", "pen", "rug")):
+        (tmp_path / "physiclear" / name).mkdir(parents=True)
+        for video in (0, 3, 5):
+            for frame in range(4):
+                pixels = rng.normal(100, 2, (240, 320, 3))
+                pixels[:, np.arange(320) // (4 << i) % 2 == 0] += 60
+                path = tmp_path / "physiclear" / name / f"{name}_{video}_{frame}.jpg"
+                image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
+    grades = {"apple": 2, "rug": 0, "pen": 1, "skin": 1}
+    kinds = {"hardness": grades, "roughness": grades, "texture": grades | {"pen": 2}, "materials": {"apple": "food"}}
+    (tmp_path / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
+    return tmp_path

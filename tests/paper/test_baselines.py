@@ -35,12 +35,12 @@ def test_copies_are_learned_beside_the_touches_and_never_validated_on(monkeypatc
     for augmented in (False, True):
         make(TRAIN, augmented, silent)
     assert settings["augmentation"]["copies"] == COPIES
-    felt = {stream.key for _, stream in TRAIN}
+    keys = {stream.key for _, stream in TRAIN}
     for streams, validation in zip(trained, held, strict=True):
-        assert {stream.key for stream in validation} <= felt
+        assert {stream.key for stream in validation} <= keys
         assert len(validation) == 3
         assert not {stream.key for stream in validation} & {stream.key for stream in streams}
-    assert {stream.key for stream in trained[0]} == felt - {stream.key for stream in held[0]}
+    assert {stream.key for stream in trained[0]} == keys - {stream.key for stream in held[0]}
     assert len(trained[1]) == len(trained[0]) * (1 + COPIES)
     assert len({stream.key for stream in trained[1]}) > 1.5 * len(trained[0])
 
@@ -49,9 +49,9 @@ def test_a_network_learns_noise_with_its_augmentation_and_the_seed_makes_it():
     catalogue = Catalogue(course=Course(epochs=15, batch=8))
     make, settings = baseline("conv-lstm", catalogue, augmentation=Augmentation(0, (1, 1), 1, noise=0.3, drift=0))
     assert settings["epochs"] == 15
-    asked = [noise(stream, 0.4, 0) for _, stream in TEST]
+    evaluated = [noise(stream, 0.4, 0) for _, stream in TEST]
     plain, tough = (make(TRAIN, augmented, silent) for augmented in (False, True))
-    shares = [accuracy([name for name, _ in TEST], list(system.predict(asked))) for system in (plain, tough)]
+    shares = [accuracy([name for name, _ in TEST], list(system.predict(evaluated))) for system in (plain, tough)]
     assert shares[1] > shares[0]
     clean = [stream for _, stream in TEST]
     assert list(make(TRAIN, True, silent).predict(clean)) == list(tough.predict(clean))

@@ -1,7 +1,6 @@
 """Objects under a camera: classified by video, and their attributes graded before they are touched."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,39 +120,17 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
 
 
 class TestCommand:
-    @pytest.fixture
-    def folder(self, tmp_path: Path) -> Path:
-        image = pytest.importorskip("PIL.Image")
-        rng = np.random.default_rng(0)
-        for i, name in enumerate(("apple", "rug", "pen")):
-            (tmp_path / "physiclear" / name).mkdir(parents=True)
-            for video in range(2):
-                for frame in range(4):
-                    pixels = rng.normal(100, 2, (240, 320, 3))
-                    pixels[:, np.arange(320) // (4 << i) % 2 == 0] += 60  # stripes
-                    path = tmp_path / "physiclear" / name / f"{name}_{video}_{frame}.jpg"
-                    image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
-        reported = {"apple": 2, "rug": 0, "pen": 1, "skin": 1}
-        kinds = {
-            "hardness": reported,
-            "roughness": reported,
-            "texture": reported | {"pen": 2},
-            "materials": {"apple": "food"},
-        }
-        (tmp_path / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
-        return tmp_path
-
-    def test_videos_are_streams_of_all_their_frames(self, folder):
-        read = physiclear.videos(physiclear.load(folder))
-        assert len(read) == 6
+    def test_videos_are_streams_of_all_their_frames(self, gelsight):
+        read = physiclear.videos(physiclear.load(gelsight))
+        assert len(read) == 9
         assert all(stream.readings.shape == (4, 120, 160, 3) for stream in read.streams)
         assert sorted(set(zip(read.materials, read.repetition.tolist(), strict=True))) == [
-            (name, video) for name in ("apple", "pen", "rug") for video in (0, 1)
+            (name, video) for name in ("apple", "pen", "rug") for video in (0, 3, 5)
         ]
-        assert physiclear.read_attributes(folder)["pen"] == {"hardness": 1, "roughness": 1, "texture": 2}
+        assert physiclear.read_attributes(gelsight)["pen"] == {"hardness": 1, "roughness": 1, "texture": 2}
 
-    def test_it_runs_from_the_data_to_the_figures(self, folder, tmp_path):
-        words = ("fabric", "gelsight", "--data", folder, "--folds", "0", "--groups", "3", "--trees", "0")
+    def test_it_runs_from_the_data_to_the_figures(self, gelsight, tmp_path):
+        words = ("fabric", "gelsight", "--data", gelsight, "--folds", "0", "--groups", "3", "--trees", "0")
         predicted = run(*words, "--json", tmp_path / "g.json").output
         assert all(name in predicted for name in physiclear.ATTRIBUTES)
         result = json.loads((tmp_path / "g.json").read_text())
@@ -163,8 +140,8 @@ class TestCommand:
         assert len(result["parts"]) == 4
 
     @pytest.mark.parametrize("reported", ["", "{}", '{"hardness": {"apple": 5}, "roughness": {}, "texture": {}}'])
-    def test_attributes_that_cannot_be_read_are_named(self, folder, reported):
-        (folder / "physiclear" / "attributes.json").write_text(reported)
+    def test_attributes_that_cannot_be_read_are_named(self, gelsight, reported):
+        (gelsight / "physiclear" / "attributes.json").write_text(reported)
         with pytest.raises(DatasetError, match=r"attributes\.json"):
-            physiclear.read_attributes(folder)
-        assert "attributes.json" in refused("fabric", "gelsight", "--data", folder)
+            physiclear.read_attributes(gelsight)
+        assert "attributes.json" in refused("fabric", "gelsight", "--data", gelsight)

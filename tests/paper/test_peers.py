@@ -58,7 +58,7 @@ class TestStreamingLDA:
             counts[name] = counts.get(name, 0) + 1
             means[name] = means.get(name, row) + residual[:, 0] / counts[name]
             peer.observe(row, name)
-            if k % 7 == 0:  # asked in between, it sums its block: nothing may change
+            if k % 7 == 0:  # read in between, it sums its block: nothing may change
                 np.testing.assert_allclose(peer.covariance, covariance, atol=1e-12)
         np.testing.assert_allclose(peer.covariance, covariance, rtol=1e-10)
         fresh, _ = blobs(count=20)

@@ -57,7 +57,7 @@ class TestSplit:
         pairs = [{sets.streams[i].key, sets.streams[i + 1].key} for i in range(0, 36, 2)]
         assert len(held) == 6 and all(pair <= held or not pair & held for pair in pairs)
 
-    def test_materials_that_no_other_fold_teaches_are_named(self, recordings: Recordings):
+    def test_materials_that_no_other_fold_trains_are_named(self, recordings: Recordings):
         fold = np.repeat([0, 1, 2], 12)
         alone = Recordings("odd", PATCH, recordings.streams, recordings.materials, recordings.repetition, fold, False)
         with pytest.raises(InputError, match=r"'bark'.*never trained on"):
@@ -270,56 +270,44 @@ class TestCommand:
 
 
 class TestPhysiclear:
-    @pytest.fixture
-    def folder(self, tmp_path: Path) -> Path:
-        image = pytest.importorskip("PIL.Image")
-        for name, period in (("apple", 8), ("wood_ruler", 40)):
-            (tmp_path / "physiclear" / name).mkdir(parents=True)
-            for video in (0, 3, 5):
-                for frame in range(4):
-                    pixels = np.full((240, 320, 3), (60, 20 * frame, 30), np.uint8)
-                    pixels[:, np.arange(320) // period % 2 == 0] = 200  # stripes
-                    image.fromarray(pixels).save(tmp_path / "physiclear" / name / f"{name}_{video}_{frame}.jpg")
-        return tmp_path
-
-    def test_frames_are_streams_and_videos_are_not_parted(self, folder: Path):
-        read = physiclear.load(folder)
-        assert len(read) == 24 and set(read.materials) == {"apple", "wood_ruler"}
+    def test_frames_are_streams_and_videos_are_not_parted(self, gelsight: Path):
+        read = physiclear.load(gelsight)
+        assert len(read) == 36 and set(read.materials) == {"apple", "pen", "rug"}
         assert read.streams[0].readings.shape == (1, 120, 160, 3)
-        assert abs(float(read.streams[0].readings[0, 60, 6, 0]) - 60) < 9
-        for name in ("apple", "wood_ruler"):
+        assert abs(float(read.streams[0].readings[0, 60, 6, 0]) - 100) < 20
+        for name in ("apple", "pen", "rug"):
             videos: dict[int, set[int]] = {}
             for material, video, fold in zip(read.materials, read.repetition.tolist(), read.fold.tolist(), strict=True):
                 if material == name:
                     videos.setdefault(video, set()).add(fold)
             assert videos.keys() == {0, 3, 5}
             assert all(len(folds) == 1 for folds in videos.values())
-        assert physiclear.load(folder / "physiclear", seed=1).fold.tolist() != read.fold.tolist()
+        assert physiclear.load(gelsight / "physiclear", seed=1).fold.tolist() != read.fold.tolist()
 
-    def test_a_study_votes_by_video_and_runs_what_reads_frames(self, folder: Path):
-        read = physiclear.load(folder)
+    def test_a_study_votes_by_video_and_runs_what_reads_frames(self, gelsight: Path):
+        read = physiclear.load(gelsight)
         study = Table1([read], ("svm", "kernels-lda"), epochs=1)
         results = list(study.run({read.name: [read.fold[0]]}))
         assert [cell.system for cell, _ in results] == ["kernels-lda"]
         assert results[0][1]["recordings"] == results[0][1]["tested"] // 4
         assert rows(results)[0]["sets"][read.name]["vote"] == 1.0
 
-    def test_what_is_missing_or_damaged_is_named(self, folder: Path):
-        apple = folder / "physiclear" / "apple"
+    def test_what_is_missing_or_damaged_is_named(self, gelsight: Path):
+        apple = gelsight / "physiclear" / "apple"
         (apple / "apple_3_2.jpg").rename(apple / "kept")
         with pytest.raises(DatasetError, match="it also holds kept"):
-            physiclear.load(folder)
+            physiclear.load(gelsight)
         kept = (apple / "kept").read_bytes()
         (apple / "kept").unlink()
         with pytest.raises(DatasetError, match=r"expected .*apple_3_2\.jpg; it is missing.*octopi"):
-            physiclear.load(folder)
+            physiclear.load(gelsight)
         pytest.importorskip("PIL.Image").new("RGB", (64, 48)).save(apple / "apple_3_2.jpg")
         with pytest.raises(DatasetError, match=r"320 × 240.*64 × 48"):
-            physiclear.load(folder)
+            physiclear.load(gelsight)
         (apple / "apple_3_2.jpg").write_bytes(kept[:200])
         with pytest.raises(DatasetError, match=r"apple_3_2\.jpg; it cannot be read"):
-            physiclear.load(folder)
+            physiclear.load(gelsight)
         for path in apple.glob("apple_[35]_*.jpg"):
             path.unlink()
         with pytest.raises(DatasetError, match="two videos or more"):
-            physiclear.load(folder)
+            physiclear.load(gelsight)

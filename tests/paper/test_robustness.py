@@ -66,9 +66,9 @@ def test_records_are_of_the_perturbed_touches_of_their_fold():
     assert len(train) + len(test) == 60
     system = Loudest(train, False, print)
     for record in records:
-        asked = task._perturbed(test, "noise", record["strength"])
-        predicted = system.predict([stream for _, stream in asked])
-        right = np.mean([name == item for (name, _), item in zip(asked, predicted, strict=True)])
+        evaluated = task._perturbed(test, "noise", record["strength"])
+        predicted = system.predict([stream for _, stream in evaluated])
+        right = np.mean([name == item for (name, _), item in zip(evaluated, predicted, strict=True)])
         assert record["accuracy"] == right
     assert task._perturbed(test, "noise", 0.5)[0][1] != test[0][1]
 
@@ -82,8 +82,8 @@ def test_an_interrupted_run_goes_on(tmp_path):
         list(study(tmp_path / "run").run([0], stop))
     kept = json.loads((tmp_path / "run" / "robustness.json").read_text())["notes"]
     assert 0 < len(kept) < len(study().cells(0))
-    asked = []
-    whole = list(study(tmp_path / "run").run([0], lambda what, done, of: asked.append(what)))
+    reported = []
+    whole = list(study(tmp_path / "run").run([0], lambda what, done, of: reported.append(what)))
     assert whole == list(study().run([0]))
     again = study(tmp_path / "run")
     assert list(again.run([0])) == whole

@@ -240,7 +240,7 @@ class TestTraining:
             whole = TRAIN[0][1]
             system.predict([whole, whole.first(whole.seconds / 2)])
         assert widths[0] == 2 * widths[1] == widths[2]
-        assert len(widths) == 3  # of one width, and asked together
+        assert len(widths) == 3  # of one width, and in one batch
 
     def test_the_rate_falls_on_a_plateau_and_the_best_epoch_stays(self):
         images = torch.randn(12, 2, generator=torch.Generator().manual_seed(0))

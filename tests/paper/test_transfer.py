@@ -1,4 +1,4 @@
-"""Transfer between tasks and across sensors: what is learned, what is asked, what is kept, and that it can work."""
+"""Transfer between tasks and across sensors: what is learned, what is evaluated, what is kept, and that it can work."""
 
 import importlib
 import json
@@ -61,9 +61,9 @@ class TestFewTouches:
             for i in range(3):
                 readout.observe(material, touched(PATCH, material, i))
                 learner.observe(material, touched(PATCH, material, i))
-        asked = [touched(PATCH, material, i, 0.3) for material in CYCLES for i in range(10, 16)]
-        predicted = [readout.name_of(stream) for stream in asked]
-        assert predicted == [learner.predict(stream).material for stream in asked]
+        evaluated = [touched(PATCH, material, i, 0.3) for material in CYCLES for i in range(10, 16)]
+        predicted = [readout.name_of(stream) for stream in evaluated]
+        assert predicted == [learner.predict(stream).material for stream in evaluated]
         assert len(set(predicted)) > 1
 
     def test_draws_leave_the_tested_fold_out_and_keep_a_video_together(self):
@@ -205,8 +205,8 @@ class TestAligning:
     def share(self, candidate, streams, trained, names):
         for i in trained:
             candidate.observe(names[i], streams[i])
-        asked = [i for i in range(len(streams)) if i not in trained]
-        return np.mean([candidate.name_of(streams[i]) == names[i] for i in asked])
+        evaluated = [i for i in range(len(streams)) if i not in trained]
+        return np.mean([candidate.name_of(streams[i]) == names[i] for i in evaluated])
 
     def features(self, streams, found):
         return {stream.key: row for stream, row in zip(streams, found, strict=True)}

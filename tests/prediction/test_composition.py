@@ -39,7 +39,7 @@ def described(shares):
     return {name: share for name, share in zip(PARTS, shares, strict=True) if share}
 
 
-def felt(names, touches=8, **settings):
+def observed(names, touches=8, **settings):
     learner = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=256), **settings)
     for at in range(touches):
         for name in names:
@@ -50,7 +50,7 @@ def felt(names, touches=8, **settings):
 @pytest.fixture(scope="module")
 def learner():
     """All mixtures but two were observed, and described afterwards."""
-    learner = felt([name for name in mixtures() if name not in ("cl", "lsw")])
+    learner = observed([name for name in mixtures() if name not in ("cl", "lsw")])
     for name, shares in mixtures().items():
         learner.describe(name, described(shares))
     return learner
@@ -62,7 +62,7 @@ def right(composition, shares):
 
 class TestCompose:
     @pytest.mark.parametrize("name", ["c", "lw", "csw", "clsw"])
-    def test_a_material_that_was_felt_is_known_by_what_it_is_made_of(self, learner, name):
+    def test_a_material_that_was_observed_is_known_by_what_it_is_made_of(self, learner, name):
         for seed in range(20, 24):
             said = learner.compose(touch(mixtures()[name], seed))
             assert all(right(said, mixtures()[name]))
@@ -72,7 +72,7 @@ class TestCompose:
             assert said["cotton"].evidence[0][0] == name or "c" not in name
 
     @pytest.mark.parametrize("name", ["cl", "lsw"])
-    def test_one_never_felt_is_composed_of_those_that_were(self, learner, name):
+    def test_one_never_observed_is_composed_of_those_that_were(self, learner, name):
         answers = [learner.compose(touch(mixtures()[name], seed)) for seed in range(20, 28)]
         assert np.mean([right(one, mixtures()[name]) for one in answers]) > 0.9
         missed = [[one.share for one in said.constituents] for said in answers] - np.array(mixtures()[name])
@@ -111,12 +111,12 @@ class TestSharpness:
     # Its touches are shorter than a wide window, and read as one.
     SLOW = SKIN.model_copy(update={"duration": 1.4})
 
-    def taught(self, names, touches=6):
-        taught = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
+    def trained(self, names, touches=6):
+        trained = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
         for at in range(touches):
             for number, name in enumerate(names):
-                taught.observe(name, self.shape(number, at))
-        return taught
+                trained.observe(name, self.shape(number, at))
+        return trained
 
     def shape(self, number, seed):
         rng = np.random.default_rng([number, seed])
@@ -124,24 +124,24 @@ class TestSharpness:
         return np.clip(np.repeat(level, 50, axis=0), -2, 2)
 
     def test_probabilities_of_known_materials_are_as_sharp_as_touches_taken_out_deserve(self):
-        taught = self.taught("abcd")
+        trained = self.trained("abcd")
         for name in "abcd":
-            taught.describe(name, {"hard": name in "bd", "wet": name in "cd"})
-        composer = taught._current.composer(taught._ledger, taught.model())
+            trained.describe(name, {"hard": name in "bd", "wet": name in "cd"})
+        composer = trained._current.composer(trained._ledger, trained.model())
         assert composer.stages[0].sharpness == 1  # of many windows a touch
         sharpness = composer.stages[-1].sharpness
         assert sharpness > 1.1
-        said = taught.compose(self.shape(3, 50), unfamiliar=0.0)
+        said = trained.compose(self.shape(3, 50), unfamiliar=0.0)
         chances = {name: chance**sharpness for name, chance in said.prediction.ranking}
         assert said["hard"].presence == pytest.approx((chances["b"] + chances["d"]) / sum(chances.values()))
         assert said["hard"].evidence[0][1] == pytest.approx(max(chances.values()) / sum(chances.values()))
 
     def test_fewer_than_eight_touches_or_one_material_leave_them_as_they_are(self):
         for names, touches, sharp in (("ab", 3, False), ("a", 9, False), ("abc", 3, True)):
-            taught = self.taught(names, touches)
+            trained = self.trained(names, touches)
             for name in names:
-                taught.describe(name, {"hard": name == "b"})
-            composer = taught._current.composer(taught._ledger, taught.model())
+                trained.describe(name, {"hard": name == "b"})
+            composer = trained._current.composer(trained._ledger, trained.model())
             assert (composer.stages[-1].sharpness != 1) == sharp
 
 
@@ -167,22 +167,22 @@ class TestDescribing:
             assert repr(after.compose(stream)) == repr(before.compose(stream))
 
     def test_a_later_description_changes_the_answer_without_a_touch(self, learner):
-        taught = felt(["c", "l", "s"], 4)
+        trained = observed(["c", "l", "s"], 4)
         for name in "cls":
-            taught.describe(name, described(mixtures()[name]))
+            trained.describe(name, described(mixtures()[name]))
         stream = touch(mixtures()["s"], 60)
-        assert taught.compose(stream)["silk"].presence > 0.5
-        taught.describe("s", {"wool": 1.0})
-        said = taught.compose(stream)
+        assert trained.compose(stream)["silk"].presence > 0.5
+        trained.describe("s", {"wool": 1.0})
+        said = trained.compose(stream)
         assert said["wool"].presence > 0.5
         assert "silk" not in [one.name for one in said.constituents]
 
     def test_what_all_or_none_have_is_named_and_not_guessed(self):
-        taught = felt(["c", "l", "s"], 4)
+        trained = observed(["c", "l", "s"], 4)
         for name in "cls":
             values = {"dyed": True, "woven": False, "soft": name == "s"}
-            taught.describe(name, values | ({"rare": True} if name == "c" else {}))
-        said = taught.compose(touch(mixtures()["s"], 80))
+            trained.describe(name, values | ({"rare": True} if name == "c" else {}))
+        said = trained.compose(touch(mixtures()["s"], 80))
         assert (said["dyed"].presence, said["woven"].presence, said["rare"].presence) == (None, None, None)
         assert "every material" in said["dyed"].unlearned
         assert "no material" in said["woven"].unlearned
@@ -191,18 +191,18 @@ class TestDescribing:
         assert said["soft"].unlearned == ""
         assert [one.share for one in said.constituents] == [None] * 4
 
-    def test_nothing_described_and_nothing_felt(self):
-        taught = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
+    def test_nothing_described_and_nothing_observed(self):
+        trained = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
         with pytest.raises(DescriptionError, match="nothing was described yet"):
-            taught.compose(touch(mixtures()["s"], 0))
-        taught.describe("s", {"silk": 1.0})
-        said = taught.compose(touch(mixtures()["s"], 0))
+            trained.compose(touch(mixtures()["s"], 0))
+        trained.describe("s", {"silk": 1.0})
+        said = trained.compose(touch(mixtures()["s"], 0))
         assert (said["silk"].presence, said["silk"].unlearned) == (None, "nothing was observed yet")
         assert said.prediction.material is None
-        taught.observe("s", touch(mixtures()["s"], 0))
-        assert taught.compose(touch(mixtures()["s"], 1))["silk"].presence is None
-        taught.observe("w", touch(mixtures()["w"], 0))  # felt, and nothing is known of it
-        assert taught.compose(touch(mixtures()["s"], 1))["silk"].presence is None
+        trained.observe("s", touch(mixtures()["s"], 0))
+        assert trained.compose(touch(mixtures()["s"], 1))["silk"].presence is None
+        trained.observe("w", touch(mixtures()["w"], 0))  # observed, and nothing is known of it
+        assert trained.compose(touch(mixtures()["s"], 1))["silk"].presence is None
 
     @pytest.mark.parametrize(
         ("wrong", "said"),
@@ -222,24 +222,24 @@ class TestDescribing:
         ],
     )
     def test_what_cannot_be_is_refused(self, wrong, said):
-        taught = TactileLearner(sensor=SKIN)
-        taught.describe("felt", {"wool": 1.0})
+        trained = TactileLearner(sensor=SKIN)
+        trained.describe("felt", {"wool": 1.0})
         with pytest.raises(DescriptionError, match=said):
-            taught.describe("felt", wrong)
+            trained.describe("felt", wrong)
         with pytest.raises(MaterialError):
-            taught.describe("", {"wool": 1.0})
-        assert taught.descriptions == {"felt": {"wool": 1.0}}
+            trained.describe("", {"wool": 1.0})
+        assert trained.descriptions == {"felt": {"wool": 1.0}}
 
     def test_it_is_kept_plain_and_nobody_elses(self):
-        taught = TactileLearner(sensor=SKIN)
+        trained = TactileLearner(sensor=SKIN)
         mine = {"wool": np.float32(0.25), "silk": np.float64(0.75), "soft": np.True_}
-        taught.describe("felt", mine)
+        trained.describe("felt", mine)
         mine["wool"] = 9
-        taught.descriptions["felt"]["wool"] = 9
-        assert taught.descriptions == {"felt": {"silk": 0.75, "soft": True, "wool": 0.25}}
-        assert [type(value) for value in taught.descriptions["felt"].values()] == [float, bool, float]
-        taught.describe("felt", None)
-        assert taught.descriptions == {}
+        trained.descriptions["felt"]["wool"] = 9
+        assert trained.descriptions == {"felt": {"silk": 0.75, "soft": True, "wool": 0.25}}
+        assert [type(value) for value in trained.descriptions["felt"].values()] == [float, bool, float]
+        trained.describe("felt", None)
+        assert trained.descriptions == {}
 
     def test_rounded_shares_pass_and_equal_descriptions_are_kept_equal(self):
         assert checked("felt", {"wool": 1.0000005}) == {"wool": 1.0000005}
@@ -263,7 +263,7 @@ class TestDescribing:
 
     def test_what_is_unknown_of_a_material_takes_no_part(self):
         names = ["c", "l", "s", "w", "cl"]
-        whole, part = felt(names, 4), felt(names, 4)
+        whole, part = observed(names, 4), observed(names, 4)
         for name in names:
             values = {part: share > 0 for part, share in zip(PARTS, mixtures()[name], strict=True)}
             whole.describe(name, values)

@@ -19,7 +19,7 @@ VISION = Vision(None, seed=0, stages=(1, 2))
 SLOW = Sensor(name="slow", channels=8, rate=10.0, low=0.0, high=1.0, unit="N", duration=4.0)
 
 
-def taught(sensor, embedding=VISION, readout="lda", seconds=None):
+def trained(sensor, embedding=VISION, readout="lda", seconds=None):
     scene = Scene(sensor=sensor)
     learner = TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
     for at in range(3):
@@ -37,7 +37,7 @@ def exported(learner, path):
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
 @pytest.mark.parametrize("sensor", [sensors.BIOTAC, sensors.ROBOSKIN, SLOW], ids=lambda one: one.name)
 def test_it_says_what_predict_says(sensor, readout, tmp_path):
-    learner, scene = taught(sensor, readout=readout)
+    learner, scene = trained(sensor, readout=readout)
     session = exported(learner, tmp_path / "memory.onnx")
     materials = json.loads(session.get_modelmeta().custom_metadata_map["materials"])
     assert materials == list(learner.materials)
@@ -70,14 +70,14 @@ def test_an_empty_memory_is_refused(tmp_path):
 
 
 def test_a_material_observed_only_briefly_is_named(tmp_path):
-    learner, scene = taught(sensors.ROBOSKIN)
+    learner, scene = trained(sensors.ROBOSKIN)
     learner.observe("brief", scene.touch(scene.materials[0], 5).first(0.4))
     with pytest.raises(InputError, match="'brief' was only observed briefly"):
         export_onnx(learner, tmp_path / "memory.onnx")
 
 
 def test_it_reads_no_further_than_was_learned(tmp_path):
-    learner, scene = taught(sensors.ROBOSKIN, seconds=1.2)
+    learner, scene = trained(sensors.ROBOSKIN, seconds=1.2)
     session = exported(learner, tmp_path / "memory.onnx")
     touch = scene.touch(scene.materials[1], 9)
     (scores,) = session.run(None, {"image": tactile_image(touch)})

@@ -24,7 +24,7 @@ def test_a_longer_touch_is_read_as_far_as_was_learned():
 
 
 @pytest.mark.parametrize(("sensor", "least"), [("biotac", 0.96), ("roboskin", 0.945)])
-def test_learned_from_half_streams_whole_ones_are_told_apart(real_data, sensor, least):
+def test_learned_from_half_streams_whole_ones_are_distinguished(real_data, sensor, least):
     # The figures over five folds are 98.3 and 97.2 %; a fold holds 200 touches, and five more of them may be wrong.
     recordings = biotac_slide.load(real_data, sensor)
     learner = TactileLearner(sensor=recordings.sensor)

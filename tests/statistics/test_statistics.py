@@ -51,10 +51,10 @@ few = settings(max_examples=40, deadline=None)
 
 @few
 @given(touches, st.randoms(use_true_random=False))
-def test_any_order_is_the_same(felt, random):
-    shuffled = felt.copy()
+def test_any_order_is_the_same(observed, random):
+    shuffled = observed.copy()
     random.shuffle(shuffled)
-    same(of(felt), of(shuffled))
+    same(of(observed), of(shuffled))
 
 
 @few
@@ -84,7 +84,7 @@ def test_a_difference_takes_out_again(a, b):
 
 @few
 @given(touches, touches)
-def test_what_was_removed_leaves_no_trace_even_when_more_is_felt(a, b):
+def test_what_was_removed_leaves_no_trace_even_when_more_is_observed(a, b):
     statistics = of(a + b)
     for one in b:
         statistics.remove(*touch(one))
@@ -96,17 +96,17 @@ def test_what_was_removed_leaves_no_trace_even_when_more_is_felt(a, b):
 
 @few
 @given(touches)
-def test_what_a_store_keeps_is_all_of_it(felt):
-    arrays, names = of(felt).to_arrays()
-    assert names == sorted(of(felt).materials)
+def test_what_a_store_keeps_is_all_of_it(observed):
+    arrays, names = of(observed).to_arrays()
+    assert names == sorted(of(observed).materials)
     again = Statistics.from_arrays(DIMENSION, SCALES, {name: array.copy() for name, array in arrays.items()}, names)
-    same(again, of(felt))
+    same(again, of(observed))
     before = {name: array.tobytes() for name, array in arrays.items()}
     for one in (1, 2, 3, 4, 5):
         again.add(*touch(one))
-    same(again, of([*felt, 1, 2, 3, 4, 5]))
+    same(again, of([*observed, 1, 2, 3, 4, 5]))
     assert {name: array.tobytes() for name, array in arrays.items()} == before
-    assert of(felt).to_arrays()[0].keys() == arrays.keys()
+    assert of(observed).to_arrays()[0].keys() == arrays.keys()
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
         whole - part
 
 
-def test_only_what_was_felt_can_be_removed():
+def test_only_what_was_observed_can_be_removed():
     statistics = of([])
     statistics.add("wool", 1, {5: np.ones((1, 3), np.int32)})
     for material, fold in (("felt", 1), ("wool", 0)):
@@ -173,7 +173,7 @@ def test_only_what_was_felt_can_be_removed():
     same(statistics, of([]))
 
 
-def test_touches_of_other_lengths_are_told_apart():
+def test_touches_of_other_lengths_are_distinguished():
     codes = {5: np.ones((2, 3), np.int32)}
     shorter, longer = of([]), of([])
     shorter.add("wool", 0, codes, 40)

@@ -568,8 +568,10 @@ def test_what_a_full_memory_refuses_is_not_in_the_journal_either(tmp_path):
         feel(learner, 2)
         digest = learner.digest()
         fill(learner)
-        with pytest.raises(CapacityError):
-            learner.observe("wool", touch("wool", 9))
+        for name in ("wool", "tile"):
+            with pytest.raises(CapacityError, match="exact"):
+                learner.observe(name, touch("wool", 9))
+        assert learner.materials == dict.fromkeys(NAMES, 2)
         last = learner._ledger.store.last
         sequence = learner.memory.sequence
         learner._ledger._saved = sequence  # what was faked must not be written

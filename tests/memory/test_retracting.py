@@ -13,6 +13,7 @@ from scroll_tactile.errors import (
     InputError,
     MismatchError,
     ObservationError,
+    UnknownMaterialError,
 )
 from scroll_tactile.signals.stream import validate
 from store import (
@@ -57,7 +58,11 @@ class TestRetract:
                 learner.retract(receipts[2])
             with pytest.raises(ObservationError, match=r"row 13 .* is no observation, but of kind 'retract'"):
                 learner.retract(13)
-            require_same(learner, without(2))
+            learner.describe("d", {"wool": 1.0})
+            for name in ("d", "e"):
+                with pytest.raises(UnknownMaterialError, match=f"'{name}' was never observed"):
+                    learner.forget(name)
+            require_same(learner, without(2), {"d": {"wool": 1.0}})
 
     def test_a_receipt_of_another_memory_is_refused(self, path, tmp_path):
         learner, _ = filled(path)
@@ -219,6 +224,19 @@ class TestBatch:
 
 
 class TestMerge:
+    def test_what_a_compacted_memory_brings_cannot_be_taken_apart(self, path, tmp_path):
+        ours, _ = filled(path, OBSERVED[:4])
+        theirs, _ = filled(tmp_path / "other", OBSERVED[4:])
+        with ours, theirs:
+            theirs.compact(keep=2)
+            ours.merge(tmp_path / "other", shared="once")
+            require_same(ours, OBSERVED)
+            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 2 of its 4"):
+                ours.forget("a")
+            with pytest.raises(ObservationError, match=r"6 streams that both .* cannot be counted once"):
+                ours.merge(theirs, shared="once")
+            require_same(ours, OBSERVED)
+
     @pytest.mark.parametrize(
         ("settings", "said"),
         [
@@ -278,7 +296,9 @@ class TestMerge:
             with pytest.raises(KeyboardInterrupt):
                 ours.merge(theirs, shared="once", progress=stop)
             require_same(ours, OBSERVED[:4])
-            ours.merge(theirs, shared="once")
+            steps = []
+            ours.merge(theirs, shared="once", progress=lambda *step: steps.append(step))
+            assert steps[-1] == ("merging", 8, 8)
             require_same(ours, OBSERVED)
 
 

@@ -65,9 +65,9 @@ def test_a_commit_waits_for_the_one_in_the_background(opened, monkeypatch):
 
 def test_closing_finishes_what_was_handed_over(tmp_path):
     with Store.open(tmp_path, identity={}) as opened:
-        opened.commit_later(ONE, upto=0)
+        opened.commit_later(ONE, upto=0, attributes={"a": [1]})
     with Store.open(tmp_path) as opened:
-        assert opened.latest().number == 1
+        assert (opened.latest().number, opened.latest().attributes) == (1, {"a": [1]})
     assert "store commit" not in " ".join(thread.name for thread in threading.enumerate())
 
 

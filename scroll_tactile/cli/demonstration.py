@@ -34,9 +34,9 @@ def demo(
 ) -> None:
     """Ten seconds of learning: twenty simulated materials, one by one, nothing forgotten.
 
-    After each material it is asked about held-out touches of all materials met so far. In the end it is asked
-    about materials it has never met, and about the first 0.3 s of a touch. No data is needed, and nothing is kept
-    unless you give --memory.
+    After each material it is tested on held-out touches of all materials learned so far, and in the end on materials
+    that it never learned, and on the first 0.3 s of touches. It needs no data, and keeps nothing unless you give
+    --memory.
     """
     from scroll_tactile.pipelines.demo import Demo
     from scroll_tactile.recordings.arrays import read_sensor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,7 +33,6 @@ __all__ = [
     "progress_bar",
     "say",
     "verdict",
-    "write_json",
 ]
 
 INTERRUPTED = 130  # what a shell reports for a command ended by ctrl-C: 128 + SIGINT
@@ -51,7 +49,7 @@ def say(text: str) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands whose expected errors are one red line, with exit code 1, and whose ctrl-C is 130."""
+    """Commands that end with one red line and exit code 1 on an expected error, and with 130 on ctrl-C."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
@@ -80,7 +78,7 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     except (InputError, NotAStoreError) as error:
         if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
             raise
-        what = f"there is no memory in {path}; to make one, say which sensor it is for, with --sensor"
+        what = f"there is no memory in {path}; to make one, say which sensor it is for: scroll-tactile observe --sensor"
         raise InputError(what) from error
 
 
@@ -111,7 +109,7 @@ def verdict(prediction: Prediction) -> str:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on the standard error; yields what is to be told (what is being done, steps done, steps in all)."""
+    """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console(error=True), transient=True) as progress:
         task = progress.add_task("starting", total=None)
@@ -119,25 +117,11 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def confusion_text(names: Sequence[str], counts: np.ndarray) -> str:
-    """Counts of (truth, said), shape (C, C), as a table of characters; a column is the row of the same number.
-
-    A dot is none.
-    """
+    """Counts of (truth, predicted), shape (C, C), as text: column 3 is the material of row 3, a dot a count of 0."""
     wide = max(map(len, names)) + 3
-    head = " " * wide + "".join(f"{at + 1:>3}" for at in range(len(names)))
+    head = " " * wide + "".join(f"{i:>3}" for i in range(1, len(names) + 1))
     rows = [
-        f"{at + 1:>2} {name:<{wide - 3}}" + "".join(f"{count or '·':>3}" for count in counts[at].tolist())
-        for at, name in enumerate(names)
+        f"{i:>2} {name:<{wide - 3}}" + "".join(f"{count or '·':>3}" for count in row)
+        for i, (name, row) in enumerate(zip(names, counts.tolist(), strict=True), start=1)
     ]
     return "\n".join([head, *rows])
-
-
-def write_json(path: Path, result: dict[str, Any]) -> None:
-    """Write a result, whole or not at all. Raises InputError where the file cannot be written."""
-    text = json.dumps(result, indent=2, ensure_ascii=False) + "\n"
-    try:
-        draft = path.with_name(path.name + ".new")
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from error

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from scroll_tactile.cli.everyday import MemoryFolder
 from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say
 from scroll_tactile.errors import ScrollTactileError
 from store import StoreError, check_store, repair_store
@@ -18,8 +19,6 @@ from store import StoreError, check_store, repair_store
 __all__ = ["memory"]
 
 memory = typer.Typer(cls=Commands, no_args_is_help=True, help="Look after a memory on disk.")
-
-MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
 
 
 class Shared(StrEnum):
@@ -34,14 +33,14 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
     """Verify every checksum; change nothing. The exit code is 1 where something is damaged."""
     with progress_bar() as progress:
         problems = check_store(folder, progress=progress)
-    damaged = [one for one in problems if one.kind != "leftover"]
+    damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
-        found = [{"path": str(one.path), "what": one.what, "kind": one.kind} for one in problems]
+        found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]
         typer.echo(json.dumps({"sound": not damaged, "problems": found}, ensure_ascii=False))
     else:
-        for one in problems:
-            colour = {"lost": "red", "spare": "yellow"}.get(one.kind, "dim")
-            say(f"[{colour}]{one.kind}:[/] {escape(one.what)}")
+        for problem in problems:
+            colour = {"lost": "red", "spare": "yellow"}.get(problem.kind, "dim")
+            say(f"[{colour}]{problem.kind}:[/] {escape(problem.what)}")
         say("[green]sound:[/] every checksum holds" if not damaged else f"[red]{len(damaged)} damaged[/]")
         if damaged:
             say(f"copy the folder, then: scroll-tactile memory repair {escape(str(folder))}")
@@ -52,7 +51,7 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 @memory.command()
 def repair(folder: MemoryFolder) -> None:
     """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
-    # Where it can still be opened, what it knows is written down first: a repair may give up what led to it.
+    # Where it still opens, closing it writes a generation: a repair may give up the rows that led to it.
     with suppress(ScrollTactileError, StoreError), opened_for_upkeep(folder):
         pass
     with progress_bar() as progress:
@@ -73,8 +72,8 @@ def compact(
 ) -> None:
     """Give up the features of old observations for space: they stay learned, and can no longer be retracted."""
     with opened_for_upkeep(folder) as learner:
-        felt = sum(learner.materials.values())
-        question = f"Of {felt} observations only the newest {keep} can be retracted or forgotten afterwards. Go on?"
+        count = sum(learner.materials.values())
+        question = f"Of {count} observations only the newest {keep} can be retracted or forgotten afterwards. Go on?"
         if not yes and not typer.confirm(question):
             raise typer.Exit(1)
         done = learner.compact(keep=keep)
@@ -98,7 +97,7 @@ def export(
 @memory.command()
 def retract(
     folder: MemoryFolder,
-    observation: Annotated[int, typer.Argument(help="Its number, as observe and export tell it.", show_default=False)],
+    observation: Annotated[int, typer.Argument(help="Its number, as observe and export give it.", show_default=False)],
 ) -> None:
     """Take one observation out again, exactly, as if it had never been made."""
     with opened_for_upkeep(folder) as learner:
@@ -128,6 +127,6 @@ def merge(
     """Make a memory the one that observed all that both did, exactly."""
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, shared=shared.value, progress=progress)
-        digest, felt = learner.digest(), sum(learner.materials.values())
-    say(f"{done.observations} observations came in; {done.shared} streams were observed by both; {felt} are there now")
+        digest, count = learner.digest(), sum(learner.materials.values())
+    say(f"{done.observations} observations came in; {done.shared} streams were observed by both; {count} are there now")
     say(f"[bold]digest:[/] {digest}")

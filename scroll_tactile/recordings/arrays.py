@@ -51,20 +51,23 @@ def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     first = text.partition("\n")[0]
     separator = next((mark for mark in ";\t" if mark in first), ",")
     reader = csv.reader(text.splitlines(), delimiter=separator)
-    lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise InputError(f"{path} cannot be read as a table: {error}. Is a quotation mark never closed?") from error
     if lines and not any(_is_number(cell) for cell in lines[0][1]):
         lines = lines[1:]
     if not lines:
         raise InputError(f"expected readings in {path}, one row each; there are none")
     width = len(lines[0][1])
     rows = np.empty((len(lines), width))
-    for at, (line, cells) in enumerate(lines):
+    for i, (line, cells) in enumerate(lines):
         if len(cells) != width:
             raise InputError(f"{path}, row {line}: expected {width} cells as in the rows before it; came {len(cells)}")
         for column, cell in enumerate(cells):
             if not _is_number(cell):
                 raise InputError(f"{path}, row {line}, column {column + 1}: expected a number; came {cell!r:.60}")
-            rows[at, column] = float(cell)
+            rows[i, column] = float(cell)
     return rows
 
 

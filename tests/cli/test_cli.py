@@ -103,6 +103,7 @@ class TestMemory:
     def test_errors_are_one_line(self, memory: Path, files: Path, tmp_path: Path) -> None:
         silk = files / "silk.npy"
         assert "--sensor" in refused("observe", tmp_path / "new", "silk", silk)
+        assert "scroll-tactile observe" in refused("describe", tmp_path / "new", "silk", "silk=1")
         assert not (tmp_path / "new").exists()
         assert "one of biotac" in refused("observe", tmp_path / "new", "silk", silk, "--sensor", "skin")
         assert "biotac" in refused("observe", memory, "silk", silk, "--sensor", "biotac")

@@ -24,6 +24,7 @@ def test_a_table_with_and_without_a_header(tmp_path: Path) -> None:
         ("1,2\n\n3\n", r"row 3: expected 2 cells"),
         ("a,b\n", "there are none"),
         ("", "there are none"),
+        ('"' + "1,2\n" * 50_000, "table: field larger than"),  # a quotation mark that never closes
     ],
 )
 def test_a_bad_cell_is_named_by_row_and_column(tmp_path: Path, text: str, message: str) -> None:

@@ -10,12 +10,13 @@ __all__ = ["Compacted", "Composition", "Constituent", "Merged", "Observation", "
 
 @dataclass(frozen=True)
 class Receipt:
-    """Word that an observation is kept, given when it is durable.
+    """The acknowledgement of one observation.
 
-    sequence: its place in the memory's journal, from 1; in a memory without a store, the count of observations.
-    material: what it was said to be. key: hash of the stream's content, 32 bytes.
-    seconds: the stream's length; of a camera's, of what was kept of it. clipped: values outside the sensor's range.
-    durable: whether it is on disk; False in a memory without a store, and in a batch, which is when it ends.
+    sequence: its row in the memory's journal, from 1; in a memory without a path, the count of observations.
+    material: its label. key: hash of the stream's content, 32 bytes.
+    seconds: the stream's length; of a camera's, that of the frames in contact. clipped: values outside the sensor's
+    range. durable: whether it is on disk; False in a memory without a path, and in a batch, which is durable at its
+    end.
     """
 
     sequence: int
@@ -30,8 +31,8 @@ class Receipt:
 class Observation:
     """What the journal says of one observation.
 
-    sequence, material, key: as in its receipt. time: when it was observed, in seconds since 1970. state: "kept";
-    "compacted": learned, and its features given up; or "retracted".
+    sequence, material, key: as in its receipt. time: when it was observed, in seconds since 1970. state: "kept", with
+    its features; "compacted", learned and without them; or "retracted".
     """
 
     sequence: int
@@ -45,8 +46,8 @@ class Observation:
 class Merged:
     """What a merge brought.
 
-    observations: that came in. shared: streams, of one material, that both memories had observed.
-    described: materials whose descriptions came in, or were replaced.
+    observations: how many came in. shared: how many streams of a material both memories had observed.
+    described: how many materials' descriptions came in or replaced ours.
     """
 
     observations: int
@@ -58,7 +59,7 @@ class Merged:
 class Compacted:
     """What a compaction did.
 
-    upto: the last row of the journal whose features were given up. bytes_before, bytes_after: of the memory on disk.
+    upto: the last row of the journal without its features. bytes_before, bytes_after: size of the memory on disk.
     """
 
     upto: int
@@ -73,15 +74,13 @@ class Prediction:
     material: the likeliest of the materials that were candidates; None where nothing was ever observed.
     probability: that of `material`, given that it is one of the candidates; calibrated on touches held out.
     ranking: every candidate with its probability, likeliest first; equal ones in alphabetical order.
-    novelty: how unlike anything observed: in standard deviations above what known materials give when held out; more
-        is newer; with a scene, than its materials. Infinite where nothing was ever observed; 0 where one material only
-        was, for then there is nothing to be told apart from.
-    known: whether novelty stays below the threshold of the false-alarm rate: False means "never felt this", and
-        then `material` is only what comes nearest.
-    seconds: how much touch the answer rests on: the stream's length, or that of the longest touch learned where the
-        stream is longer, for nothing was ever observed of how a material goes on after that. Of a camera's stream only
-        the frames in contact count, and the one at rest.
-    tuned: whether f*, the fine-tuned model, gave the probabilities; f did otherwise. Novelty is always f's.
+    novelty: how unlike the candidates the touch is, in standard deviations above held-out touches of known materials.
+        Infinite where nothing was ever observed; 0 where only one material was: there is nothing to compare it with.
+    known: whether novelty stays below the threshold of the false-alarm rate. False means "never felt this", and
+        `material` is then only the nearest.
+    seconds: how much touch the answer rests on: the stream's length, at most that of the longest touch learned. Of a
+        camera's stream only the frames in contact count, and the one at rest.
+    tuned: whether f*, the fine-tuned model, gave the probabilities, and not f. Novelty is always f's.
     """
 
     material: str | None
@@ -97,10 +96,9 @@ class Prediction:
 class Constituent:
     """What a stream says of one constituent.
 
-    name: as it was described. presence: the probability that it is there; None where no head could be learned.
-    share: its part of the mass, from 0 to 1; None where it has none, or no head could be learned.
-    evidence: the materials known to have it that the touch feels most like, with the probability of each among all
-        that were observed; likeliest first.
+    name: as in the descriptions. presence: the probability that it is there; None where no head could be learned.
+    share: its part of the mass, from 0 to 1; None where no description gives a share, or no head could be learned.
+    evidence: the materials known to have it that the touch feels most like, each with its probability; likeliest first.
     unlearned: why there is no presence, in words; empty where there is one.
     """
 
@@ -115,9 +113,8 @@ class Constituent:
 class Composition:
     """What a stream feels made of.
 
-    constituents: all that were asked for, in alphabetical order. unfamiliar: the probability that the touch is of a
-        material never observed: what the heads weigh, which speak for a new material, against the known ones that it
-        feels like.
+    constituents: those that were asked for, in alphabetical order. unfamiliar: the probability that the touch is of a
+        material never observed; so much weight have the heads, and the rest the materials that it feels like.
     prediction: what it feels like among the materials observed.
     """
 
@@ -127,7 +124,7 @@ class Composition:
 
     def __getitem__(self, name: str) -> Constituent:
         """The constituent of a name. Raises KeyError where it was not asked for."""
-        for one in self.constituents:
-            if one.name == name:
-                return one
+        for constituent in self.constituents:
+            if constituent.name == name:
+                return constituent
         raise KeyError(name)

@@ -1,11 +1,11 @@
-"""From f to f*: a pass over the exemplars alone that starts from the closed form and ends no worse than it.
+"""From f to f*: training on the exemplars alone, from the closed form on; f* is used where it is clearly better.
 
 As in SCROLL (Wang et al. 2022, arXiv 2210.05561) f* restarts each time from the pre-trained weights with its head set
 from the readout, and is trained by cross-entropy on the buffer only. Small buffers train residual adapters (Li et al.
 2022, arXiv 2107.00358), a 1 × 1 convolution beside each 3 × 3 one, and the head; larger ones the whole network. How
-long to train, and whether f* is used at all, is decided on the buffer's own folds: every exemplar is answered by an f*
-whose training did not see it, and which began from a readout that did not either. On these the temperature is learned,
-too: learned where f has been solved it only sharpens what is certain already.
+long to train, and whether f* is used at all, is decided on the buffer's own folds: every exemplar is classified by an
+f* that neither its training nor the readout it began from had seen. The temperature is learned there, too: on touches
+that f was solved from it would only sharpen what is certain already.
 """
 
 from __future__ import annotations
@@ -100,8 +100,7 @@ def require_tunable(plan: WindowPlan, embedding: Embedding) -> None:
     if plan.beginning or plan.noisy or plan.filled:
         raise InputError(
             f"f* is made of windows alone, and {embedding!r} reads beginnings, noise and dead channels by statistics "
-            "that training would not know: it would be asked about less than f. Fine-tune a memory of the embedding "
-            "inside it"
+            "that training does not have: f* would see less than f. Fine-tune a memory of the embedding inside it"
         )
 
 

@@ -65,7 +65,7 @@ class Backbone(nn.Module):
         }
 
     def put(self, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
-        """Take over tensors that `tensors` gave."""
+        """Replace tensors by those that `tensors` returned."""
         parameters = dict(self.named_parameters())
         with torch.no_grad():
             for name, tensor in tensors.items():

@@ -51,9 +51,10 @@ class Start:
 
 @dataclass
 class Trained:
-    """One training: logits (touches, C) of the exemplars held out after every epoch, and its state after the last.
+    """The result of a training.
 
-    targets: the places of their materials among the C.
+    logits: (touches, C) of the exemplars held out, after every epoch. targets: the places of their materials among the
+    C. heads, bias, network: as in `Tuned`, after the last epoch.
     """
 
     logits: list[FloatArray]

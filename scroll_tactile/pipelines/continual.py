@@ -58,26 +58,26 @@ def tally(truth: Sequence[str], predicted: Sequence[str | None]) -> Point:
 
 def accuracy_of(point: Point) -> float:
     """The share of right answers at one moment."""
-    return sum(right for right, _ in point.values()) / sum(asked for _, asked in point.values())
+    return sum(right for right, _ in point.values()) / sum(tested for _, tested in point.values())
 
 
 def curve(points: Points) -> list[list[float]]:
-    """[materials met, accuracy over them] at each moment, in the order of learning."""
+    """[materials learned, accuracy over them] at each moment, in the order of learning."""
     return [[len(points[key]), accuracy_of(points[key])] for key in sorted(points, key=int)]
 
 
 def forgetting_of(points: Points) -> float | None:
     """`forgetting` of counts."""
     ordered = [points[key] for key in sorted(points, key=int)]
-    return forgetting([{name: right / asked for name, (right, asked) in point.items()} for point in ordered])
+    return forgetting([{name: right / tested for name, (right, tested) in point.items()} for point in ordered])
 
 
 def summary(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row for each method and size of the buffer: means and standard deviations over the folds.
 
-    folds: what `Continual.run` yields. A row has the method, its size (None: it has no buffer), accuracy and forgetting
-    as {"mean", "sd"} (None: not measured), and the mean curve. Rows of `f*` also hold how many folds kept theirs, and
-    the mean seconds of a fine-tune, exemplars, and bytes of one.
+    folds: the figures of each, as `examples.paper` notes them. A row has the method, its size (None: it has no
+    buffer), accuracy and forgetting as {"mean", "sd"} (None: not measured), and the mean curve. Rows of
+    `f*` also hold how many folds kept theirs, and the mean seconds of a fine-tune, exemplars, and bytes of one.
     """
     if not folds:
         return []

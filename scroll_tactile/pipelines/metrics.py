@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["accuracy", "calibration_error", "mean_and_spread"]
+__all__ = ["accuracy", "calibration_error", "confusion_counts", "mean_and_spread"]
 
 
 def accuracy(truth: Sequence[str | None], predicted: Sequence[str | None]) -> float:
-    """The share of answers that are right: Σ_i [said_i = truth_i] / N.
+    """The share of answers that are right: Σ_i [predicted_i = truth_i] / N.
 
     truth, predicted: N materials each. Raises InputError where N differs or is 0.
     """

@@ -96,8 +96,8 @@ def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:
 
     return [
         [material, name, present(value), value if isinstance(value, float) else ""]
-        for material, one in descriptions.items()
-        for name, value in one.items()
+        for material, description in descriptions.items()
+        for name, value in description.items()
     ]
 
 
@@ -107,8 +107,7 @@ def _arrays(statistics: Statistics) -> dict[str, npt.NDArray[Any]]:
     arrays["materials"] = np.array(names, dtype=np.str_)
     lower = np.tril_indices(statistics.dimension)
     for scale in statistics.scales:
-        felt = set(statistics.names(scale))
-        known = [name for name in names if name in felt]
+        known = sorted({*names} & {*statistics.names(scale)})
         places = [names.index(name) for name in known]
         counts = np.zeros(len(names), np.int64)
         sums = np.zeros((len(names), statistics.dimension), np.int64)

@@ -23,7 +23,7 @@ _KINDS = {"noise": 0, "dead": 1, "drift": 2}
 
 
 def length(stream: Stream, seconds: float, seed: int = 0) -> Stream:
-    """The touch broken off after so many seconds, or whole where it is shorter; nothing is drawn.
+    """The first seconds of the touch, or all of a shorter one; nothing is drawn.
 
     Raises StreamTooShortError for less than 0.1 s.
     """

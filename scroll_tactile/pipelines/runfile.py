@@ -19,7 +19,7 @@ class RunFile:
     """Notes of one run, kept in a JSON file that is replaced whole, or nowhere.
 
     path: the file, or None. plan: what was asked for, in JSON's types; a file of another plan is refused.
-    notes: by name. resumed: whether there were notes to go on from.
+    notes: by name.
 
     Raises InputError for a file of another run or no notes at all.
     """
@@ -28,14 +28,12 @@ class RunFile:
         self.path = path
         self.plan = json.loads(json.dumps(plan))
         self.notes: dict[str, Any] = {}
-        self.resumed = False
         if path is None:
             return
         if path.parent.exists() and not path.parent.is_dir():
             raise InputError(f"expected a folder for the memory; {path.parent} is a file")
         if path.exists():
             self.notes = self._read(path)
-            self.resumed = True
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
             raise InputError(
                 f"{path.parent} holds other things, and no {path.name}: no run to go on with. Take an empty folder"

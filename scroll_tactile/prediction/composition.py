@@ -62,7 +62,7 @@ class Composer:
         feels_like: probability of each material observed. encoded: the touch, with the scales that are `needed`.
         expected: the probability of a material never observed before the touch.
 
-        A touch through noise is composed of the described materials it feels like: the heads read what noise hides.
+        A touch through noise rests on the described materials it feels like alone: the heads read what noise hides.
         """
         if encoded.noisy:
             return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0), expected
@@ -126,7 +126,7 @@ def _sharpened(chances: Mapping[str, float], sharpness: float) -> Mapping[str, f
 
 
 def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Target]) -> list[Constituent]:
-    """Shares made parts of one: of all that is a mass, or, where some share is not known, not more than one."""
+    """Shares that sum to one; where some share is unknown, to at most one."""
     shares = [constituent.share for constituent in constituents if targets[constituent.name].share]
     total = sum(share for share in shares if share is not None)
     if total == 0 or (total <= 1 and None in shares):

@@ -40,7 +40,7 @@ class CurrentModel:
         """The model that predictions are made with: `fitted`, or one updated since where `refit` allows."""
         if not self._settings.refit:
             return self.fitted(ledger)
-        memory = ledger.memory  # read anew first where a change was cut short: that is a version of its own
+        memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
         if self._updated is None or self._updated[0] != ledger.version:
             model, added = self._updated and self._updated[1], ledger.added
             if model is None or added is None or not model.update(memory, added):

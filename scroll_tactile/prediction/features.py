@@ -82,8 +82,8 @@ class FeatureExtractor:
     def codes(self, image: Image, key: bytes) -> Codes:
         """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
 
-        The touch's own come first: the sample finds them by their place. Copies are no longer than the touch, and so
-        have no scale that it has not.
+        The touch's own come first: the sample finds them by their place. Copies are no longer than the touch, so they
+        have no other scales.
         """
         copies, noisy = self._augmentation.copies_of(image, key) if self._augmentation is not None else ([], [])
         own, *others = [self.features(picture) for picture in (image, *copies, *noisy * (not self._plan.noisy))]
@@ -113,7 +113,7 @@ class FeatureExtractor:
     def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale."""
         places = self._plan.places(image.shape[1])
-        # Not rounded: the grid is for sums, and would only add its error to what is evaluated.
+        # Not rounded: the grid is for sums, and would only add its error here.
         return {
             scale: in_units(rows[places[scale]], self._embedding.bound).mean(axis=0)
             for scale, rows in self.features(image, scales).items()
@@ -141,8 +141,8 @@ class FeatureExtractor:
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.
 
-        What comes later was never observed of any material, and the later part of a slide differs: learned from 2 s of
-        BioTac, touches of 4 s are told apart in 93.5 % when all of them is read.
+        Nothing was learned of what comes later, and the later part of a slide differs: learned from 2 s of BioTac,
+        touches of 4 s are right in 93.5 % when they are read to their end.
         """
         frame = self._plan.widths[0] if self._sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column

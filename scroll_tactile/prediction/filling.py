@@ -1,9 +1,9 @@
-"""Broken wires: a channel that reads the low end throughout is filled in from the others, as they usually go together.
+"""Dead channels: a channel that reads the low end throughout is filled in from the others.
 
-A touch teaches, beside the features of its windows, a few of its readings. Their counts, sums and second moment are
-kept like those of any scale, so they are exact too, and from them follows the mean μ and the covariance S of a reading
-over all materials. Of a touch in which the channels s are silent and the channels a are not, the conditional mean of a
-normal distribution is put in their place: x_s = μ_s + S_sa S_aa⁻¹ (x_a − μ_a).
+Beside the features of its windows, a few readings of each touch are sampled. Their counts, sums and second moment are
+kept like those of any scale, and are as exact. They give the mean μ and the covariance S of a reading over all
+materials. Where the channels s of a touch are dead and the channels a alive, the conditional mean of a normal
+distribution replaces the dead ones: x_s = μ_s + S_sa S_aa⁻¹ (x_a − μ_a).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["Filling", "sampled_readings"]
 
 FloatArray = npt.NDArray[np.float64]
 
-SAMPLED = 32  # readings of a touch: 800 touches tell the covariance of 60 channels from 25600 of them
+SAMPLED = 32  # readings of a touch: 800 touches give 25600 for the covariance of 60 channels
 FLOOR = 1 / LEVELS**2  # of a channel's variance: less is rounding
 
 
@@ -34,29 +34,29 @@ def sampled_readings(image: npt.NDArray[np.float32], dimension: int) -> npt.NDAr
     """
     columns = image.shape[1]
     count = min(SAMPLED, columns)
-    at = np.arange(count) * (columns - 1) // max(1, count - 1)
+    places = np.arange(count) * (columns - 1) // max(1, count - 1)
     rows = np.zeros((count, dimension), dtype=np.float32)
-    rows[:, : len(image)] = to_levels(image[:, at]).T / np.float32(LEVELS)
+    rows[:, : len(image)] = to_levels(image[:, places]).T / np.float32(LEVELS)
     return rows
 
 
 @dataclass(frozen=True)
 class Filling:
-    """mean: of a reading, in [-1, 1], shape (C,). covariance: shape (C, C)."""
+    """What fills in dead channels. mean: of a reading, in [-1, 1], shape (C,). covariance: shape (C, C)."""
 
     mean: FloatArray
     covariance: FloatArray
 
     @classmethod
     def of(cls, statistics: Statistics, channels: int, bound: float) -> Filling | None:
-        """By the readings that a memory has sampled; None where there are none."""
+        """From the readings that a memory has sampled; None where there are none."""
         counts, sums = statistics.totals(CHANNELS)
         rows = int(counts.sum())
         if not rows:
             return None
         lower = np.tril_indices(channels)
         second = np.zeros((channels, channels))
-        # The packed triangle's rows come one after another: those of the channels are its beginning.
+        # The triangle is packed row by row: the channels' rows are its beginning.
         second[lower] = statistics.total_second(CHANNELS)[: len(lower[0])] / rows
         second += np.tril(second, -1).T
         mean = sums.sum(axis=0)[:channels] / rows
@@ -66,14 +66,14 @@ class Filling:
         return cls(mean / unit, covariance)
 
     def fill(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """The image with its silent channels filled in, shape (C, T) in [-1, 1]; itself where none or all are."""
-        silent = (image == -1).all(axis=1)
-        if not silent.any() or silent.all():
+        """The image with its dead channels filled in, shape (C, T) in [-1, 1]; itself where none or all are dead."""
+        dead = (image == -1).all(axis=1)
+        if not dead.any() or dead.all():
             return image
-        heard = ~silent
+        alive = ~dead
         with one_thread():
-            weights = np.linalg.solve(self.covariance[np.ix_(heard, heard)], self.covariance[np.ix_(heard, silent)])
-            told = self.mean[silent, None] + weights.T @ (image[heard] - self.mean[heard, None])
+            weights = np.linalg.solve(self.covariance[np.ix_(alive, alive)], self.covariance[np.ix_(alive, dead)])
+            expected = self.mean[dead, None] + weights.T @ (image[alive] - self.mean[alive, None])
         filled = image.copy()
-        filled[silent] = np.clip(told, -1, 1)
+        filled[dead] = np.clip(expected, -1, 1)
         return filled

@@ -40,9 +40,9 @@ class IncrementalModel:
         self._readouts: dict[Scale, RecursiveReadout] = {}
 
     def update(self, memory: Memory, added: Sequence[Added]) -> bool:
-        """Take in the touches that were added since; False where the model has to be fitted again.
+        """Update the model with the touches that were added since; False where it has to be fitted again.
 
-        memory: as it is with them.
+        memory: with these touches in it.
         """
         statistics = memory.statistics
         self._observations += len(added)

@@ -34,9 +34,10 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory, so that each answer rests on one state.
 
-    names: the materials. selections: scale → its readout. stages: for each, the scales that judge there. longest: the
-    columns of the longest touch that was learned. noisy: of touches observed through noise; None where none were
-    learned. filling: of dead channels; None where none are filled in.
+    names: the materials. stages: for each, the scales that judge there. selections: scale → its readout. calibrations:
+    of the stages, as far as any touch reached them. longest: the columns of the longest touch that was learned. noisy:
+    the calibration of touches observed through noise; None where none were learned. filling: fills in dead channels;
+    None where the embedding does not ask for that.
     """
 
     kind: ReadoutName
@@ -51,7 +52,7 @@ class Model:
 
     @classmethod
     def of(cls, memory: Memory, kind: ReadoutName, filling: Filling | None = None) -> Model:
-        """Fit the readouts of a memory and calibrate them; filling: of its dead channels, see `Filling.of`."""
+        """Fit the readouts of a memory and calibrate them; filling: see `Filling.of`."""
         statistics = memory.statistics
         scales = statistics.scales
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
@@ -77,7 +78,7 @@ class Model:
         return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)
 
     def needed(self, candidates: Sequence[str], columns: int) -> list[Scale]:
-        """The scales whose windows judging these candidates for a touch of so many columns takes."""
+        """The scales that are read to judge these candidates for a touch of so many columns."""
         decided = self._decided(candidates, len(self.plan.stages(columns)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]})
 
@@ -95,8 +96,8 @@ class Model:
         means: for each scale that is `needed`, or of NOISE where the touch is `noisy`, its mean features in the codes'
         unit, (d,). columns: observed so far. tuned: logits of f*, by material, in place of the last stage's scores.
 
-        Materials that were observed at fewer scales are weighed against all others at the stage that they share; what
-        these leave over is shared out among the others at the finer stages.
+        A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
+        the probability that is left goes to the others, which later stages weigh again.
         """
         z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
         if noisy:
@@ -104,7 +105,7 @@ class Model:
         reached = len(self.plan.stages(columns))
         probability, mass = np.ones(len(candidates)), 1.0
         decided = self._decided(candidates, reached)
-        for at, (stage, members) in enumerate(decided):
+        for i, (stage, members) in enumerate(decided):
             names = [candidates[place] for place in members]
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
@@ -112,7 +113,7 @@ class Model:
                 logits = self._weighted(self.stages[stage], self.calibrations[stage], z, names)
             chances = np.exp(logits - logits.max())
             probability[members] = chances / chances.sum() * mass
-            later = decided[at + 1][1] if at + 1 < len(decided) else []
+            later = decided[i + 1][1] if i + 1 < len(decided) else []
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
         stage = max(stage for stage, members in decided if best in members)
@@ -141,7 +142,7 @@ class Model:
     def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
         """The places of the candidates that were observed at all of these scales."""
         known = [self.selections[scale].places for scale in scales]
-        return [at for at, name in enumerate(candidates) if all(name in places for places in known)]
+        return [i for i, name in enumerate(candidates) if all(name in places for places in known)]
 
     def _weighted(
         self, scales: Sequence[Scale], calibration: Calibration, z: Mapping[Scale, FloatArray], names: Sequence[str]

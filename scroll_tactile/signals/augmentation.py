@@ -49,9 +49,9 @@ def resize(image: Image, factor: float) -> Image:
     if not (math.isfinite(factor) and factor > 0):
         raise InputError(f"expected a finite factor above 0 to resize by; came {factor}")
     columns = image.shape[-1]
-    at = np.linspace(0, columns - 1, max(1, round(columns * factor)))
-    before = np.minimum(at.astype(np.int64), max(columns - 2, 0))
-    part = (at - before).astype(np.float32)
+    places = np.linspace(0, columns - 1, max(1, round(columns * factor)))
+    before = np.minimum(places.astype(np.int64), max(columns - 2, 0))
+    part = (places - before).astype(np.float32)
     after = np.minimum(before + 1, columns - 1)
     resized: Image = image[..., before] * (1 - part) + image[..., after] * part
     return resized
@@ -97,8 +97,8 @@ def fit(image: Image, columns: int) -> Image:
     if columns < 1:
         raise InputError(f"expected 1 column or more to fit an image to; came {columns}")
     length = image.shape[-1]
-    at = np.arange(columns) % (2 * length)
-    return np.ascontiguousarray(image[..., np.minimum(at, 2 * length - 1 - at)])
+    places = np.arange(columns) % (2 * length)
+    return np.ascontiguousarray(image[..., np.minimum(places, 2 * length - 1 - places)])
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,7 @@ class Change:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        numbers = {one.name: float(getattr(self, one.name)) for one in fields(self)}
-        if not all(map(math.isfinite, numbers.values())):
+        if not all(math.isfinite(getattr(self, field.name)) for field in fields(self)):
             raise InputError(f"expected finite numbers; came {self}")
         positive = self.speed > 0 and 0 < self.keep <= 1 and 0 <= self.place <= 1
         if not positive or min(self.noise, self.drift, self.seed) < 0:
@@ -197,11 +196,9 @@ class Augmentation:
         None is made shorter than the 0.1 s that a stream has to last: it goes on as its mirror image up to there.
         Raises InputError for a camera's stream.
         """
-
-        def one(stream: Stream) -> Stream:
-            return changed(stream, partial(_long_enough, self.draw(rng), fewest_readings(stream.sensor)))
-
-        return [one(stream) for stream in streams]
+        return [
+            changed(stream, partial(_long_enough, self.draw(rng), fewest_readings(stream.sensor))) for stream in streams
+        ]
 
 
 def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:

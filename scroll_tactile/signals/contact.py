@@ -1,8 +1,9 @@
-"""Which of a camera's frames count: those in which the gel is pressed, told by their difference from the gel at rest.
+"""Which of a camera's frames count: those in which the gel is pressed, and so looks unlike the gel at rest.
 
-The resting image is the first frame of every stream, or one that is given once and for all, or there is none and every
-frame counts; an embedding that reads frames says which, by `Capabilities.rest`. A frame is in contact where enough of
-it is brighter or darker than at rest, in any colour: a function of the stream alone, so that a memory is one, too.
+The resting image is the first frame of every stream, or one image for all streams; or there is none, and every frame
+counts. An embedding that reads frames declares which, by `Capabilities.rest`. A frame is in contact where enough of it
+is brighter or darker than at rest, in any colour. That depends on the stream alone, so the memory stays a function of
+its streams.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MOST_FRAMES = 64  # in contact that are kept of a stream, evenly spread
 
 
 def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:
-    """Whether each frame is in contact, shape (T,); without a resting image all are, and the first never if it is that.
+    """Whether each frame is in contact, shape (T,); without a resting image all are.
 
     A frame is averaged to at most 60 × 80 cells; in contact, 1 % of them or more differ from the rest by 2 % of the
     range or more in some colour.
@@ -42,14 +43,14 @@ def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:
     low, high = stream.sensor.limits
     span = high - low
     differing = np.count_nonzero(gap >= np.float32(DIFFERENCE) * span, axis=(1, 2))
-    told: npt.NDArray[np.bool_] = differing >= max(1.0, AREA * gap[0].size)
-    return told
+    contact: npt.NDArray[np.bool_] = differing >= max(1.0, AREA * gap[0].size)
+    return contact
 
 
 def pressed(stream: Stream, rest: Rest) -> Stream:
     """The stream of the frames in contact, at most 64, behind the first frame where that is the resting image.
 
-    What it gives it gives again for its own result.
+    It changes nothing in a stream that it returned.
 
     Raises NoContactError where there are none.
     """

@@ -1,8 +1,8 @@
-"""Augmented observation: a touch is learned together with copies of it as they would have been observed otherwise.
+"""Augmented observation: a touch is learned together with copies at other speeds, in noise, or with dead channels.
 
-The copies are drawn with a generator that is seeded by the touch's content hash, so that what is learned of a touch
-is a function of the touch: in any order, on any machine, at any time the same bits. Only the four operations that
-IEEE 754 rounds correctly are used, and no power or logarithm, whose last bit differs between machines.
+The touch's content hash seeds the generator that draws the copies, so what is learned of a touch is a function of the
+touch: the same bits in any order and on any machine. Only the four operations that IEEE 754 rounds correctly are used,
+and no power or logarithm, whose last bit differs between machines.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scroll_tactile.signals.augmentation import Image, crop, resize
 
 __all__ = ["Augmented", "hiss", "require_augmentable", "silence", "wander"]
 
-FEWEST = 2  # columns of a copy: a touch is not sped up until nothing of it is left
+FEWEST = 2  # columns of a copy, however fast it is
 
 
 def hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
@@ -38,11 +38,11 @@ def silence(image: Image, share: float, rng: np.random.Generator) -> Image:
     """The touch observed with dead channels: a `share` of the channels, rounded, reads the low end of the range
     throughout.
 
-    image: float32 of shape (C, T) in [-1, 1]. Which channels are broken is drawn.
+    image: float32 of shape (C, T) in [-1, 1]. Which channels are dead is drawn.
     """
-    silent = image.copy()
-    silent[rng.permutation(len(image))[: round(share * len(image))]] = -1
-    return silent
+    copy = image.copy()
+    copy[rng.permutation(len(image))[: round(share * len(image))]] = -1
+    return copy
 
 
 def wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -> Image:
@@ -76,8 +76,8 @@ class Augmented(FrozenModel):
     other copies lie between two of the touch's, and are smoothed by that as no sensor smooths.
 
     The speeds are spread evenly over the copies, two of them faster for each that is slower: there is less of a fast
-    touch to be known by. A copy is no longer than the touch: what is slower is cut off there, as it is where it is
-    asked about.
+    touch to be known by. A copy is no longer than the touch: a slower one is cut off there, as slow touches are when
+    they are evaluated.
 
     Raises InputError for strengths that cannot be.
     """
@@ -92,16 +92,16 @@ class Augmented(FrozenModel):
     thinned: bool = False
 
     def model_post_init(self, context: Any) -> None:
-        """Refuse what would copy nothing, or thin nothing."""
+        """Raise InputError for settings that would copy nothing, or thin nothing."""
         if not self.copies + self.noisy:
             raise InputError(f"expected 1 copy or more in all; came {self!r}")
         if self.thinned and (self.speed < 2 or not self.copies):
             raise InputError(f"expected, to be thinned, a copy and a speed of 2 or more; came {self!r}")
 
     def to_json(self) -> dict[str, Any]:
-        """All of it in JSON's types, as a memory keeps it.
+        """Its fields in JSON's types, as a memory keeps them.
 
-        `thinned` only where it is asked for: memories from before it was there are of the same making as without it.
+        `thinned` only where it is true: older memories do not have it.
         """
         return {name: value for name, value in self.model_dump(mode="json").items() if name != "thinned" or value}
 
@@ -112,22 +112,22 @@ class Augmented(FrozenModel):
         `Stream.key`.
         """
         rng = np.random.default_rng([1, int.from_bytes(key, "little")])
-        copies = [self._copy(image, at, rng) for at in range(self.copies)]
+        copies = [self._copy(image, i, rng) for i in range(self.copies)]
         amplitudes = self.noise * (0.1 + 0.9 * rng.random(self.noisy))
         return copies, [hiss(image, float(amplitude), rng) for amplitude in amplitudes]
 
-    def _copy(self, image: Image, at: int, rng: np.random.Generator) -> Image:
-        pace = (at + rng.random()) / self.copies
+    def _copy(self, image: Image, i: int, rng: np.random.Generator) -> Image:
+        pace = (i + rng.random()) / self.copies
         dead, offset, gain = rng.random(3)
-        copy = self._paced(image, pace) if at + 1 < self.copies or not self.thinned else self._thinned(image)
+        copy = self._paced(image, pace) if i + 1 < self.copies or not self.thinned else self._thinned(image)
         copy = wander(copy, offset * self.offset, gain * self.gain, rng)
         return silence(copy, dead * self.dead, rng)
 
     def _paced(self, image: Image, pace: float) -> Image:
-        much = (3 * pace - 1) / 2 if pace > 1 / 3 else 3 * pace
-        factor = 1 + much * (self.speed - 1)
+        faster = pace > 1 / 3
+        factor = 1 + ((3 * pace - 1) / 2 if faster else 3 * pace) * (self.speed - 1)
         columns = image.shape[1]
-        copy = resize(image, max(1 / factor if pace > 1 / 3 else factor, FEWEST / columns))
+        copy = resize(image, max(1 / factor if faster else factor, FEWEST / columns))
         return crop(copy, 0, min(columns, copy.shape[1]))
 
     def _thinned(self, image: Image) -> Image:
@@ -136,7 +136,7 @@ class Augmented(FrozenModel):
 
 
 def require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> None:
-    """Raise InputError for what is no augmentation, and for a camera, whose frames are not slid along time."""
+    """Raise InputError for what is no augmentation, and for any with a camera, whose frames are no channels in time."""
     if augmentation is not None and not isinstance(augmentation, Augmented):
         raise InputError(f"expected an augmentation such as Augmented(copies=4); came {augmentation!r:.60}")
     if augmentation is not None and sensor.camera:

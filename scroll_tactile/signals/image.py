@@ -52,8 +52,8 @@ def scaled_down(frames: npt.NDArray[np.float32], rows: int, columns: int) -> npt
     """Frames (T, height, width, 3) averaged to at most so many rows and columns: (T, rows, columns, 3)."""
     rows, columns = min(frames.shape[1], rows), min(frames.shape[2], columns)
     small = np.empty((len(frames), rows, columns, 3), dtype=np.float32)
-    for at, frame in enumerate(frames):  # one by one: a second of frames in double precision is 180 MB
-        small[at] = _average(_average(frame, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
+    for i, frame in enumerate(frames):  # one by one: a second of frames in double precision is 180 MB
+        small[i] = _average(_average(frame, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
     return small
 
 

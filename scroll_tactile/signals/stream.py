@@ -196,7 +196,7 @@ def _from_torch(tensor: "torch.Tensor") -> _Array:
 def _stack(items: list[Any], sensor: Sensor) -> _Array:
     plain = (list, tuple, numbers.Number)  # np.asarray reads nested lists fastest when it gets them whole
     rows = [
-        item if isinstance(item, plain) else _as_array(item, f"reading {at}", sensor) for at, item in enumerate(items)
+        item if isinstance(item, plain) else _as_array(item, f"reading {i}", sensor) for i, item in enumerate(items)
     ]
     try:
         return np.asarray(rows)
@@ -206,17 +206,17 @@ def _stack(items: list[Any], sensor: Sensor) -> _Array:
 
 
 def _raise_ragged(rows: list[Any], sensor: Sensor) -> None:
-    for at, row in enumerate(rows):
+    for i, row in enumerate(rows):
         try:
             shape = np.shape(row)
         except ValueError:  # ragged within one reading
             raise ChannelCountError(
-                f"expected {sensor.channels} numbers in each reading of sensor {sensor.name!r}; reading {at} "
+                f"expected {sensor.channels} numbers in each reading of sensor {sensor.name!r}; reading {i} "
                 f"of {len(rows)} holds sequences of different lengths"
             ) from None
         if shape != sensor.shape:
             raise ChannelCountError(
-                f"expected each reading of sensor {sensor.name!r} to have shape {sensor.shape}; reading {at} "
+                f"expected each reading of sensor {sensor.name!r} to have shape {sensor.shape}; reading {i} "
                 f"of {len(rows)} has {shape}. Were values lost on the way from the sensor?"
             ) from None
 
@@ -231,17 +231,17 @@ def _real(array: _Array) -> _Array:
         )
     flat = array.reshape(-1)
     values = np.empty(flat.shape)
-    for at, item in enumerate(flat):
+    for i, item in enumerate(flat):
         real = isinstance(item, numbers.Real | np.bool)
         if not real:
-            index = np.unravel_index(at, array.shape)
+            index = np.unravel_index(i, array.shape)
             raise ReadingsTypeError(
                 f"expected real numbers; {_place(index)} is {item!r:.60}, {_article(type(item).__name__)}"
             )
         try:
-            values[at] = float(item)
+            values[i] = float(item)
         except OverflowError:  # an int beyond float64: as far outside the range as can be said
-            values[at] = sys.float_info.max if item > 0 else -sys.float_info.max
+            values[i] = sys.float_info.max if item > 0 else -sys.float_info.max
     return values.reshape(array.shape)
 
 
@@ -290,7 +290,7 @@ def _require_finite(array: _Array, sensor: Sensor) -> None:
 
 
 def _place(index: tuple[Any, ...]) -> str:
-    channel = ", ".join(str(int(at)) for at in index[1:])
+    channel = ", ".join(str(int(axis)) for axis in index[1:])
     return f"reading {int(index[0])}, channel {channel}" if len(index) > 1 else f"item {int(index[0])}"
 
 

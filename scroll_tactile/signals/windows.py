@@ -49,13 +49,13 @@ _NUMBERS = {"noise-a": 0, "beginning": 1, "channels": 2, "noise-b": 3}
 
 @dataclass(frozen=True)
 class Scale:
-    """What statistics are kept of, by itself.
+    """A kind of features that has statistics of its own.
 
     kind: "window" for windows of `width` columns; "beginning" for the first of the narrowest windows alone; "noise-a"
-    and "noise-b" for the two sets of features of a touch observed through noise, as a whole; "channels" for readings
-    themselves, by which dead channels are filled in, and which judges nothing. width: 0 but for windows.
+    and "noise-b" for the two sets of features of a whole touch observed through noise; "channels" for readings
+    themselves, which fill in dead channels and judge nothing. width: 0 except for windows.
 
-    Scales are ordered by their number; `str` of one is its number, which names its arrays on disk.
+    Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it.
     """
 
     kind: Literal["window", "beginning", "noise-a", "noise-b", "channels"]
@@ -135,7 +135,7 @@ def _thinned(begin: Sequence[int]) -> list[int]:
     """At most MOST_WINDOWS of them, evenly."""
     if len(begin) <= MOST_WINDOWS:
         return list(begin)
-    return [begin[at] for at in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
+    return [begin[place] for place in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
 
 
 def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
@@ -181,9 +181,9 @@ class WindowPlan:
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
-    is a scale of its own. noisy: whether touches observed through noise are. filled: whether silent channels are
-    filled in. penalties: the λ that the readouts are tried with; none: those of `shrinkage`. frames: whether windows
-    are a camera's frames.
+    is a scale of its own. noisy: whether touches observed through noise are. filled: whether dead channels are filled
+    in. penalties: the λ that the readouts choose from; those of `readouts.shrinkage` where empty. frames: whether
+    windows are a camera's frames.
     """
 
     widths: tuple[int, ...]
@@ -202,7 +202,7 @@ class WindowPlan:
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """All that has statistics of its own, ascending by number: what is no window comes first."""
+        """All scales, ascending by number: the windows come last."""
         own = NOISE * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled
         return (*sorted(own), *self.windows)
 

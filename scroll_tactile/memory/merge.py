@@ -14,7 +14,7 @@ from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.rows import unspanned
 from scroll_tactile.memory.state import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
-from store import Head, Record, Store
+from store import Generation, Head, Record, Store
 
 __all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations", "observations_of"]
 
@@ -141,11 +141,14 @@ class Incoming:
 
         The caller opens a batch around it. each: called with (rows done, rows in all).
         """
-        total = len(self.rows)
+        base = self.source.base()
+        # A base comes in as one row, and the merges before it are a part of it.
+        part = 0 if base is None else sum(head.kind == MERGE and head.sequence <= base.upto for head in self.rows) - 1
+        total = len(self.rows) - part
         for material, description in self.descriptions.items():
             memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": description}).sequence
             memory.describe(material, description)
-        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(), start=1):
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(base), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != MEMBER:
                 memory.replay(ours.record(head.sequence), ours)
@@ -153,8 +156,7 @@ class Incoming:
             each(done, total)
         return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
 
-    def _rows_to_append(self) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
-        base = self.source.base()
+    def _rows_to_append(self, base: Generation | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:
             left_out = ("tuned", "descriptions")  # f* stays there; descriptions come as rows of their own
             attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}

@@ -301,6 +301,15 @@ class TestMerge:
             assert steps[-1] == ("merging", 8, 8)
             require_same(ours, OBSERVED)
 
+    def test_progress_ends_with_all_rows_done_where_the_other_was_compacted(self, path, tmp_path):
+        theirs, _ = filled(tmp_path / "other")
+        theirs.compact(keep=3)
+        theirs.close()
+        ours, steps = TactileLearner.open(path, **SETTINGS), []
+        with ours:
+            ours.merge(tmp_path / "other", shared="once", progress=lambda *step: steps.append(step))
+        assert steps[-1][1] == steps[-1][2] == len(OBSERVED) + 1  # what it was compacted to, and a row for each stream
+
 
 class TestCompact:
     def test_what_was_learned_stays_and_can_no_longer_be_retracted(self, path):

@@ -52,7 +52,7 @@ __all__ = [
 
 __version__ = "0.2.0"
 
-# Imported when asked for, so that whoever needs a sensor's name does not wait for the libraries behind a learner.
+# Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
     "Augmented": "signals.copies",
     "Capabilities": "embeddings.protocol",

@@ -1,4 +1,4 @@
-"""The errors that scroll-tactile raises on purpose, grouped by what the one who catches them does.
+"""The errors that scroll-tactile raises on purpose, grouped by what to do about them.
 
 ::
 
@@ -46,7 +46,7 @@ class EmptyStreamError(StreamError):
 
 
 class StreamTooShortError(StreamError):
-    """There are too few readings to feel anything in: touch for longer."""
+    """There are too few readings, less than 0.1 s: touch for longer."""
 
 
 class NoContactError(StreamError):

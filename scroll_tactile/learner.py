@@ -47,16 +47,16 @@ class TactileLearner:
     >>> learner.predict(scene.touch(scene.materials[1], 9)).material == scene.materials[1]
     True
 
-    sensor: whose streams it reads. embedding: the frozen features; unless given `Kernels()`, and `Frames()` for a
-    camera, of whose frames those count in which the gel is pressed (see `signals.contact`).
+    sensor: whose streams it reads. embedding: the frozen features; `Kernels()` unless given, and `Frames()` for a
+    camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
     augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
     settings: readout, false_alarms, refit, solver and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
-    In memory only; `TactileLearner.open` gives one with a path. Methods may be called from any thread. `pickle` and
-    `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at that moment, and says of
-    which memory it is a snapshot.
+    A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
+    any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
+    that moment; its repr names the memory that it was taken of.
 
-    Raises InputError for settings that there are not or that do not fit.
+    Raises InputError for unknown settings, and for values that do not fit.
     """
 
     def __init__(
@@ -107,15 +107,15 @@ class TactileLearner:
         mode: Literal["write", "read"] = "write",
         **settings: Any,
     ) -> TactileLearner:
-        """Open the memory in folder `path`, or make it where there is nothing; the rest is as for the class.
+        """Open the memory in folder `path`, or make a new one there; the other arguments are those of the class.
 
-        A memory that is there says itself what it was made with: sensor, augmentation, exemplars and an embedding that
-        ships with scroll-tactile may be left out. Nothing is embedded before the first touch is.
-        mode: "read" for one that another process writes; it shows what was committed when it was opened.
+        An existing memory knows what it was made with: leave out sensor, augmentation, exemplars, and an embedding that
+        ships with scroll-tactile. Nothing is embedded before the first touch.
+        mode: "read" shows what was committed when it was opened, also while another process writes the memory.
 
-        Raises SensorMismatchError, EmbeddingMismatchError, MismatchError for a memory made with others, or with an
-        embedding of the user's own that is not passed; InputError where a new memory is given no sensor; StoreError
-        (locked, damaged, not a store, a newer version …).
+        Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, or with a
+        user's own embedding that is not passed; InputError where a new memory is given no sensor; StoreError (locked,
+        damaged, not a store, a newer version …).
         """
         chosen = Settings(**settings)
         if sensor is None and not Path(path).exists():
@@ -124,14 +124,18 @@ class TactileLearner:
         try:
             identity = Identity.read(store)
             identity.require(store.path, sensor, augmentation)
-            found = identity.own_embedding(store.path) if embedding is None else embedding
-            (identity.require_plan if embedding is None else identity.require_embedding)(store.path, found)
-            learner = cls.__new__(cls)
+            if embedding is None:
+                found = identity.own_embedding(store.path)
+                identity.require_plan(store.path, found)
+            else:
+                found = embedding
+                identity.require_embedding(store.path, found)
             exemplars = identity.exemplar_count(store, chosen.exemplars)
+            learner = cls.__new__(cls)
             learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
             learner._unverified = (identity, store.path) if embedding is None else None
-            plan, most = learner._plan, learner._settings.exemplars or 0
-            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, most), store)
+            plan = learner._plan
+            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, exemplars), store)
         except BaseException:
             store.close()
             raise
@@ -189,7 +193,7 @@ class TactileLearner:
 
     @property
     def memory(self) -> Memory:
-        """What it has learned: statistics, samples, exemplars and f*; to be read, and never to be changed."""
+        """What it has learned: statistics, sample, exemplars, descriptions and f*. Read it; never change it."""
         with self._ledger.lock:
             return self._ledger.memory
 
@@ -217,13 +221,12 @@ class TactileLearner:
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.
 
-        constituents: each with its share by mass, from 0 to 1, all together one, and then what is not named is absent;
-        or, for attributes that are no masses, True where it is there and False where not. None: it is unknown, and so
-        is, of attributes, what is not named; the material takes no part then in what is learned of that constituent.
-        None for all: the description of the material is removed.
+        constituents: name → share by mass, from 0 to 1, summing to one; a mass that is not named is absent. For
+        attributes that are no masses: True or False; one that is not named is unknown. None for a name: unknown, and
+        nothing is learned of that constituent from this material. None for all: removes the description.
 
         A later description replaces an earlier one as a whole; the same one again changes nothing. Statistics and
-        `digest` stay as they are. `forget` takes the description along, `retract` does not.
+        `digest` stay as they are. `forget` removes the description too, `retract` does not.
 
         Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
         that cannot be used (nothing was changed); StoreError.
@@ -233,7 +236,7 @@ class TactileLearner:
 
     @property
     def descriptions(self) -> dict[str, Description]:
-        """Material → what it was said to be made of, as kept, in alphabetical order; observed or not."""
+        """Material → its description, in alphabetical order, whether it was observed or not."""
         with self._ledger.lock:
             described = self._ledger.memory.descriptions
             return {name: dict(description) for name, description in sorted(described.items())}
@@ -242,9 +245,9 @@ class TactileLearner:
     def batch(self) -> Iterator[None]:
         """Make what is observed, retracted or forgotten in the block durable together, when it ends.
 
-        For a bulk of touches: the disk is waited for once. If the process dies in the block none of it is kept. An
-        exception in the block ends it, and what came before it is kept. Other threads wait for the end of it; there is
-        no fine-tuning, merging, compacting or closing in it. In a memory without a path it does nothing.
+        For many touches: it waits for the disk once. If the process dies in the block, none of it is kept; after an
+        exception, what came before it is. Other threads wait for its end, and it allows no fine-tuning, merging,
+        compacting or closing. In a memory without a path it does nothing.
 
         Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
         """
@@ -278,15 +281,15 @@ class TactileLearner:
         descriptions: Choice = "same",
         progress: Callable[[str, int, int], object] | None = None,
     ) -> Merged:
-        """Make this memory the one that observed everything that both did; durable, whole, when this returns.
+        """Add everything that another memory observed; durable, as a whole, when this returns.
 
         other: a memory with a path, or its path; it stays as it is. shared: whether a stream that both observed (one
         material, one content hash) counts once or twice. Receipts of the other memory are not receipts of this one.
-        descriptions: whose is kept of a material that both describe: "ours", "theirs", or "same", where they must be.
+        descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
 
-        Raises MismatchError for a memory of another sensor, embedding or grid, or one that describes a material
-        otherwise where nobody chose, ObservationError where shared streams cannot be told apart any more,
-        CapacityError, InputError, StoreError: nothing was changed then.
+        Raises MismatchError for a memory of another sensor, embedding or grid, and for a different description where
+        they must agree; ObservationError where a shared stream was compacted and cannot be left out; CapacityError,
+        InputError, StoreError. Nothing was changed then.
         """
         if shared not in ("once", "twice"):
             raise InputError(f"expected shared as 'once' or 'twice'; came {shared!r}")
@@ -315,9 +318,9 @@ class TactileLearner:
     def predict(self, stream: Readings, *, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
         """Classify a stream among the materials observed; the memory stays as it is, and the answer is of one state.
 
-        stream: as for `observe`. scene: the materials that can be here; all that were observed where it is None.
-        tuned: ask f*, where there is one that was kept (see `fine_tune`), that knows all the candidates, and whose
-        last stage the touch reaches; f answers otherwise, and `Prediction.tuned` says which of them did.
+        stream: as for `observe`. scene: the materials that can be here; None: all that were observed.
+        tuned: let f* answer (see `fine_tune`), if one was kept, knows all candidates, and the touch is long enough for
+        it; f answers otherwise. `Prediction.tuned` says which of them did.
 
         Raises StreamError, UnknownMaterialError for a scene that names a material never observed, InputError for an
         empty one. Before anything was observed the answer is material None, known False.
@@ -338,19 +341,19 @@ class TactileLearner:
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
     ) -> Composition:
-        """Report what a stream feels made of, of all that was described; the memory stays as it is.
+        """Estimate what the touched material is made of, from the descriptions; the memory stays as it is.
 
-        stream: as for `observe`. constituents: those that are asked for; all where it is None. unfamiliar: how probable
-        it is beforehand that the touch is of a material never observed: 1 where that is known, 0 where it cannot be.
+        stream: as for `observe`. constituents: which of them; None: all that were described. unfamiliar: the
+        probability, before the touch, that the material was never observed: 1 where that is certain, 0 where it cannot
+        be.
 
-        A touch of a material that was observed is composed by what it feels like and what that is made of, one of a
-        material never observed by heads over all that were (see `prediction.composition`); the two are weighed by the
-        touch's novelty. A touch through noise, where noisy copies were observed, rests on what it feels like alone. A
-        constituent that all or none of the materials have that were observed and of which it is known is named, in
-        `Constituent.unlearned`, and not guessed.
+        For a material that was observed the estimate is the composition of the materials it feels like, for one that
+        was not that of heads over all described materials (see `prediction.composition`); the touch's novelty weighs
+        the two. A touch through noise, where noisy copies were observed, has the first alone. A constituent that all
+        materials have, or none, cannot be learned: `Constituent.unlearned` says so.
 
-        Raises StreamError, DescriptionError where nothing was described, or for a constituent that nothing names, and
-        InputError for an unfamiliar that is no probability.
+        Raises StreamError; DescriptionError where nothing was described, or for a constituent that no description
+        names; InputError for an unfamiliar that is no probability.
         """
         if not 0 <= unfamiliar <= 1:
             raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
@@ -373,7 +376,7 @@ class TactileLearner:
         return Composition(made_of, new, prediction)
 
     def _verified(self) -> FeatureExtractor:
-        """The extractor of features, once the embedding that was found for the memory has proved to be its own."""
+        """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""
         if self._unverified is not None:
             identity, path = self._unverified
             identity.require_embedding(path, self._embedding)
@@ -391,7 +394,7 @@ class TactileLearner:
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, encoded.seconds, tuned=tuned)
 
     def model(self) -> Model:
-        """The readouts and calibrations of the memory as it is now; fitted where it changed since it was last asked."""
+        """The readouts and calibrations of the memory as it is now, fitted again where it has changed."""
         with self._ledger.lock:
             return self._current.fitted(self._ledger)
 
@@ -401,7 +404,7 @@ class TactileLearner:
             return self._ledger.memory.statistics.digest()
 
     def observations(self) -> list[Observation]:
-        """What was observed, in order, and what became of it; of a memory without a path, which keeps no journal, none.
+        """Every observation in the journal, in order, and its state; none in a memory without a path.
 
         Raises StoreError.
         """
@@ -429,13 +432,12 @@ class TactileLearner:
     ) -> TuneReport:
         """Make f* from f by training on the exemplars; durable when this returns.
 
-        epochs: the most, 8 unless given; how many are taken is decided on exemplars held out. seed: of the order and
-        the augmentation. device: torch's name of one. progress: called with (what is being done, steps done, steps in
-        all).
+        epochs: the most, 8 unless given; exemplars held out decide how many are taken. seed: of the order and the
+        augmentation. device: as torch names it. progress: called with (what is being done, steps done, steps in all).
 
-        The same memory, seed and device give the same f*, to the bit. f stays as it is, and f* stays what it is when
-        more is observed. Where f* does worse than f on the exemplars held out the report says so, and f goes on
-        answering. Interrupted, or after an error, the f* before stays.
+        The same memory, seed and device give the same f*, to the bit. f stays as it is, and observing more does not
+        change f*. Where f* is not clearly better than f on the exemplars held out, the report says so and f answers.
+        After an interruption or an error the earlier f* stays.
 
         Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
         enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
@@ -478,7 +480,7 @@ class TactileLearner:
         return self._tuned_reader
 
     def close(self) -> None:
-        """Write what opening again would have to replay, and let go of the files; a second call does nothing.
+        """Write a generation, so that opening replays nothing, and release the files; a second call does nothing.
 
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
@@ -495,4 +497,4 @@ class TactileLearner:
 
 
 def _silent(what: str, done: int, of: int) -> None:
-    """Progress that nobody asked for."""
+    """The default progress: shows nothing."""

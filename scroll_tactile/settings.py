@@ -1,4 +1,4 @@
-"""Settings of a learner, and the checks of what it is asked for, before anything is done."""
+"""Settings of a learner, and checks of names and scenes that are passed to it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Settings(FrozenModel):
     exemplars: Annotated[int, Field(ge=0)] | None = None
 
     def model_post_init(self, context: Any) -> None:
-        """Refuse a solver that would never be used."""
+        """Raise InputError for a solver that would never be used."""
         if self.solver == "recursive" and not self.refit:
             raise InputError(
                 "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by "

@@ -11,10 +11,9 @@ It is no model of any real sensor or material: the names are only names. Nothing
 Stream(biotac, (400, 19), 4 s, clipped=0)
 
 A surface is a height over one coordinate: a few sine waves of its own wavelengths, and a fine irregular
-relief. A channel sits at its own place on the pad and feels, at time t, the height at x + speed · t, so that
-what passes one channel passes those behind it a little later; how strongly it feels it depends on the force,
-and on how near the middle of the contact it lies. Force and speed vary from touch to touch, and slowly within
-one.
+relief. A channel at place x on the pad reads, at time t, the height at x + speed · t, so that what passes one
+channel passes those behind it a little later. How strongly it responds depends on the force, and on how near
+the middle of the contact it lies. Force and speed vary from touch to touch, and slowly within one.
 """
 
 import math

@@ -74,7 +74,7 @@ def fine_tune(
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars, model.names)
     touches = TouchFeatures(embedding, model.plan)
-    samples = list(_samples(touches, model, exemplars, (sensor, capabilities_of(embedding).rest), progress))
+    samples = list(_samples(touches, model, exemplars, sensor, capabilities_of(embedding).rest, progress))
     names = sorted({sample.material for sample in samples})
     if len(names) < 2:
         raise InputError(
@@ -137,17 +137,18 @@ def _samples(
     touches: TouchFeatures,
     model: Model,
     exemplars: Mapping[str, Sequence[Exemplar]],
-    seen: tuple[Sensor, Rest],
+    sensor: Sensor,
+    rest: Rest,
     progress: Progress,
 ) -> Iterator[TrainingSample]:
-    """The exemplars that reach the last stage, by material and rank; seen: by which sensor, against what at rest."""
+    """The exemplars that reach the last stage, by material and rank; rest: the resting image of a camera."""
     if len(model.calibrations) < len(model.stages):  # nothing was observed for long enough
         return
     known = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
     total, done = sum(map(len, exemplars.values())), 0
     for material, buffered in sorted(exemplars.items()):
         for exemplar in buffered:
-            image = image_of(validate(exemplar.readings, seen[0]), seen[1])
+            image = image_of(validate(exemplar.readings, sensor), rest)
             columns = image.shape[1]
             if material in known and model.is_last(columns) and touches.reads(columns):
                 yield TrainingSample(material, exemplar.key, image, touches.frozen(image))

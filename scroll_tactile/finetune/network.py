@@ -100,14 +100,13 @@ def adapted(net: Backbone) -> Backbone:
 class TouchFeatures:
     """Mean features of touches, by scale, with the embedding's frozen parts and any network for the rest.
 
-    Features are given as shares of the embedding's bound. Of several parts at most one, the first that is
-    tunable, is tuned, and of the scales those whose windows share one pass; narrower windows stay as the embedding
-    reads them, each by itself.
+    Features are shares of the embedding's bound. Of several parts only the first tunable one is tuned, and of the
+    scales only those whose windows share one pass; narrower windows stay as the embedding reads them, each by itself.
     """
 
-    def __init__(self, embedding: Embedding, reading: WindowPlan) -> None:
+    def __init__(self, embedding: Embedding, plan: WindowPlan) -> None:
         self.parts = parts_of(embedding)
-        self.reading = reading
+        self.plan = plan
         self._tuned = next((i for i, part in enumerate(self.parts) if capabilities_of(part).tunable), None)
         edges = np.cumsum([0, *(part.dimension for part in self.parts)])
         self.dimension = int(edges[-1])
@@ -118,7 +117,7 @@ class TouchFeatures:
     @property
     def tunable(self) -> bool:
         """Whether there is a network to be trained, and a scale that it reads."""
-        return self._tuned is not None and self.reading.widths[-1] >= TOGETHER
+        return self._tuned is not None and self.plan.widths[-1] >= TOGETHER
 
     def reads(self, columns: int) -> bool:
         """Whether a touch of so many columns is one pass of the network, or needs none."""
@@ -131,10 +130,10 @@ class TouchFeatures:
 
     def windows(self, columns: int) -> dict[int, list[int]]:
         """Width → first columns of the windows that judge a touch of so many columns."""
-        read = self.reading.extent(columns)
+        starts = self.plan.extent(columns)
         return {
-            scale.width: [read[scale.width][place] for place in places]
-            for scale, places in self.reading.scored(columns, columns).items()
+            scale.width: [starts[scale.width][place] for place in places]
+            for scale, places in self.plan.scored(columns, columns).items()
         }
 
     def frozen(self, image: npt.NDArray[np.float32]) -> dict[int, FloatArray]:
@@ -196,9 +195,9 @@ class TouchFeatures:
 class TunedReader:
     """Logits of f*: the network with what was trained put into it, and the head."""
 
-    def __init__(self, embedding: Embedding, reading: WindowPlan, tuned: Tuned) -> None:
+    def __init__(self, embedding: Embedding, plan: WindowPlan, tuned: Tuned) -> None:
         self.tuned = tuned
-        self._touches = TouchFeatures(embedding, reading)
+        self._touches = TouchFeatures(embedding, plan)
         self._net: Backbone | None = None
         if tuned.mode != "head":
             self._net = self._touches.network()
@@ -207,13 +206,9 @@ class TunedReader:
             self._net.put(tuned.network)
             self._net.requires_grad_(False)
 
-    def reads(self, columns: int) -> bool:
-        """Whether f* can answer for a touch of so many columns."""
-        return self._touches.reads(columns)
-
     def logits_of(self, image: npt.NDArray[np.float32], candidates: Sequence[str]) -> dict[str, float] | None:
         """The `logits` of a touch; None where f* cannot answer for these candidates, or for so many columns."""
-        able = set(candidates) <= set(self.tuned.names) and self.reads(image.shape[1])
+        able = set(candidates) <= set(self.tuned.names) and self._touches.reads(image.shape[1])
         return self.logits(image) if able else None
 
     def logits(self, image: npt.NDArray[np.float32]) -> dict[str, float]:

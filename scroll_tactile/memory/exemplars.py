@@ -221,10 +221,7 @@ class ExemplarSample:
         *,
         ratio: int = CANDIDATES,
     ) -> ExemplarSample:
-        """The sample that `to_arrays` described, or one of less capacity.
-
-        With more capacity it is not the sample that observing everything again would give.
-        """
+        """The sample that `to_arrays` gave, or one of less capacity; one of more lacks what was dropped before."""
         sample = cls(capacity, ratio=ratio)
         readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
         rows = zip(arrays["exemplar-keys"], arrays["exemplar-codes"], arrays["exemplar-scales"], strict=True)

@@ -131,7 +131,7 @@ class Memory:
                         record.sequence,
                     )
         elif record.kind == MERGE:
-            self._join(record.arrays, cast(dict[str, Any], record.attributes))
+            self._join(record.arrays, record.attributes)
         elif record.kind not in (MEMBER, DESCRIBE):
             raise MismatchError(
                 f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
@@ -176,7 +176,7 @@ class Memory:
         for head in store.heads(self.base, kind=MERGE):
             if head.sequence <= self.sequence:
                 record = store.record(head.sequence)
-                fresh._join(record.arrays, cast(dict[str, Any], record.attributes))
+                fresh._join(record.arrays, record.attributes)
         heads = [head for head in self.retractable(store) if head.sequence <= self.sequence]
         streams = [(head.label, head.key, head.sequence) for head in heads]
 
@@ -224,7 +224,7 @@ class Memory:
                         fresh.exemplars.add(exemplar)
             return fresh
         if base is not None:
-            fresh._take(base.arrays, cast(dict[str, Any], base.attributes))
+            fresh._take(base.arrays, base.attributes)
         return fresh
 
     def _touch(self, columns: int, codes: Codes) -> WindowSums:
@@ -234,7 +234,7 @@ class Memory:
             stages += [*unreached, {scale: [0] for scale in NOISE}]
         return WindowSums.of(stages, codes)
 
-    def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+    def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any) -> None:
         """Add another memory of the same making: the arrays and attributes of one of its generations."""
         other = self._empty()
         other._take(arrays, attributes)
@@ -296,7 +296,7 @@ class Memory:
         # Without a sound generation the base raises what is lost; without a base the journal has every row.
         generation = store.latest() or store.base()
         if generation is not None:
-            memory._take(generation.arrays, cast(dict[str, Any], generation.attributes))
+            memory._take(generation.arrays, generation.attributes)
             memory.sequence = memory.saved = generation.upto
             memory.generation = generation.number
         replayed = 0
@@ -318,7 +318,7 @@ class Memory:
         memory = self._empty()
         memory.base, memory.sequence = self.base, self.base
         if (base := store.base()) is not None:
-            memory._take(base.arrays, cast(dict[str, Any], base.attributes))
+            memory._take(base.arrays, base.attributes)
         for record in store.records(after=self.base):
             if record.sequence > upto:
                 break
@@ -329,13 +329,13 @@ class Memory:
         memory.sequence, memory.retracted = upto, set(self.retracted)
         return memory
 
-    def filled(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any], sequence: int) -> Memory:
+    def filled(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any, sequence: int) -> Memory:
         """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over."""
         self._take(arrays, attributes)
         self.sequence = sequence
         return self
 
-    def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+    def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         self.sample = TouchSample.from_arrays(arrays, attributes["pool"])

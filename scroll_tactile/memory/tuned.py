@@ -73,22 +73,15 @@ class Tuned:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> Tuned:
-        """The f* that `to_arrays` described."""
+        """The f* that `to_arrays` gave."""
 
         def named(prefix: str) -> dict[str, npt.NDArray[Any]]:
             return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
         heads = {int(scale): head for scale, head in named("tuned-head-").items()}
         network = named("tuned-net-")
-        return cls(
-            list(about["names"]),
-            heads,
-            arrays["tuned-bias"],
-            network,
-            about["mode"],
-            about["kept"],
-            dict(about["report"]),
-        )
+        names, bias, report = list(about["names"]), arrays["tuned-bias"], dict(about["report"])
+        return cls(names, heads, bias, network, about["mode"], about["kept"], report)
 
     @staticmethod
     def described(report: TuneReport) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A run's own notes beside its memories: what was asked for, and what is finished; so that it can go on."""
+"""A run's notes beside its memories: its plan and what is finished, so that an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ _FORMAT = 1
 
 
 class RunFile:
-    """Notes of one run, kept in a JSON file that is replaced whole, or nowhere.
+    """Notes of one run by name, in a JSON file that is replaced as a whole.
 
-    path: the file, or None. plan: what was asked for, in JSON's types; a file of another plan is refused.
-    notes: by name.
+    path: the file; None keeps the notes in memory only. plan: what the run does, in JSON's types.
 
-    Raises InputError for a file of another run or no notes at all.
+    Raises InputError for a file of another plan, or one that cannot be read.
     """
 
     def __init__(self, path: Path | None, plan: Mapping[str, Any]) -> None:
@@ -36,7 +35,7 @@ class RunFile:
             self.notes = self._read(path)
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
             raise InputError(
-                f"{path.parent} holds other things, and no {path.name}: no run to go on with. Take an empty folder"
+                f"{path.parent} holds other things, and no {path.name}: no run to resume. Take an empty folder"
             )
         else:
             self._write()

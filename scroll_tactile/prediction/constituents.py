@@ -139,11 +139,11 @@ class HeadFitter:
         )
 
     def _sharpness(self) -> float:
-        """The sharpness, by touches taken out of the readouts that answer, one by one; 1 where that cannot be done.
+        """The sharpness, from leaving single touches out of the readouts that answer; 1 where that cannot be done.
 
-        The probabilities are calibrated on readouts of two thirds of the touches, which are wrong more often, and so
-        are not sharp enough. A touch can be taken out where it is one row of the statistics: several windows of a touch
-        are no sum that the sample holds.
+        The probabilities are calibrated on readouts of two thirds of the touches. These are wrong more often, so the
+        probabilities are not sharp enough. A touch can be left out where it is one row of the statistics: of several
+        windows the sample holds the sum alone, and not the products.
         """
         statistics, scales = self.memory.statistics, self.model.stages[self.stage]
         touches = sum(statistics.materials.values())
@@ -165,7 +165,7 @@ class HeadFitter:
         return float(fit_weights([row[None] for row in logits], targets, np.ones(1))[0])
 
     def _single_rows(self) -> list[tuple[str, list[FloatArray]]]:
-        """(material, codes by scale) of the sampled touches of one window a scale that leave their material others."""
+        """(material, codes by scale) of sampled touches of one window a scale whose material has other touches too."""
         statistics, scales = self.memory.statistics, self.model.stages[self.stage]
         counts = [
             dict(zip(self.model.selections[scale].names, statistics.totals(scale)[0], strict=True)) for scale in scales
@@ -182,17 +182,9 @@ class HeadFitter:
         places = self.space.places(known)
         values = np.array([known[self.space.names[place]] for place in places], dtype=np.float64)
         if len(places) < 2:
-            some = (
-                "1 material of which it is known was"
-                if len(places) == 1
-                else f"{len(places)} of which it is known were"
-            )
-            return f"{some} observed for long enough; a head takes two or more"
+            return f"it is known of {len(places)} of the materials observed for long enough; a head takes two or more"
         if np.ptp(values) == 0:
-            who = "every" if values[0] else "no"
-            return f"{who} material of which it is known and that was observed has it" + (
-                "" if curved else f", each with a share of {values[0]:g}"
-            )
+            return f"{'every' if values[0] else 'no'} material observed for long enough has it, as far as known"
         evaluated = {gamma: self._evaluated(known, gamma) for gamma in GAMMAS}
         losses = {
             gamma: float(np.square(predicted - truth).sum())

@@ -68,11 +68,6 @@ class Model:
         names, longest = list(statistics.materials), statistics.longest
         return cls(kind, names, memory.plan, stages, selections, calibrations, longest, noisy, filling)
 
-    @property
-    def scales(self) -> tuple[int, ...]:
-        """The widths of windows, ascending."""
-        return self.plan.widths
-
     def is_last(self, columns: int) -> bool:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
         return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)

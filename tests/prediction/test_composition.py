@@ -186,7 +186,7 @@ class TestDescribing:
         assert (said["dyed"].presence, said["woven"].presence, said["rare"].presence) == (None, None, None)
         assert "every material" in said["dyed"].unlearned
         assert "no material" in said["woven"].unlearned
-        assert said["rare"].unlearned.startswith("1 material of which it is known was observed")
+        assert said["rare"].unlearned.startswith("it is known of 1 of the materials observed")
         assert said["soft"].presence > 0.5
         assert said["soft"].unlearned == ""
         assert [one.share for one in said.constituents] == [None] * 4

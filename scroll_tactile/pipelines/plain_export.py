@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.results import Observation
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import FOLDS, Statistics
 
@@ -52,8 +53,7 @@ def export_plain(
 
 
 def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, int], object]) -> None:
-    # A snapshot: every file is then of one state, whatever is observed meanwhile.
-    held, journal = copy.deepcopy(learner), learner.observations()
+    held, journal = _one_state(learner)
     if learner.path is not None:
         progress("observations", 0, 1)
         rows = [[row.sequence, row.material, row.key.hex(), _date(row.time), row.state] for row in journal]
@@ -84,6 +84,14 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
         "folds": FOLDS,
     }
     (target / "memory.json").write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _one_state(learner: TactileLearner) -> tuple[TactileLearner, list[Observation]]:
+    """A snapshot and the journal of the same state, whatever is observed meanwhile."""
+    while True:
+        held, journal = copy.deepcopy(learner), learner.observations()
+        if learner.memory.sequence == held.memory.sequence:
+            return held, journal
 
 
 def _date(seconds: float) -> str:

@@ -31,7 +31,10 @@ def describe(
     ] = None,
 ) -> None:
     """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
-    shares = dict(_constituent(text) for text in constituents or [])
+    named = [_constituent(text) for text in constituents or []]
+    shares = dict(named)
+    if len(shares) < len(named):
+        raise DescriptionError(f"expected each constituent once; came {', '.join(name for name, _ in named)}")
     with opened(memory) as learner:
         learner.describe(material, shares or None)
         count = learner.materials.get(material, 0)

@@ -81,6 +81,7 @@ class TestMemory:
         assert found["soft"]["presence"] is None and found["soft"]["unlearned"]
         text = run("compose", memory, files / "silk.csv").stdout
         assert "constituent" in text and "a material never observed" in text
+        assert "each constituent once" in run("describe", memory, "silk", "silk=0.5", "silk=0.5").output
         for wrong, said in (("wool", "came 'wool'"), ("wool=much", "NAME=SHARE"), ("wool=0.7", "sum to one")):
             refused = run("describe", memory, "silk", wrong)
             assert refused.exit_code != 0 and said in refused.output

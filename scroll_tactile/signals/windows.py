@@ -67,6 +67,9 @@ class Scale:
         special = {other: kind for kind, other in _NUMBERS.items()}
         return cls(special[number]) if number in special else cls("window", number)  # type: ignore[arg-type]
 
+    def __hash__(self) -> int:
+        return self.width  # scales are looked up a hundred times a touch; of the few with no width all are equal here
+
     def __index__(self) -> int:
         return self.width if self.kind == "window" else _NUMBERS[self.kind]
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
+from pydantic import BeforeValidator, RootModel, ValidationError, model_validator
 
 from scroll_tactile.errors import DescriptionError
 from scroll_tactile.settings import LONGEST_NAME
@@ -19,6 +20,41 @@ Description = dict[str, float | bool | None]
 """Constituent → its share by mass; or whether it is there, where it is no mass; or None where that is unknown."""
 
 SLACK = 1e-6  # of shares that are to sum to one: thirds of six digits pass, a forgotten percent does not
+
+
+def _name(name: Any) -> str:
+    if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
+        raise ValueError(f"expected constituents as names of 1 to {LONGEST_NAME} printable characters; came {name!r}")
+    return name
+
+
+def _value(value: Any) -> float | bool | None:
+    if value is None or isinstance(value, bool | np.bool_):
+        return None if value is None else bool(value)
+    if not isinstance(value, Real):
+        raise ValueError(f"expected a share from 0 to 1, True, False or None; came {value!r:.60}")
+    share = float(value)
+    if not math.isfinite(share) or share < 0 or share > 1 + SLACK:
+        hint = ". Shares are parts of one, not percent" if 1 < share <= 100 else ""
+        raise ValueError(f"expected a share from 0 to 1; came {share:g}{hint}")
+    return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
+
+
+class _Constituents(RootModel[dict[Annotated[Any, BeforeValidator(_name)], Annotated[Any, BeforeValidator(_value)]]]):
+    """A description as it is kept."""
+
+    @model_validator(mode="after")
+    def _sum_to_one(self) -> Self:
+        if not self.root:
+            raise ValueError("expected at least one constituent; came none. None in place of the mapping removes it")
+        shares = [value for value in self.root.values() if isinstance(value, float)]
+        total, unknown = math.fsum(shares), None in self.root.values()
+        if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
+            raise ValueError(
+                f"expected the shares to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. Name all "
+                "constituents, or give None for those whose share is unknown"
+            )
+        return self
 
 
 def checked(material: str, constituents: Mapping[str, Any]) -> Description:
@@ -34,40 +70,13 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
             f"expected {where} as a mapping from constituents to shares, such as {{'wool': 0.35, 'viscose': 0.65}}; "
             f"came {type(constituents).__name__} {constituents!r:.60}"
         )
-    if not constituents:
-        raise DescriptionError(
-            f"expected at least one constituent in {where}; came none. None in place of the mapping removes it"
-        )
-    for name in constituents:
-        if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
-            raise DescriptionError(
-                f"expected constituents in {where} as names of 1 to {LONGEST_NAME} printable characters; came {name!r}"
-            )
-    kept = {name: _value(where, name, value) for name, value in sorted(constituents.items())}
-    shares = [value for value in kept.values() if isinstance(value, float)]
-    total, unknown = math.fsum(shares), None in kept.values()
-    if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
-        raise DescriptionError(
-            f"expected the shares in {where} to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. "
-            "Name all constituents, or give None for those whose share is unknown"
-        )
-    return kept
-
-
-def _value(where: str, name: str, value: Any) -> float | bool | None:
-    if value is None or isinstance(value, bool | np.bool_):
-        return None if value is None else bool(value)
-    if not isinstance(value, Real):
-        raise DescriptionError(
-            f"expected a share from 0 to 1, True, False or None for {name!r} in {where}; came {value!r:.60}"
-        )
-    share = float(value)
-    if not math.isfinite(share) or share < 0 or share > 1 + SLACK:
-        raise DescriptionError(
-            f"expected a share from 0 to 1 for {name!r} in {where}; came {share:g}"
-            + (". Shares are parts of one, not percent" if 1 < share <= 100 else "")
-        )
-    return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
+    ordered = dict(sorted(constituents.items(), key=lambda named: str(named[0])))
+    try:
+        return dict(_Constituents.model_validate(ordered).root)
+    except ValidationError as error:
+        first = error.errors()[0]
+        of = f", {first['loc'][0]!r}" if first["loc"] else ""
+        raise DescriptionError(f"{where}{of}: {first['ctx']['error']}") from None
 
 
 def require_constituents(descriptions: Mapping[str, Description], wanted: Collection[str] | None) -> list[str]:

@@ -44,7 +44,6 @@ class Capabilities:
     judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
     reads_beginnings: the first narrow window of a touch is a scale of its own.
     fills_channels: dead channels are filled in from the others before anything is embedded.
-    penalties: the λ that readouts of its features are tried with; none: the usual ones.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
     embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
     embeds_noise: it has `is_noisy(image)` and `embed_noisy(images)`, see `NoiseEmbedding`.
@@ -56,7 +55,6 @@ class Capabilities:
     judged_scales: Literal["widest", "all"] = "all"
     reads_beginnings: bool = False
     fills_channels: bool = False
-    penalties: tuple[float, ...] = ()
     reads_frames: bool = False
     rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
     embeds_windows: bool = False
@@ -168,7 +166,6 @@ def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
         declared.reads_beginnings,
         declared.embeds_noise,
         declared.fills_channels and sensor.channels <= embedding.dimension,
-        tuple(float(penalty) for penalty in declared.penalties),
         sensor.camera,
     )
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.grid import BITS, mean_code
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import Sample
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "mean_code", "quotas", "rank", "ranked_exemplars"]
+__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "quotas", "rank", "ranked_exemplars"]
 
 IntArray = npt.NDArray[np.int64]
 
@@ -31,12 +31,6 @@ IntArray = npt.NDArray[np.int64]
 CANDIDATES = 3
 MOST_FEATURES = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
 LIMB = 32  # bits
-
-
-def mean_code(total: npt.NDArray[np.integer], rows: int) -> IntArray:
-    """Σ x / n rounded to integers (halves upward), the same on every machine; total: Σ x, any shape; rows: n."""
-    whole: IntArray = total.astype(np.int64)
-    return (2 * whole + rows) // (2 * rows)
 
 
 def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: IntArray, count: int) -> list[int]:
@@ -258,7 +252,6 @@ def ranked_exemplars(sample: ExemplarSample, statistics: Statistics) -> dict[str
     """The buffer, as `rank`, against the exact means of all that was observed."""
 
     def mean(material: str, scale: Scale) -> IntArray:
-        total = statistics.sums(scale, [material]).sum(axis=(0, 1))
-        return mean_code(total, int(statistics.counts(scale, [material]).sum()))
+        return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
 
     return rank(sample, mean)

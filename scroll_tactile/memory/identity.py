@@ -17,7 +17,6 @@ from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorM
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.statistics import FOLDS
 from store import DamageError, NotAStoreError, Store
 
 __all__ = [
@@ -68,7 +67,6 @@ class Grid(_Kept):
     """The grid of codes, and the widths of windows; frames: whether they are a camera's frames."""
 
     bits: int
-    folds: int
     scales: tuple[int, ...]
     frames: bool = False
 
@@ -101,7 +99,7 @@ class Identity(_Kept):
         return cls(
             sensor=sensor,
             embedding=EmbeddingIdentity.of(embedding),
-            grid=Grid(bits=BITS, folds=FOLDS, scales=plan.widths, frames=plan.frames),
+            grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
             reading=(plan.partial, plan.judged),
             exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
             augmentation=augmentation,
@@ -208,7 +206,7 @@ class Identity(_Kept):
                 f"{path} was made with an embedding whose partial_windows and judged_scales are {list(self.reading)}; "
                 f"it was opened with one whose are {[plan.partial, plan.judged]}. Open it with those"
             )
-        grid = Grid(bits=BITS, folds=FOLDS, scales=plan.widths, frames=plan.frames)
+        grid = Grid(bits=BITS, scales=plan.widths, frames=plan.frames)
         if self.grid != grid:
             raise MismatchError(f"{path} was made with {self.grid!r}; this version works with {grid!r}")
 

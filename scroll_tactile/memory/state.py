@@ -17,8 +17,8 @@ from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample
 from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
-from scroll_tactile.statistics.sample import TouchSample, WindowSums
-from scroll_tactile.statistics.statistics import Statistics, fold_of
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
+from scroll_tactile.statistics.statistics import Statistics
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
@@ -102,7 +102,7 @@ class Memory:
 
         Raises CapacityError before anything is added.
         """
-        self.statistics.add(material, fold_of(key), codes, columns)
+        self.statistics.add(material, codes, columns)
         if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes))
         if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key):
@@ -146,7 +146,7 @@ class Memory:
     def retract(self, record: Record) -> None:
         """Subtract an observation from the sums; call `refill` afterwards for the sample and the exemplars."""
         material, key = record.label, record.key
-        self.statistics.remove(material, fold_of(key), unpack_codes(record.arrays), _columns(record))
+        self.statistics.remove(material, unpack_codes(record.arrays), _columns(record))
         self.retracted.add(record.sequence)
         self.retractions += 1
         if self.sample.holds(material, key) or (self.exemplars and self.exemplars.holds(material, key)):
@@ -161,7 +161,7 @@ class Memory:
 
     def put_back(self, record: Record) -> None:
         """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and f*."""
-        self.statistics.add(record.label, fold_of(record.key), unpack_codes(record.arrays), _columns(record))
+        self.statistics.add(record.label, unpack_codes(record.arrays), _columns(record))
         self.retracted.discard(record.sequence)
         self._stale = False
 
@@ -180,7 +180,7 @@ class Memory:
         heads = [head for head in self.retractable(store) if head.sequence <= self.sequence]
         streams = [(head.label, head.key, head.sequence) for head in heads]
 
-        def touch(material: str, key: bytes, sequence: int) -> WindowSums:
+        def touch(material: str, key: bytes, sequence: int) -> SampledTouch:
             if (found := touches.get((material, key))) is not None:
                 return found
             record = store.record(sequence)
@@ -227,12 +227,12 @@ class Memory:
             fresh._take(base.arrays, base.attributes)
         return fresh
 
-    def _touch(self, columns: int, codes: Codes) -> WindowSums:
-        stages = [self.plan.scored(columns, length) for length in self.plan.stages(columns)]
+    def _touch(self, columns: int, codes: Codes) -> SampledTouch:
+        stages = self.plan.scored_stages(columns)
         if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage after all others
             unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.plan.milestones()) - len(stages))
             stages += [*unreached, {scale: [0] for scale in NOISE}]
-        return WindowSums.of(stages, codes)
+        return SampledTouch.of(stages, codes)
 
     def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any) -> None:
         """Add another memory of the same making: the arrays and attributes of one of its generations."""

@@ -27,6 +27,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
+from scroll_tactile.statistics.sample import stage_rows
 
 __all__ = ["Encoded", "FeatureExtractor", "Readings"]
 
@@ -80,19 +81,25 @@ class FeatureExtractor:
         return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
 
     def codes(self, image: Image, key: bytes) -> Codes:
-        """The codes of a touch's windows by scale, behind them those of its copies; and those of its noisy copies.
+        """The rows of codes that a touch adds to the statistics, by scale: its own, behind them those of its copies.
 
-        The touch's own come first: the sample finds them by their place. Copies are no longer than the touch, so they
-        have no other scales.
+        Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
+        other scales. Noisy copies have rows of their own where the embedding reads noise.
         """
         copies, noisy = self._augmentation.copies_of(image, key) if self._augmentation is not None else ([], [])
-        own, *others = [self.features(picture) for picture in (image, *copies, *noisy * (not self._plan.noisy))]
+        own, *others = [self._stage_rows(picture) for picture in (image, *copies, *noisy * (not self._plan.noisy))]
         rows = {scale: [first, *(other[scale] for other in others if scale in other)] for scale, first in own.items()}
+        bound = self._embedding.bound
         if self._plan.noisy and noisy:
-            rows |= {scale: [features] for scale, features in zip(NOISE, self._noisy_features(noisy), strict=True)}
+            sets = zip(NOISE, self._noisy_features(noisy), strict=True)
+            rows |= {scale: [to_codes(features, bound)] for scale, features in sets}
         if self._plan.filled:
-            rows[CHANNELS] = [sampled_readings(image, self._embedding.dimension)]
-        return {scale: to_codes(np.concatenate(rows[scale]), self._embedding.bound) for scale in sorted(rows)}
+            rows[CHANNELS] = [to_codes(sampled_readings(image, self._embedding.dimension), bound)]
+        return {scale: np.concatenate(rows[scale]) for scale in sorted(rows)}
+
+    def _stage_rows(self, image: Image) -> Codes:
+        windows = {scale: to_codes(rows, self._embedding.bound) for scale, rows in self.features(image).items()}
+        return stage_rows(self._plan.scored_stages(image.shape[1]), windows)
 
     def encode(self, stream: Stream, model: Model, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
         """What is evaluated of a `stream`: its part within the longest touch that was learned.

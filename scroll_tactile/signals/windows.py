@@ -185,8 +185,7 @@ class WindowPlan:
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
     is a scale of its own. noisy: whether touches observed through noise are. filled: whether dead channels are filled
-    in. penalties: the λ that the readouts choose from; those of `readouts.shrinkage` where empty. frames: whether
-    windows are a camera's frames.
+    in. frames: whether windows are a camera's frames.
     """
 
     widths: tuple[int, ...]
@@ -195,7 +194,6 @@ class WindowPlan:
     beginning: bool = False
     noisy: bool = False
     filled: bool = False
-    penalties: tuple[float, ...] = ()
     frames: bool = False
 
     @property
@@ -224,6 +222,10 @@ class WindowPlan:
         """Of a touch of so many columns: scale → places of the windows that judge after the first `length`."""
         places = scored(self.extent(columns), length, partial=self.partial)
         return {scale: places.get(scale.width, [0]) for scale in self.judging(length)}
+
+    def scored_stages(self, columns: int) -> list[dict[Scale, list[int]]]:
+        """For each stage that a touch of so many columns reached: scale → places of the windows that judge there."""
+        return [self.scored(columns, length) for length in self.stages(columns)]
 
     def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""

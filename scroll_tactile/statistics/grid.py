@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import EmbeddingError
 
-__all__ = ["BITS", "in_units", "to_codes"]
+__all__ = ["BITS", "in_units", "mean_code", "to_codes"]
 
 BITS = 20  # the grid: bound · 2⁻²⁰. 2²⁰ · 2²⁰ · 8192 rows is 2⁵³, the last integer that float64 counts to
 
@@ -32,3 +32,9 @@ def in_units(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
             f"{features[tuple(bad)]}. The embedding's bound is wrong, or it divides by zero"
         )
     return scaled
+
+
+def mean_code(total: npt.NDArray[np.integer], rows: int) -> npt.NDArray[np.int64]:
+    """Σ x / n rounded to integers (halves upward), the same on every machine; total: Σ x, any shape; rows: n."""
+    whole: npt.NDArray[np.int64] = total.astype(np.int64)
+    return (2 * whole + rows) // (2 * rows)

@@ -1,8 +1,7 @@
 """Samples: bounded choices among the streams observed, which depend on the set of them and never on the order.
 
 Each material's streams are ranked by content hash, and a sample holds the first by (rank, hash), so that materials
-share it evenly. The readouts of the other folds are evaluated on a `TouchSample`; the candidates for exemplars are
-another.
+share it evenly. Readouts are calibrated on a `TouchSample`; the candidates for exemplars are another.
 """
 
 from __future__ import annotations
@@ -17,48 +16,68 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import mean_code
 
-__all__ = ["CAPACITY", "Sample", "TouchSample", "WindowSums"]
+__all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage_rows"]
 
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
 
 T = TypeVar("T")
+Codes = Mapping[Scale, npt.NDArray[np.int32]]
+
+
+Stages = Sequence[Mapping[Scale, Sequence[int]]]
+"""For each stage that a touch reached: scale → places of the windows that are scored there."""
+
+
+def stage_rows(stages: Stages, windows: Codes) -> Codes:
+    """What is learned of a touch: for each scale one row for each stage that it judges at, (rows, d) by scale.
+
+    windows: the codes of the touch's windows by scale. A row is the mean of those that are scored at the stage: what
+    will be judged of a touch that ends there.
+    """
+    rows: dict[Scale, list[npt.NDArray[np.int64]]] = {}
+    for stage in stages:
+        for scale, places in stage.items():
+            row = mean_code(windows[scale][places].sum(axis=0, dtype=np.int64), len(places))
+            rows.setdefault(scale, []).append(row)
+    return {scale: np.stack(rows[scale]).astype(np.int32) for scale in sorted(rows)}
 
 
 @dataclass(frozen=True)
-class WindowSums:
-    """Sums of the codes of a touch's windows, for each stage it reached and each scale that fits there.
+class SampledTouch:
+    """The rows that a touch added to the statistics, of each stage that it reached and each scale that judges there.
 
-    sums: int32 of shape (pairs, d) (64 windows of codes below 2²¹ fit); a pair is a stage with a scale, by place.
-    pairs: (stage, scale, windows in the sum) of each, int64 of shape (pairs, 3).
+    rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
+    the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
+    shape (pairs, 3).
     """
 
-    sums: npt.NDArray[np.int32]
+    rows: npt.NDArray[np.int32]
     pairs: npt.NDArray[np.int64]
 
     @classmethod
-    def of(
-        cls, stages: Sequence[Mapping[Scale, Sequence[int]]], codes: Mapping[Scale, npt.NDArray[np.int32]]
-    ) -> WindowSums:
-        """The sums of these codes; stages: for each, scale → places of the windows that are scored there."""
-        scored = [
-            (stage, i, scale, places)
-            for stage, windows in enumerate(stages)
-            for i, (scale, places) in enumerate(sorted(windows.items()))
-        ]
-        sums = [codes[scale][places].sum(axis=0, dtype=np.int32) for *_, scale, places in scored]
-        pairs = [(stage, i, len(places)) for stage, i, _, places in scored]
-        return cls(np.stack(sums), np.array(pairs))
+    def of(cls, stages: Stages, codes: Codes) -> SampledTouch:
+        """The sampled touch of some codes, of which its own come first, stage after stage; as `stage_rows` gives."""
+        used: dict[Scale, int] = {}
+        rows, pairs = [], []
+        for stage, scales in enumerate(stages):
+            for place, scale in enumerate(sorted(scales)):
+                row = used.get(scale, 0)
+                used[scale] = row + 1
+                rows.append(codes[scale][row])
+                pairs.append((stage, place, len(codes[scale])))
+        return cls(np.stack(rows), np.array(pairs))
 
-    def windows(self, stage: int) -> list[int]:
-        """How many windows of each scale are in the sums of a stage; none where it was not reached."""
-        windows: list[int] = self.pairs[self.pairs[:, 0] == stage, 2].tolist()
-        return windows
+    @classmethod
+    def of_sums(cls, sums: npt.NDArray[np.int32], pairs: npt.NDArray[np.int64]) -> SampledTouch:
+        """The sampled touch that an earlier version kept: sums of windows, and how many in the third column."""
+        rows = [mean_code(total, windows) for total, windows in zip(sums, pairs[:, 2].tolist(), strict=True)]
+        return cls(np.array(rows, dtype=np.int32).reshape(sums.shape), pairs)
 
-    def means(self, stage: int) -> list[npt.NDArray[np.float64]] | None:
-        """Mean codes of the windows of each scale at a stage, each of shape (d,); None where it was not reached."""
-        rows = np.flatnonzero(self.pairs[:, 0] == stage)
-        return [self.sums[row] / self.pairs[row, 2] for row in rows] if len(rows) else None
+    def at(self, stage: int) -> npt.NDArray[np.int32]:
+        """The rows of the scales that judge at a stage, ascending, (scales, d); none where it was not reached."""
+        return self.rows[self.pairs[:, 0] == stage]
 
 
 class Sample(Generic[T]):
@@ -125,7 +144,7 @@ class Sample(Generic[T]):
         return max((len(keys) - 1, keys[-1], material) for material, keys in self._keys.items() if keys)
 
 
-class TouchSample(Sample[WindowSums]):
+class TouchSample(Sample[SampledTouch]):
     """At most `capacity` touches of all materials: a function of the set of touches observed."""
 
     def __init__(self, capacity: int = CAPACITY) -> None:
@@ -138,15 +157,18 @@ class TouchSample(Sample[WindowSums]):
             "pool-keys": np.array([list(key) for _, key, _ in self] or [[]], np.uint8)[: len(self)],
             "pool-sizes": np.array([len(touch.pairs) for touch in touches], dtype=np.int64),
             "pool-pairs": np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)]),
-            "pool-sums": np.concatenate([t.sums for t in touches]) if touches else np.zeros((0, 0), np.int32),
+            "pool-rows": np.concatenate([t.rows for t in touches]) if touches else np.zeros((0, 0), np.int32),
         }, [material for material, *_ in self]
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> TouchSample:
-        """The sample that `to_arrays` described."""
+        """The sample that `to_arrays` described, of this version or an earlier one."""
         sample = cls()
         edges = np.cumsum(arrays["pool-sizes"])[:-1]
-        sums, pairs = np.split(arrays["pool-sums"], edges), np.split(arrays["pool-pairs"], edges)
+        summed = "pool-sums" in arrays
+        rows = np.split(arrays["pool-sums" if summed else "pool-rows"], edges)
+        pairs = np.split(arrays["pool-pairs"], edges)
+        made = SampledTouch.of_sums if summed else SampledTouch
         for i, material in enumerate(materials):
-            sample.add(material, arrays["pool-keys"][i].tobytes(), WindowSums(sums[i], pairs[i]))
+            sample.add(material, arrays["pool-keys"][i].tobytes(), made(rows[i], pairs[i]))
         return sample

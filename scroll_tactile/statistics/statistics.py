@@ -1,7 +1,7 @@
 """Statistics: all that learning keeps, as exact integers with an algebra of + and −.
 
-For every scale (a width of windows) and every fold: counts n_y, sums c_y and the second moment A. Sums of
-integers do not depend on order, batching or grouping, so neither does the memory.
+For every scale: counts n_y and sums c_y of each material, and the second moment A of all. Sums of integers do not
+depend on order, batching or grouping, so neither does the memory.
 """
 
 from __future__ import annotations
@@ -18,23 +18,13 @@ from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialErro
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, require_room
 
-__all__ = ["FOLDS", "Statistics", "fold_of"]
+__all__ = ["Statistics"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
-# Each fold costs one more second moment a scale. Three leave two thirds of the touches to the model that is
-# tried on the rest; two made λ and the temperature those of a memory half as large.
-FOLDS = 3
-
-
-def fold_of(key: bytes) -> int:
-    """The fold of a stream, from its content hash: the same wherever and whenever it was observed."""
-    return int.from_bytes(key[:8], "little") % FOLDS
-
-
 class Statistics:
-    """Counts, sums and second moments by material, scale and fold.
+    """Counts and sums by material and scale, and the second moment of each scale.
 
     dimension: d. scales: the widths of windows, in readings, ascending.
 
@@ -45,60 +35,62 @@ class Statistics:
         self.dimension = dimension
         self.scales = tuple(scales)
         self._places: dict[str, int] = {}
-        self._observations = np.zeros((0, FOLDS), dtype=np.int64)
+        self._observations = np.zeros(0, dtype=np.int64)
         self._lengths: Counter[int] = Counter()
-        self._rows = {scale: np.zeros((0, FOLDS), dtype=np.int64) for scale in self.scales}
-        self._sums = {scale: np.zeros((0, FOLDS, dimension), dtype=np.int64) for scale in self.scales}
-        self._seconds = {scale: [SecondMoment(dimension) for _ in range(FOLDS)] for scale in self.scales}
+        self._rows = {scale: np.zeros(0, dtype=np.int64) for scale in self.scales}
+        self._sums = {scale: np.zeros((0, dimension), dtype=np.int64) for scale in self.scales}
+        self._seconds = {scale: SecondMoment(dimension) for scale in self.scales}
 
     @property
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order; only those that have any."""
-        counts = self._observations.sum(axis=1)
-        return {name: int(counts[place]) for name, place in sorted(self._places.items()) if counts[place]}
+        counts = self._observations.tolist()
+        return {name: counts[place] for name, place in sorted(self._places.items()) if counts[place]}
+
+    @property
+    def touches(self) -> int:
+        """The number of observations."""
+        return int(self._observations.sum())
 
     @property
     def longest(self) -> int:
         """The columns of the longest touch that is in it, 0 where there is none."""
         return max(self._lengths, default=0)
 
-    def add(self, material: str, fold: int, codes: Codes, columns: int = 0) -> None:
-        """Add one observation, of so many columns: for each scale the codes of its windows, shape (windows, d).
+    def add(self, material: str, codes: Codes, columns: int = 0) -> None:
+        """Add one observation, of so many columns: for each scale its rows of codes, shape (rows, d).
 
         Raises CapacityError, before anything is added, where a sum would not be exact any more.
         """
         self.require_room(codes)
         place = self._place(material)
         for scale, rows in codes.items():
-            self._seconds[scale][fold].add(rows)
-            self._rows[scale][place, fold] += len(rows)
-            self._sums[scale][place, fold] += rows.sum(axis=0, dtype=np.int64)
-        self._observations[place, fold] += 1
+            self._seconds[scale].add(rows)
+            self._rows[scale][place] += len(rows)
+            self._sums[scale][place] += rows.sum(axis=0, dtype=np.int64)
+        self._observations[place] += 1
         self._lengths[columns] += 1
 
     def require_room(self, codes: Codes) -> None:
-        """Raise CapacityError where these codes could not be added: all folds together are summed as well."""
+        """Raise CapacityError where these codes could not be added."""
         for scale, rows in codes.items():
-            require_room(self._total_rows(scale), len(rows))
+            require_room(self._seconds[scale].rows, len(rows))
 
-    def _total_rows(self, scale: Scale) -> int:
-        return sum(moment.rows for moment in self._seconds[scale])
-
-    def remove(self, material: str, fold: int, codes: Codes, columns: int = 0) -> None:
+    def remove(self, material: str, codes: Codes, columns: int = 0) -> None:
         """Take out one observation that was added: the memory is as if it had never been.
 
-        Raises UnknownMaterialError for a material without an observation in this fold.
+        Raises UnknownMaterialError for a material without such an observation.
         """
         place = self._places.get(material)
-        if place is None or not self._observations[place, fold] or not self._lengths[columns]:
+        if place is None or not self._observations[place] or not self._lengths[columns]:
             raise UnknownMaterialError(
-                f"{material!r} has no observation of {columns} columns in fold {fold} that could be taken out"
+                f"{material!r} has no observation of {columns} columns that could be taken out"
             )
         for scale, rows in codes.items():
-            self._seconds[scale][fold].remove(rows)
-            self._rows[scale][place, fold] -= len(rows)
-            self._sums[scale][place, fold] -= rows.sum(axis=0, dtype=np.int64)
-        self._observations[place, fold] -= 1
+            self._seconds[scale].remove(rows)
+            self._rows[scale][place] -= len(rows)
+            self._sums[scale][place] -= rows.sum(axis=0, dtype=np.int64)
+        self._observations[place] -= 1
         self._lengths = +(self._lengths - Counter([columns]))
 
     def _place(self, material: str) -> int:
@@ -106,7 +98,7 @@ class Statistics:
         if place is None:
             place = self._places[material] = len(self._places)
             if place >= len(self._observations):
-                self._grow(max(8, 2 * place))
+                self._grow(max(8, place + place // 4 + 1))  # of ten thousand materials the sums are 80 MB a scale
         return place
 
     def _grow(self, capacity: int) -> None:
@@ -121,37 +113,29 @@ class Statistics:
 
     def names(self, scale: Scale) -> list[str]:
         """The materials that have rows at a scale, in alphabetical order."""
-        rows = self._rows[scale].sum(axis=1)
+        rows = self._rows[scale].tolist()
         return [name for name, place in sorted(self._places.items()) if rows[place]]
 
     def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
-        """Rows of each material in each fold, shape (C, FOLDS)."""
+        """Rows of each material, shape (C,)."""
         return self._rows[scale][[self._places[name] for name in names]]
 
     def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
-        """Sums of codes of each material in each fold, shape (C, FOLDS, d)."""
+        """Sums of codes of each material, shape (C, d)."""
         return self._sums[scale][[self._places[name] for name in names]]
 
     def totals(self, scale: Scale) -> tuple[IntArray, IntArray]:
-        """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`, over all folds."""
+        """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`."""
         names = self.names(scale)
-        return self.counts(scale, names).sum(axis=1), self.sums(scale, names).sum(axis=1)
+        return self.counts(scale, names), self.sums(scale, names)
 
-    def second(self, scale: Scale, fold: int) -> SecondMoment:
-        """The second moment of a scale and fold, over all materials."""
-        return self._seconds[scale][fold]
-
-    def total_second(self, scale: Scale) -> IntArray:
-        """The lower triangle of A over all folds, shape (d·(d+1)/2,)."""
-        total = self._seconds[scale][0].packed().copy()
-        for moment in self._seconds[scale][1:]:
-            if not moment.empty:
-                total += moment.packed()
-        return total
+    def second(self, scale: Scale) -> SecondMoment:
+        """The second moment of a scale, over all materials."""
+        return self._seconds[scale]
 
     def digest(self) -> str:
         """Hex of a SHA-256 over all of it in one canonical order: equal if and only if the bytes are."""
-        digest = hashlib.sha256(repr((self.dimension, tuple(map(int, self.scales)), FOLDS)).encode())
+        digest = hashlib.sha256(repr((self.dimension, tuple(map(int, self.scales)))).encode())
         names = sorted(self.materials)
         places = [self._places[name] for name in names]
         digest.update(repr(names).encode())
@@ -160,10 +144,8 @@ class Statistics:
         for scale in self.scales:
             digest.update(self._rows[scale][places].astype("<i8").tobytes())
             digest.update(self._sums[scale][places].astype("<i8").tobytes())
-            for moment in self._seconds[scale]:
-                digest.update(b"\x01" if moment.rows else b"\x00")
-                if moment.rows:
-                    digest.update(moment.packed().astype("<i8", copy=False).data)
+            if self._seconds[scale].rows:
+                digest.update(self._seconds[scale].packed().astype("<i8", copy=False).data)
         return digest.hexdigest()
 
     def __eq__(self, other: object) -> bool:
@@ -188,7 +170,7 @@ class Statistics:
         joint = Statistics(self.dimension, self.scales)
         if sign > 0:
             for scale in self.scales:
-                require_room(self._total_rows(scale), other._total_rows(scale))
+                require_room(self._seconds[scale].rows, other._seconds[scale].rows)
         joint._lengths.update(self._lengths)
         (joint._lengths.update if sign > 0 else joint._lengths.subtract)(other._lengths)
         for part, weight in ((self, 1), (other, sign)):
@@ -199,11 +181,9 @@ class Statistics:
                     joint._rows[scale][to] += weight * part._rows[scale][place]
                     joint._sums[scale][to] += weight * part._sums[scale][place]
         for scale in self.scales:
-            for fold in range(FOLDS):
-                ours, theirs = self._seconds[scale][fold], other._seconds[scale][fold]
-                packed = ours.packed() + sign * theirs.packed()
-                rows = ours.rows + sign * theirs.rows
-                joint._seconds[scale][fold] = SecondMoment.of(packed, rows, self.dimension)
+            ours, theirs = self._seconds[scale], other._seconds[scale]
+            packed = ours.packed() + sign * theirs.packed()
+            joint._seconds[scale] = SecondMoment.of(packed, ours.rows + sign * theirs.rows, self.dimension)
         if sign < 0 and not joint._sound():
             raise InputError("statistics can be taken only out of statistics that contain them")
         joint._lengths = +joint._lengths
@@ -217,7 +197,8 @@ class Statistics:
             rows = self._rows[scale]
             if (rows < 0).any() or self._sums[scale][rows == 0].any():
                 return False
-            if any(moment.packed().any() for moment in self._seconds[scale] if not moment.rows):
+            moment = self._seconds[scale]
+            if not moment.rows and moment.packed().any():
                 return False
         return True
 
@@ -230,9 +211,8 @@ class Statistics:
         for scale in self.scales:
             arrays[f"rows-{scale}"] = self._rows[scale][places]
             arrays[f"sums-{scale}"] = self._sums[scale][places]
-            for fold, moment in enumerate(self._seconds[scale]):
-                if moment.rows:
-                    arrays[f"second-{scale}-{fold}"] = moment.packed().copy()
+            if self._seconds[scale].rows:
+                arrays[f"second-{scale}"] = self._seconds[scale].packed().copy()
         return arrays, names
 
     @classmethod
@@ -243,17 +223,27 @@ class Statistics:
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
     ) -> Statistics:
-        """The statistics that `to_arrays` described; the arrays are taken over."""
+        """The statistics that `to_arrays` described, of this version or an earlier one; the arrays are taken over.
+
+        Earlier ones kept three folds apart: second moments of their own, and an axis more of the others. They add up.
+        """
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
-        statistics._observations = arrays["observations"]
+        statistics._observations = _joined(arrays["observations"], 1)
         statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
         for scale in statistics.scales:
-            statistics._rows[scale] = arrays[f"rows-{scale}"]
-            statistics._sums[scale] = arrays[f"sums-{scale}"]
-            for fold in range(FOLDS):
-                packed = arrays.get(f"second-{scale}-{fold}")
-                if packed is not None:
-                    rows = int(arrays[f"rows-{scale}"][:, fold].sum())
-                    statistics._seconds[scale][fold] = SecondMoment.of(packed, rows, dimension)
+            statistics._rows[scale] = _joined(arrays[f"rows-{scale}"], 1)
+            statistics._sums[scale] = _joined(arrays[f"sums-{scale}"], 2)
+            found = [f"second-{scale}", *(f"second-{scale}-{fold}" for fold in range(3))]
+            moments = [arrays[name] for name in found if name in arrays]
+            if moments:
+                rows = int(statistics._rows[scale].sum())
+                packed = moments[0] if len(moments) == 1 else np.sum(moments, axis=0)
+                statistics._seconds[scale] = SecondMoment.of(packed, rows, dimension)
         return statistics
+
+
+def _joined(array: IntArray, axes: int) -> IntArray:
+    """An array of so many axes; of one more, the second was that of the folds."""
+    joined: IntArray = array if array.ndim == axes else array.sum(axis=1)
+    return joined

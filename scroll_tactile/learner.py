@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
@@ -21,7 +21,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.model import Draft, Model
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["TactileLearner"]
 
 logger = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer")
 
 
 class TactileLearner:
@@ -50,7 +52,7 @@ class TactileLearner:
     sensor: whose streams it reads. embedding: the frozen features; `Kernels()` unless given, and `Frames()` for a
     camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
     augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
-    settings: readout, false_alarms, refit, solver and exemplars, by name; see `scroll_tactile.settings.Settings`.
+    settings: readout, false_alarms and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
     any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
@@ -216,7 +218,10 @@ class TactileLearner:
         require_name(material)
         touch = self._verified().stream(stream)
         image = self._extractor.image(touch)
-        return self._ledger.observe(material, touch, image.shape[1], self._extractor.codes(image, touch.key))
+        receipt = self._ledger.observe(material, touch, image.shape[1], self._extractor.codes(image, touch.key))
+        with self._ledger.lock:
+            self._current.prepare(self._ledger)
+        return receipt
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.
@@ -326,17 +331,32 @@ class TactileLearner:
         empty one. Before anything was observed the answer is material None, known False.
         """
         touch = self._verified().stream(stream)
+
+        def evaluate() -> tuple[int, Callable[[], Prediction]]:
+            with self._ledger.lock:
+                model, filling = self._current.present(self._ledger), self._current.filling(self._ledger)
+                version, reader = self._ledger.version, self._reader() if tuned else None
+                candidates = candidates_of(scene, model.names)
+            if not candidates:
+                return version, lambda: Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
+            encoded = self._extractor.encode(touch, model, filling, lambda columns: model.needed(candidates, columns))
+            logits = None
+            if reader is not None and not encoded.noisy and model.is_last(encoded.columns):
+                logits = reader.logits_of(encoded.image, candidates)
+            return version, lambda: self._answer(model, candidates, encoded, logits)
+
+        return self._of_one_state(evaluate)
+
+    def _of_one_state(self, evaluate: Callable[[], tuple[int, Callable[[], Answer]]]) -> Answer:
+        """An answer that rests on one state of the memory, though others may change it while a touch is embedded.
+
+        evaluate: reads the memory and embeds the touch; gives the version that it read, and what answers.
+        """
+        version, answer = evaluate()
         with self._ledger.lock:
-            model = self._current.present(self._ledger)
-            reader = self._reader() if tuned else None
-        candidates = candidates_of(scene, model.names)
-        if not candidates:
-            return Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
-        encoded = self._extractor.encode(touch, model, lambda columns: model.needed(candidates, columns))
-        logits = None
-        if reader is not None and not encoded.noisy and model.is_last(encoded.columns):
-            logits = reader.logits_of(encoded.image, candidates)
-        return self._answer(model, candidates, encoded, logits)
+            if self._ledger.version != version:
+                _, answer = evaluate()
+            return answer()
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
@@ -358,22 +378,31 @@ class TactileLearner:
         if not 0 <= unfamiliar <= 1:
             raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
         touch = self._verified().stream(stream)
-        with self._ledger.lock:
-            described = self._ledger.memory.descriptions
-            wanted = require_constituents(described, constituents)
-            model = self._current.present(self._ledger)
-            composer = self._current.composer(self._ledger, model) if model.names else None
-        if composer is None:
-            nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
-            return Composition(nothing, 1.0, Prediction(None, 0.0, (), float("inf"), False, touch.seconds))
 
-        def needed(columns: int) -> list[Scale]:
-            return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
+        def evaluate() -> tuple[int, Callable[[], Composition]]:
+            with self._ledger.lock:
+                wanted = require_constituents(self._ledger.memory.descriptions, constituents)
+                model, filling = self._current.present(self._ledger), self._current.filling(self._ledger)
+                version = self._ledger.version
+                if not model.names:
+                    nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
+                    unknown = Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
+                    return version, lambda: Composition(nothing, 1.0, unknown)
+                composer = self._current.composer(self._ledger, model)
 
-        encoded = self._extractor.encode(touch, model, needed)
-        prediction = self._answer(model, model.names, encoded, None)
-        made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
-        return Composition(made_of, new, prediction)
+            def needed(columns: int) -> list[Scale]:
+                return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
+
+            encoded = self._extractor.encode(touch, model, filling, needed)
+
+            def answer() -> Composition:
+                prediction = self._answer(model, model.names, encoded, None)
+                made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
+                return Composition(made_of, new, prediction)
+
+            return version, answer
+
+        return self._of_one_state(evaluate)
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""
@@ -393,10 +422,19 @@ class TactileLearner:
         tuned = logits is not None
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, encoded.seconds, tuned=tuned)
 
-    def model(self) -> Model:
-        """The readouts and calibrations of the memory as it is now, fitted again where it has changed."""
+    def settle(self) -> None:
+        """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.
+
+        Between two such moments the readouts are those of all that was observed, to rounding; the calibration may rest
+        on an eighth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
+        """
         with self._ledger.lock:
-            return self._current.fitted(self._ledger)
+            self._current.settle(self._ledger)
+
+    def model(self) -> Model:
+        """The readouts and calibrations of the memory as it is now, as after `settle`; what comes later is not in them."""
+        with self._ledger.lock:
+            return Draft.of(self._ledger.memory, self._settings.readout).fit()
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
@@ -485,6 +523,7 @@ class TactileLearner:
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
+        self._current.close()
         self._ledger.close()
 
     def __enter__(self) -> Self:

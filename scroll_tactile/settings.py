@@ -31,13 +31,6 @@ class Settings(FrozenModel):
 
     readout: "lda" or "ridge" (the paper's); both are computed from the same statistics.
     false_alarms: the share of touches of known materials that may be called unknown, between 0 and 1.
-    refit: the share, 0 to 1, by which the memory may grow before λ and the calibration are chosen again. With 0 they
-    are at each change, and every answer is a function of the memory alone. With 0.1, say, a `predict` just after an
-    `observe` is a hundred times as fast: the readouts are of all that was observed, λ and the calibration of a little
-    less.
-    solver: how the readouts follow between two such fits. "exact" updates a factor of the exact statistics and equals a
-    fresh solve to rounding. "recursive" is the paper's recursive least squares, whose rounding errors add up until the
-    next fit; it is there to be compared with, and what the memory keeps is exact all the same.
     exemplars: streams in the buffer that `fine_tune` trains on; three times as many are kept raw, to choose from. 0
     keeps none. None is 400, and none for a camera, whose frames are large (480 × 640: 4 MB).
 
@@ -46,17 +39,7 @@ class Settings(FrozenModel):
 
     readout: Literal["lda", "ridge"] = "lda"
     false_alarms: Annotated[float, Field(gt=0, lt=1, strict=False)] = 0.05
-    refit: Annotated[float, Field(ge=0, le=1, strict=False)] = 0.0
-    solver: Literal["exact", "recursive"] = "exact"
     exemplars: Annotated[int, Field(ge=0)] | None = None
-
-    def model_post_init(self, context: Any) -> None:
-        """Raise InputError for a solver that would never be used."""
-        if self.solver == "recursive" and not self.refit:
-            raise InputError(
-                "solver='recursive' is what happens between two fits, and with refit=0 every change is followed by "
-                "one: give refit=1.0, say, to fit again when the memory has doubled"
-            )
 
 
 def _described(error: ValidationError, model: type[BaseModel]) -> str:

@@ -26,7 +26,7 @@ __all__ = ["Ledger"]
 
 logger = logging.getLogger(__name__)
 
-MOST_ADDED = 256  # touches: updating a model with more of them takes longer than fitting it again
+MOST_ADDED = 1024  # touches: a model is fitted again long before
 SNAPSHOT_EVERY = 1024  # rows between generations: opening replays so many in about a second
 
 
@@ -137,7 +137,7 @@ class Ledger:
             with self._mutation(_nothing):
                 sequence = self._append(material, stream.key, columns, codes, readings)
                 self._memory.add(material, stream.key, columns, codes, sequence, readings)
-                self._changed((material, codes))
+                self._changed((material, codes, 1))
             self._snapshot_if_due()
             durable = self.store is not None and not self._batching
         return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable)

@@ -14,8 +14,8 @@ from scroll_tactile.statistics.grid import BITS
 __all__ = ["Added", "Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
 
 Codes = dict[Scale, npt.NDArray[np.int32]]
-Added = tuple[str, Codes]
-"""A material, and the codes of a touch of it by scale."""
+Added = tuple[str, Codes, int]
+"""A material, the codes of a touch of it by scale, and 1 where it came or -1 where it was retracted."""
 
 LARGE, BLOCK = 2**13, 2**10  # codes
 

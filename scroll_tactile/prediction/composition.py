@@ -2,8 +2,8 @@
 
 A touch may be of a material that was observed: then its composition is that material's, weighed by the probabilities
 of the materials. Or it is of one never observed: then the heads answer, ridge regressions over the materials. The
-novelty tells the two apart. All three are measured on the sampled touches, each scored by readouts of the folds that it
-is not in, and by heads that never observed its material. All of it is a function of the statistics, the sample and the
+novelty tells the two apart. All are measured on the sampled touches, each scored by readouts that never observed it, and
+by heads that never observed its material. All of it is a function of the statistics, the sample and the
 descriptions: a material described after it was touched gives the same as one described before, to the bit.
 """
 
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from scroll_tactile.memory.descriptions import Target, targets_of
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.constituents import ConstituentHead, HeadFitter, StageHeads, combined, space_of
+from scroll_tactile.prediction.constituents import ConstituentHead, HeadFitter, MaterialSpace, StageHeads, combined
 from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Constituent
@@ -38,14 +38,16 @@ class Composer:
     model: Model
     targets: dict[str, Target]
     stages: list[StageHeads]
+    spaces: list[MaterialSpace]
 
     @classmethod
     def of(cls, model: Model, memory: Memory) -> Composer:
         """Fit the heads of what is described in a memory over what was observed there, and the model made of it."""
         targets = targets_of(memory.descriptions)
         with one_thread():
-            stages = [HeadFitter(model, memory, stage).fit(targets) for stage in range(len(model.calibrations))]
-        return cls(model, targets, stages)
+            fitters = [HeadFitter(model, stage) for stage in range(len(model.calibrations))]
+            stages = [fitter.fit(targets) for fitter in fitters]
+        return cls(model, targets, stages, [fitter.space for fitter in fitters])
 
     def needed(self, columns: int) -> list[Scale]:
         """The scales whose windows the heads read of a touch of so many columns."""
@@ -68,14 +70,13 @@ class Composer:
             return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0), expected
         stage = self._stage(encoded.columns)
         heads, scales, calibration = self.stages[stage], self.model.stages[stage], self.model.calibrations[stage]
-        projected = {scale: self.model.selections[scale].readout.project(encoded.means[scale]) for scale in scales}
-        z = combined(self.model, stage, space_of(self.model, stage).names, projected)
-        distances = [float(self.model.selections[scale].readout.novelty(projected[scale])) for scale in scales]
+        z = combined(self.model, stage, self.spaces[stage].names, encoded.means)
+        readouts = {scale: self.model.readouts[scale] for scale in scales}
+        distances = [readout.novelty(encoded.means[scale], range(len(readout.names))) for scale, readout in readouts.items()]
         new = float(heads.novel(calibration.novelty(np.array(distances))))
         # Bayes: the curve is that of as many new touches as known ones.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
-        feels_like = _sharpened(feels_like, heads.sharpness)
         return self._constituents(wanted, heads, feels_like, z, unfamiliar), unfamiliar
 
     def _constituents(
@@ -115,14 +116,6 @@ class Composer:
             tuple(evidence[:MOST_EVIDENCE]),
             presence if isinstance(presence, str) else "",
         )
-
-
-def _sharpened(chances: Mapping[str, float], sharpness: float) -> Mapping[str, float]:
-    if sharpness == 1:
-        return chances
-    raised = {name: chance**sharpness for name, chance in chances.items()}
-    total = sum(raised.values())
-    return {name: chance / total for name, chance in raised.items()} if total > 0 else chances
 
 
 def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Target]) -> list[Constituent]:

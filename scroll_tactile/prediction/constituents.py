@@ -1,7 +1,7 @@
 """Heads for each constituent over the readouts of a model, fitted and evaluated on the sampled touches.
 
-Each sampled touch is scored by readouts of the folds that it is not in, and by heads that never observed its material.
-These scores say how far heads, novelty and the probabilities of the materials are to be believed.
+Each sampled touch is scored by readouts that never observed it, and by heads that never observed its material. These
+scores say how far heads and novelty are to be believed.
 """
 
 from __future__ import annotations
@@ -13,17 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.descriptions import Target
-from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, RidgeSystem, fit_curve, solve
-from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
-from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.calibration import judged_touches
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.sample import WindowSums
-from scroll_tactile.statistics.statistics import fold_of
 
-__all__ = ["ConstituentHead", "HeadFitter", "StageHeads", "combined", "space_of"]
+__all__ = ["ConstituentHead", "HeadFitter", "MaterialSpace", "StageHeads", "combined"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,7 +28,7 @@ NOVEL = Curve(1.0, -2.0)  # of a novelty in spreads, likewise
 
 
 @dataclass(frozen=True)
-class _MaterialSpace:
+class MaterialSpace:
     """The materials as a stage's readouts see them: names, and G of all its scales, weighted, shape (C, C)."""
 
     names: list[str]
@@ -45,13 +40,12 @@ class _MaterialSpace:
 
 
 @dataclass(frozen=True)
-class _HeldOutTouch:
-    """A sampled touch, judged by the folds that it is not in: z of its stage, shape (C,), and its novelty.
+class _TouchApart:
+    """A sampled touch, judged by readouts that never observed it: z of its stage, shape (C,), and its novelty.
 
     familiar: among all materials. unfamiliar: among all but its own.
     """
 
-    fold: int
     material: str
     z: FloatArray
     familiar: float
@@ -80,12 +74,10 @@ class ConstituentHead:
 class StageHeads:
     """The heads of one stage: constituent → its head, or in words why there is none.
 
-    novel: from standardised novelty to the probability of a new material. sharpness: the power to which the
-    probabilities of the materials observed are to be taken.
+    novel: from standardised novelty to the probability of a new material.
     """
 
     novel: Curve
-    sharpness: float
     presence: dict[str, ConstituentHead | str]
     share: dict[str, ConstituentHead | str]
 
@@ -93,39 +85,10 @@ class StageHeads:
 class HeadFitter:
     """Fits the heads of one stage and evaluates them on the sampled touches."""
 
-    def __init__(self, model: Model, memory: Memory, stage: int) -> None:
-        self.model = model
-        self.memory = memory
-        self.stage = stage
+    def __init__(self, model: Model, stage: int) -> None:
         self.space = space_of(model, stage)
-        self.folds: dict[int, _MaterialSpace] = {}
-        self.touches = [touch for item in memory.sample if (touch := self._held_out(*item)) is not None]
-        self._systems: dict[tuple[int | None, float, bytes], RidgeSystem] = {}
-
-    def _held_out(self, material: str, key: bytes, sums: WindowSums) -> _HeldOutTouch | None:
-        model, fold = self.model, fold_of(key)
-        means = sums.means(self.stage)
-        scales = model.stages[self.stage]
-        if means is None or any(fold not in model.selections[scale].held_out for scale in scales):
-            return None
-        if fold not in self.folds:
-            self.folds[fold] = space_of(model, self.stage, fold)
-        names = self.folds[fold].names
-        if material not in names or len(names) < 2:
-            return None
-        readouts = {scale: model.selections[scale].held_out[fold] for scale in scales}
-        z = {scale: readout.project(mean) for (scale, (_, readout)), mean in zip(readouts.items(), means, strict=True)}
-        novelty = [
-            [
-                float(readout.novelty(z[scale], _others(model, scale, known, out)))
-                for scale, (known, readout) in readouts.items()
-            ]
-            for out in (None, material)
-        ]
-        familiar, unfamiliar = model.calibrations[self.stage].novelty(np.array(novelty))
-        return _HeldOutTouch(
-            fold, material, combined(model, self.stage, names, z, fold), float(familiar), float(unfamiliar)
-        )
+        self.touches = _touches_apart(model, stage, self.space.names)
+        self._systems: dict[tuple[float, bytes], RidgeSystem] = {}
 
     def fit(self, targets: Mapping[str, Target]) -> StageHeads:
         """The heads of all constituents, and how novelty is to be read."""
@@ -133,50 +96,9 @@ class HeadFitter:
         truth = [0.0] * len(self.touches) + [1.0] * len(self.touches)
         return StageHeads(
             fit_curve(values, truth, NOVEL),
-            self._sharpness(),
             {name: self._head(dict(target.presence), curved=True) for name, target in targets.items()},
             {name: self._head(target.share, curved=False) for name, target in targets.items()},
         )
-
-    def _sharpness(self) -> float:
-        """The sharpness, from leaving single touches out of the readouts that answer; 1 where that cannot be done.
-
-        The probabilities are calibrated on readouts of two thirds of the touches. These are wrong more often, so the
-        probabilities are not sharp enough. A touch can be left out where it is one row of the statistics: of several
-        windows the sample holds the sum alone, and not the products.
-        """
-        statistics, scales = self.memory.statistics, self.model.stages[self.stage]
-        touches = sum(statistics.materials.values())
-        single = all(int(statistics.totals(scale)[0].sum()) <= touches for scale in scales)
-        if self.model.kind != "lda" or not single or len(self.space.names) < 2:
-            return 1.0
-        rows = self._single_rows()
-        if len(rows) < FEWEST:
-            return 1.0
-        logits = np.zeros((len(rows), len(self.space.names)))
-        weights = self.model.calibrations[self.stage].weights
-        for i, (scale, weight) in enumerate(zip(scales, weights, strict=True)):
-            selection = self.model.selections[scale]
-            codes = np.stack([means[i] for _, means in rows])
-            places = [selection.places[material] for material, _ in rows]
-            scores = leave_one_out_scores(statistics, scale, selection.readout, codes, places)
-            logits += weight * scores[:, [selection.places[name] for name in self.space.names]]
-        targets = [self.space.names.index(material) for material, _ in rows]
-        return float(fit_weights([row[None] for row in logits], targets, np.ones(1))[0])
-
-    def _single_rows(self) -> list[tuple[str, list[FloatArray]]]:
-        """(material, codes by scale) of sampled touches of one window a scale whose material has other touches too."""
-        statistics, scales = self.memory.statistics, self.model.stages[self.stage]
-        counts = [
-            dict(zip(self.model.selections[scale].names, statistics.totals(scale)[0], strict=True)) for scale in scales
-        ]
-        rows = []
-        for material, _, sums in self.memory.sample:
-            means, windows = sums.means(self.stage), set(sums.windows(self.stage))
-            others = material in self.space.names and all(count[material] > 1 for count in counts)
-            if means is not None and windows == {1} and others:
-                rows.append((material, means))
-        return rows
 
     def _head(self, known: Mapping[str, float], *, curved: bool) -> ConstituentHead | str:
         places = self.space.places(known)
@@ -193,71 +115,80 @@ class HeadFitter:
         }
         # Ties go to the larger γ, the tamer head.
         gamma = min(sorted(losses, reverse=True), key=losses.__getitem__) if losses else DEFAULT_GAMMA
-        weights = self._system(None, gamma, places).weights(values)
+        weights = self._system(gamma, places).weights(values)
         # A half stays a half. Leaving a material out makes what it has rarer among the others, and where presence
         # begins, fitted on few such heads, came out on the wrong side: letters never touched 72 % right in place of 75.
         curve = fit_curve(*evaluated[gamma], PRESENCE, turning=False) if curved else None
         return ConstituentHead(places, weights, curve)
 
     def _evaluated(self, known: Mapping[str, float], gamma: float) -> tuple[FloatArray, FloatArray]:
-        """What heads that never observed a held-out touch's material predict of it, and what is true."""
+        """What heads that never observed the material of a touch predict of it, and what is true."""
+        places = self.space.places(known)
         predicted, truth = [], []
-        for fold, space in self.folds.items():
-            places = space.places(known)
-            if len(places) < 3:
-                continue
-            values = np.array([known[space.names[place]] for place in places], dtype=np.float64)
-            system = self._system(fold, gamma, places)
+        if len(places) >= 3:
+            values = np.array([known[self.space.names[place]] for place in places], dtype=np.float64)
+            system = self._system(gamma, places)
             weights = system.weights(values)
             others = {
-                space.names[place]: system.weights_without(weights, i)
+                self.space.names[place]: system.weights_without(weights, i)
                 for i, place in enumerate(places)
                 if np.ptp(np.delete(values, i)) > 0  # what is left is no task otherwise
             }
             for touch in self.touches:
-                if touch.fold == fold and touch.material in others:
-                    head = others[touch.material]
+                if (head := others.get(touch.material)) is not None:
                     predicted.append(float(head[:-1] @ touch.z[places] + head[-1]))
                     truth.append(float(known[touch.material]))
         return np.array(predicted), np.array(truth)
 
-    def _system(self, fold: int | None, gamma: float, places: npt.NDArray[np.intp]) -> RidgeSystem:
-        key = fold, gamma, places.tobytes()
+    def _system(self, gamma: float, places: npt.NDArray[np.intp]) -> RidgeSystem:
+        key = gamma, places.tobytes()
         if key not in self._systems:
-            gram = (self.space if fold is None else self.folds[fold]).gram
-            self._systems[key] = solve(gram[np.ix_(places, places)], gamma)
+            self._systems[key] = solve(self.space.gram[np.ix_(places, places)], gamma)
         return self._systems[key]
 
 
-def _readout(model: Model, scale: Scale, fold: int | None) -> tuple[list[str], Readout]:
-    """The materials of a scale's readout, and the readout: of all that was observed, or of all but a fold."""
-    selection = model.selections[scale]
-    if fold is None:
-        return selection.names, selection.readout
-    known, readout = selection.held_out[fold]
-    return [selection.names[place] for place in known], readout
-
-
-def space_of(model: Model, stage: int, fold: int | None = None) -> _MaterialSpace:
-    """The materials as the readouts of a stage see them: of all that was observed, or of all but a fold."""
-    readouts = [_readout(model, scale, fold) for scale in model.stages[stage]]
-    names = sorted(set.intersection(*(set(known) for known, _ in readouts)))
+def space_of(model: Model, stage: int) -> MaterialSpace:
+    """The materials that the readouts of a stage rest on, as they see them."""
+    readouts = [model.readouts[scale] for scale in model.stages[stage]]
+    known = [[readout.names[place] for place in readout.reference] for readout in readouts]
+    names = sorted(set.intersection(*map(set, known)))
     gram = np.zeros((len(names), len(names)))
-    for weight, (known, readout) in zip(_weights(model, stage), readouts, strict=True):
-        places = [known.index(name) for name in names]
-        gram += weight * readout.gram[np.ix_(places, places)]
-    return _MaterialSpace(names, gram)
+    for weight, own, readout in zip(_weights(model, stage), known, readouts, strict=True):
+        places = [own.index(name) for name in names]
+        gram += weight * readout.derived().gram[np.ix_(places, places)]
+    return MaterialSpace(names, gram)
 
 
-def combined(
-    model: Model, stage: int, names: Sequence[str], z: Mapping[Scale, FloatArray], fold: int | None = None
-) -> FloatArray:
-    """z of a stage, shape (C,), of the z that its scales' readouts give, in the order of the names."""
+def combined(model: Model, stage: int, names: Sequence[str], means: Mapping[Scale, FloatArray]) -> FloatArray:
+    """z of a stage, shape (C,), of a touch's mean features by scale, in the order of the names."""
     total = np.zeros(len(names))
     for weight, scale in zip(_weights(model, stage), model.stages[stage], strict=True):
-        places = {name: place for place, name in enumerate(_readout(model, scale, fold)[0])}
-        total += weight * z[scale][[places[name] for name in names]]
+        readout = model.readouts[scale]
+        places = {readout.names[place]: i for i, place in enumerate(readout.reference)}
+        total += weight * readout.centred(means[scale])[[places[name] for name in names]]
     return total
+
+
+def _touches_apart(model: Model, stage: int, names: Sequence[str]) -> list[_TouchApart]:
+    apart, calibration = [model.apart[scale] for scale in model.stages[stage]], model.calibrations[stage]
+    if len(names) < 2:
+        return []
+    places = [[left.names.index(name) for name in names] for left in apart]
+    touches = []
+    for number in judged_touches(stage, apart):
+        material = model.materials[number]
+        if material not in names:
+            continue
+        rows = [left.rows[number, stage] for left in apart]
+        distances = np.stack([left.distances[row][own] for left, row, own in zip(apart, rows, places, strict=True)])
+        z = sum(
+            weight * left.z[row][own]
+            for weight, left, row, own in zip(_weights(model, stage), apart, rows, places, strict=True)
+        )
+        others = np.delete(distances, names.index(material), axis=1)
+        novelties = [float(calibration.novelty(part.min(axis=1))) for part in (distances, others)]
+        touches.append(_TouchApart(material, np.asarray(z), *novelties))
+    return touches
 
 
 def _weights(model: Model, stage: int) -> FloatArray:
@@ -265,8 +196,3 @@ def _weights(model: Model, stage: int) -> FloatArray:
     weights = model.calibrations[stage].weights
     total = float(weights.sum())
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
-
-
-def _others(model: Model, scale: Scale, known: npt.NDArray[np.intp], out: str | None) -> npt.NDArray[np.intp]:
-    names = model.selections[scale].names
-    return np.array([i for i, place in enumerate(known) if names[place] != out], dtype=np.intp)

@@ -18,7 +18,7 @@ from scroll_tactile.embeddings.protocol import (
 )
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
-from scroll_tactile.prediction.filling import sampled_readings
+from scroll_tactile.prediction.filling import Filling, sampled_readings
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
@@ -101,11 +101,13 @@ class FeatureExtractor:
         windows = {scale: to_codes(rows, self._embedding.bound) for scale, rows in self.features(image).items()}
         return stage_rows(self._plan.scored_stages(image.shape[1]), windows)
 
-    def encode(self, stream: Stream, model: Model, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
+    def encode(
+        self, stream: Stream, model: Model, filling: Filling | None, needed: Callable[[int], Sequence[Scale]]
+    ) -> Encoded:
         """What is evaluated of a `stream`: its part within the longest touch that was learned.
 
-        model: of the memory; it knows that length, whether noisy touches were learned, and how dead channels are
-        filled in. needed: the scales to be read of a touch of so many columns.
+        model: of the memory; it knows that length, and whether noisy touches were learned. filling: fills in dead
+        channels. needed: the scales to be read of a touch of so many columns.
         """
         stream = self._within(stream, model.longest)
         image = self.image(stream)
@@ -113,8 +115,8 @@ class FeatureExtractor:
             sets = self._noisy_features([image])
             means = {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
             return Encoded(image, means, True, stream.seconds)
-        if model.filling is not None:
-            image = model.filling.fill(image)
+        if filling is not None:
+            image = filling.fill(image)
         return Encoded(image, self.means(image, needed(image.shape[1])), False, stream.seconds)
 
     def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:

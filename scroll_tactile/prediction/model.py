@@ -1,4 +1,4 @@
-"""The model: everything that predictions need of one state of a memory, computed from it and nothing else."""
+"""The model: everything that predictions need of a memory, fitted to it and nothing else, and followed as it changes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.errors import CapacityError, InputError
+from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
-from scroll_tactile.prediction.filling import Filling
-from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
-from scroll_tactile.readouts.readout import ReadoutName
-from scroll_tactile.readouts.shrinkage import PENALTIES, Selection, select
+from scroll_tactile.readouts.calibration import Calibration, calibrate
+from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
 from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
-from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Judgement", "Model"]
+__all__ = ["Draft", "Judgement", "Model"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,42 +32,92 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Model:
-    """Everything that predictions need of one state of a memory, so that each answer rests on one state.
+class Draft:
+    """All that a model is fitted to, taken of a memory at one moment, so that fitting waits for nobody.
 
-    names: the materials. stages: for each, the scales that judge there. selections: scale → its readout. calibrations:
-    of the stages, as far as any touch reached them. longest: the columns of the longest touch that was learned. noisy:
-    the calibration of touches observed through noise; None where none were learned. filling: fills in dead channels;
-    None where the embedding does not ask for that.
+    Raises InputError, from `of`, for the ridge of more materials than it can weigh.
     """
 
     kind: ReadoutName
+    memory: Memory
     names: list[str]
-    plan: WindowPlan
     stages: list[list[Scale]]
-    selections: dict[Scale, Selection]
-    calibrations: list[Calibration]
+    tasks: dict[Scale, Task]
+    sample: list[tuple[str, bytes, SampledTouch]]
     longest: int
-    noisy: Calibration | None = None
-    filling: Filling | None = None
+    touches: int
 
     @classmethod
-    def of(cls, memory: Memory, kind: ReadoutName, filling: Filling | None = None) -> Model:
-        """Fit the readouts of a memory and calibrate them; filling: see `Filling.of`."""
-        statistics = memory.statistics
-        scales = statistics.scales
+    def of(cls, memory: Memory, kind: ReadoutName) -> Draft:
+        """The draft of a memory as it is now."""
+        statistics, sample = memory.statistics, list(memory.sample)
+        names = list(statistics.materials)
+        if kind == "ridge" and len(names) > EAGER:
+            raise InputError(f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"')
+        # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
+        reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
+        judging = [scale for scale in statistics.scales if scale != CHANNELS and statistics.second(scale).rows]
+        tasks = {scale: Task.of(statistics, scale, reference) for scale in judging}
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
-        with one_thread():
-            penalties = memory.plan.penalties or PENALTIES
-            chosen = {scale: select(statistics, scale, kind, penalties) for scale in scales if scale != CHANNELS}
-            selections = {scale: selection for scale, selection in chosen.items() if selection is not None}
-            calibrations = calibrate(memory.sample, stages, selections, kind)
-            noisy = None
-            if all(scale in selections for scale in NOISE):
-                noisy = calibrate_stage(len(stages), memory.sample, [selections[scale] for scale in NOISE], kind)
+        stages += [list(NOISE)] * memory.plan.noisy
+        return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)
+
+    def fit(self) -> Model:
+        """Solve the readouts and calibrate them.
+
+        Raises CapacityError where the system has not the memory for it; nothing was changed then.
+        """
+        try:
+            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+            calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
+        except MemoryError as error:
+            raise CapacityError(
+                f"the system has no memory left to fit the readouts of {len(self.names)} materials: what was observed "
+                "is kept; name fewer in a scene, or give the process more"
+            ) from error
         give_back_scratch()
-        names, longest = list(statistics.materials), statistics.longest
-        return cls(kind, names, memory.plan, stages, selections, calibrations, longest, noisy, filling)
+        return Model(self, readouts, calibrations, apart)
+
+
+class Model:
+    """Everything that predictions need of one state of a memory.
+
+    names: the materials. stages: for each, the scales that judge there; those of NOISE come last where noise is read.
+    readouts: scale → its readout. calibrations: of the stages, as far as any touch reached them. apart: scale → the
+    sampled touches left out. longest: the columns of the longest touch that was learned. noisy: the calibration of
+    touches observed through noise; None where none were learned. fitted_to: the touches that it was fitted to.
+    """
+
+    def __init__(
+        self,
+        draft: Draft,
+        readouts: dict[Scale, Readout],
+        calibrations: list[Calibration],
+        apart: dict[Scale, LeftOut],
+    ) -> None:
+        self.kind: ReadoutName = draft.kind
+        self.plan: WindowPlan = draft.memory.plan
+        self.names, self.longest, self.fitted_to = draft.names, draft.longest, draft.touches
+        self.readouts, self.apart = readouts, apart
+        self.materials = [material for material, *_ in draft.sample]
+        learned = self.plan.noisy and all(scale in readouts for scale in NOISE)
+        self.noisy = calibrations.pop() if learned else None
+        self.calibrations = calibrations
+        self.stages = draft.stages[: len(draft.stages) - self.plan.noisy]
+
+    def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
+        """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
+
+        The readouts are then those of all that was observed; calibration, and how far the scatter is shrunk, stay.
+        """
+        for scale in memory.statistics.scales:
+            changes = [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
+            if not changes or scale == CHANNELS:
+                continue
+            if scale not in self.readouts or not self.readouts[scale].follow(changes):
+                return False
+        self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
+        return True
 
     def is_last(self, columns: int) -> bool:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
@@ -94,34 +145,25 @@ class Model:
         A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
         the probability that is left goes to the others, which later stages weigh again.
         """
-        z = {scale: self.selections[scale].readout.project(mean) for scale, mean in means.items()}
         if noisy:
-            return self._judge_noisy(candidates, z)
-        reached = len(self.plan.stages(columns))
+            assert self.noisy is not None
+            chances = _chances(self._weighted(NOISE, self.noisy, means, candidates))
+            return Judgement(chances, self._novelty(NOISE, self.noisy, means, candidates), self.noisy)
+        decided = self._decided(candidates, len(self.plan.stages(columns)))
         probability, mass = np.ones(len(candidates)), 1.0
-        decided = self._decided(candidates, reached)
         for i, (stage, members) in enumerate(decided):
             names = [candidates[place] for place in members]
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
-                logits = self._weighted(self.stages[stage], self.calibrations[stage], z, names)
-            chances = np.exp(logits - logits.max())
-            probability[members] = chances / chances.sum() * mass
+                logits = self._weighted(self.stages[stage], self.calibrations[stage], means, names)
+            probability[members] = _chances(logits) * mass
             later = decided[i + 1][1] if i + 1 < len(decided) else []
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
         stage = max(stage for stage, members in decided if best in members)
         calibration = self.calibrations[stage]
-        distances = [self._distance(scale, z[scale], candidates) for scale in self.stages[stage]]
-        return Judgement(probability, float(calibration.novelty(np.array(distances))), calibration)
-
-    def _judge_noisy(self, candidates: Sequence[str], z: Mapping[Scale, FloatArray]) -> Judgement:
-        assert self.noisy is not None
-        logits = self._weighted(NOISE, self.noisy, z, candidates)
-        chances = np.exp(logits - logits.max())
-        novelty = self.noisy.novelty(np.array([self._distance(scale, z[scale], candidates) for scale in NOISE]))
-        return Judgement(chances / chances.sum(), float(novelty), self.noisy)
+        return Judgement(probability, self._novelty(self.stages[stage], calibration, means, candidates), calibration)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
@@ -136,20 +178,30 @@ class Model:
 
     def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
         """The places of the candidates that were observed at all of these scales."""
-        known = [self.selections[scale].places for scale in scales]
+        known = [self.readouts[scale].places for scale in scales]
         return [i for i, name in enumerate(candidates) if all(name in places for places in known)]
 
     def _weighted(
-        self, scales: Sequence[Scale], calibration: Calibration, z: Mapping[Scale, FloatArray], names: Sequence[str]
+        self, scales: Sequence[Scale], calibration: Calibration, means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
         logits = np.zeros(len(names))
         for scale, weight in zip(scales, calibration.weights, strict=True):
-            selection = self.selections[scale]
-            places = [selection.places[name] for name in names]
-            logits += weight * selection.readout.scores(z[scale], self.kind)[places]
+            readout = self.readouts[scale]
+            logits += weight * readout.scores(means[scale], [readout.places[name] for name in names], self.kind)
         return logits
 
-    def _distance(self, scale: Scale, z: FloatArray, candidates: Sequence[str]) -> float:
-        selection = self.selections[scale]
-        places = np.array([selection.places[name] for name in candidates if name in selection.places])
-        return float(selection.readout.novelty(z, places))
+    def _novelty(
+        self, scales: Sequence[Scale], calibration: Calibration, means: Mapping[Scale, FloatArray], names: Sequence[str]
+    ) -> float:
+        distances = []
+        for scale in scales:
+            readout = self.readouts[scale]
+            distances.append(
+                readout.novelty(means[scale], [readout.places[name] for name in names if name in readout.places])
+            )
+        return float(calibration.novelty(np.array(distances)))
+
+
+def _chances(logits: FloatArray) -> FloatArray:
+    chances = np.exp(logits - logits.max())
+    return np.asarray(chances / chances.sum())

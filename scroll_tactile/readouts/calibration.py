@@ -1,7 +1,7 @@
-"""Calibration: from scores to probabilities, and from distances to "never observed", by touches held out.
+"""Calibration: from scores to probabilities, and from distances to "never observed", by touches left out.
 
-The readouts of the folds that a sampled touch is not in score it. On these scores s one weight w_k a scale is fitted,
-which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706.04599):
+Each sampled touch is scored by readouts that never observed it (`leave_one_out`). On these scores s one weight w_k a
+scale is fitted, which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706.04599):
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
@@ -18,17 +18,24 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.shrinkage import Selection
+from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
+from scroll_tactile.readouts.readout import Readout, ReadoutName, Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import TouchSample
-from scroll_tactile.statistics.statistics import fold_of
 
-__all__ = ["FEWEST", "Calibration", "calibrate", "calibrate_stage", "fit_weights"]
+__all__ = [
+    "FEWEST",
+    "Calibration",
+    "calibrate",
+    "calibrate_stage",
+    "common_names",
+    "fit_weights",
+    "judged_touches",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
-FEWEST = 8  # held-out touches; with fewer, a stage keeps the threshold and the spreads set beforehand
+FEWEST = 8  # left-out touches; with fewer, a stage keeps the threshold and the spreads set beforehand
 PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
@@ -42,7 +49,7 @@ class Calibration:
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
     scale_novelty: mean and spread of each scale's novelty for known materials, shape (S, 2).
-    novelties: sorted standardised novelty of known, held-out touches, shape (touches,).
+    novelties: sorted standardised novelty of known, left-out touches, shape (touches,).
     """
 
     weights: FloatArray
@@ -56,7 +63,7 @@ class Calibration:
         return standard
 
     def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
+        """The novelty that a share `false_alarms` of known touches exceeds, by the left-out ones."""
         if len(self.novelties) < FEWEST:
             return UNMEASURED
         # The conformal quantile: of n + 1 exchangeable touches no more than this share lies above it.
@@ -64,27 +71,39 @@ class Calibration:
         return float(self.novelties[rank - 1]) if rank <= len(self.novelties) else float(2 * self.novelties[-1])
 
 
-UNMEASURED = 5.0  # spreads: where too little could be held out to measure the distances of known touches
+UNMEASURED = 5.0  # spreads: where too little could be left out to measure the distances of known touches
 
 
 def calibrate(
-    sample: TouchSample, stages: Sequence[Sequence[Scale]], selections: Mapping[Scale, Selection], kind: ReadoutName
-) -> list[Calibration]:
-    """Calibrate every stage, given as the scales that fit there, of whose scales all have a readout."""
+    sample: TouchSample, stages: Sequence[Sequence[Scale]], tasks: Mapping[Scale, Task], readouts: Mapping[Scale, Readout],
+    kind: ReadoutName,
+) -> tuple[list[Calibration], dict[Scale, LeftOut]]:  # fmt: skip
+    """Calibrate every stage, given as the scales that judge there, of which all have a readout.
+
+    tasks: what the readouts were just made of. Also returns what each scale says of the touches left out.
+    """
+    apart = {scale: left_out(readouts[scale], tasks[scale], sample, stages, kind) for scale in readouts}
+    materials = [material for material, *_ in sample]
     return [
-        calibrate_stage(stage, sample, [selections[scale] for scale in scales], kind)
+        calibrate_stage(stage, materials, [readouts[scale] for scale in scales], [apart[scale] for scale in scales], kind)
         for stage, scales in enumerate(stages)
-        if all(scale in selections for scale in scales)
-    ]
+        if all(scale in readouts for scale in scales)
+    ], apart
 
 
-def calibrate_stage(stage: int, sample: TouchSample, selections: list[Selection], kind: ReadoutName) -> Calibration:
-    """Calibrate one stage, by the readouts of the scales that judge there, ascending."""
-    scores, targets, distances = _held_out(stage, sample, selections, kind)
-    prior = np.full(len(selections), PRIOR_WEIGHT[kind] / len(selections))
-    weights = fit_weights(scores, targets, prior)
+def calibrate_stage(
+    stage: int, materials: Sequence[str], readouts: Sequence[Readout], apart: Sequence[LeftOut], kind: ReadoutName
+) -> Calibration:
+    """Calibrate one stage. materials: of the sampled touches. readouts, apart: of the scales that judge, ascending."""
+    names = common_names(apart)
+    touches = judged_touches(stage, apart) if len(names) > 1 else []
+    prior = np.full(len(apart), PRIOR_WEIGHT[kind] / len(apart))
+    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
+    distances = np.stack([_picked(left, left.distances, names, touches, stage).min(axis=1) for left in apart], axis=1)
+    own = {name: i for i, name in enumerate(names)}
+    weights = fit_weights(scores, [own[materials[touch]] for touch in touches], prior)
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(selections), np.zeros(0))
+        return Calibration(weights, _assumed(readouts), np.zeros(0))
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
     unsorted = Calibration(weights, shape, np.zeros(0)).novelty(distances)
@@ -94,62 +113,41 @@ def calibrate_stage(stage: int, sample: TouchSample, selections: list[Selection]
     return Calibration(weights, shape, np.sort(Calibration(weights, shape, np.zeros(0)).novelty(distances)))
 
 
-def _held_out(
-    stage: int, sample: TouchSample, selections: list[Selection], kind: ReadoutName
-) -> tuple[list[FloatArray], list[int], FloatArray]:
-    """Scores (scales, C') and target place of each held-out touch, and its distances (touches, scales)."""
-    scores: list[FloatArray] = []
-    targets: list[int] = []
-    distances: list[FloatArray] = []
-    for material, key, sums in sample:
-        means = sums.means(stage)
-        judged = None if means is None else _judge(means, material, fold_of(key), selections, kind)
-        if judged is not None:
-            scores.append(judged[0])
-            targets.append(judged[1])
-            distances.append(judged[2])
-    return scores, targets, np.array(distances).reshape(len(scores), len(selections))
+def common_names(apart: Sequence[LeftOut]) -> list[str]:
+    """The reference materials of all of some scales, in alphabetical order."""
+    return sorted(set.intersection(*(set(left.names) for left in apart)))
 
 
-def _judge(
-    means: list[FloatArray], material: str, fold: int, selections: list[Selection], kind: ReadoutName
-) -> tuple[FloatArray, int, FloatArray] | None:
-    if any(fold not in selection.held_out for selection in selections):
-        return None
-    known = [[selection.names[place] for place in selection.held_out[fold][0]] for selection in selections]
-    common = sorted(set.intersection(*map(set, known)))
-    if material not in common or len(common) < 2:
-        return None
-    rows, distances = [], []
-    for selection, names, mean in zip(selections, known, means, strict=True):
-        readout = selection.held_out[fold][1]
-        z = readout.project(mean)
-        rows.append(readout.scores(z, kind)[[names.index(name) for name in common]])
-        distances.append(float(readout.novelty(z)))
-    return np.stack(rows), common.index(material), np.array(distances)
+def judged_touches(stage: int, apart: Sequence[LeftOut]) -> list[int]:
+    """The sampled touches, by their place in the sample, that all of some scales left out at a stage."""
+    found = [{touch for touch, reached in left.rows if reached == stage} for left in apart]
+    return sorted(set.intersection(*found))
 
 
-def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray) -> FloatArray:
-    """Weights ≥ 0 of least held-out log loss, a convex problem, drawn to the prior where touches are few."""
-    if not scores:
+def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
+    """The values of some touches at a stage for some of the materials, shape (touches, names)."""
+    own = {name: i for i, name in enumerate(left.names)}
+    rows = np.array([left.rows[touch, stage] for touch in touches], dtype=np.intp)
+    return values[np.ix_(rows, [own[name] for name in names])]
+
+
+def fit_weights(scores: FloatArray, targets: Sequence[int], prior: FloatArray) -> FloatArray:
+    """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
+
+    scores: of touches left out, shape (touches, scales, classes). targets: the class of each.
+    """
+    if not len(targets):
         return prior
-    groups: dict[int, list[int]] = {}
-    for touch, rows in enumerate(scores):
-        groups.setdefault(rows.shape[1], []).append(touch)
-    # Scores less the target's, (touches, scales, classes), for each number of classes.
-    gaps = [np.stack([scores[i] - scores[i][:, [targets[i]]] for i in touches]) for touches in groups.values()]
+    gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
-        value, slope = 0.0, np.zeros_like(weights)
-        for gap in gaps:
-            logits = np.einsum("tsc,s->tc", gap, weights)
-            top = logits.max(axis=1, keepdims=True)
-            chances = np.exp(logits - top)
-            total = chances.sum(axis=1, keepdims=True)
-            value += float((np.log(total) + top).sum())
-            slope += np.einsum("tsc,tc->s", gap, chances / total)
+        logits = np.einsum("tsc,s->tc", gap, weights)
+        top = logits.max(axis=1, keepdims=True)
+        chances = np.exp(logits - top)
+        total = chances.sum(axis=1, keepdims=True)
         pull = weights / prior - 1
-        return value + PRIOR_TOUCHES * float(pull @ pull) / 2, slope + PRIOR_TOUCHES * pull / prior
+        value = float((np.log(total) + top).sum()) + PRIOR_TOUCHES * float(pull @ pull) / 2
+        return value, np.einsum("tsc,tc->s", gap, chances / total) + PRIOR_TOUCHES * pull / prior
 
     from scipy.optimize import minimize  # a third of a second, that whoever only looks at a memory is spared
 
@@ -158,13 +156,12 @@ def fit_weights(scores: list[FloatArray], targets: list[int], prior: FloatArray)
     return fitted
 
 
-def _assumed(selections: list[Selection]) -> FloatArray:
-    """Without held-out touches: the distances of the class means themselves, spread by their own mean size."""
+def _assumed(readouts: Sequence[Readout]) -> FloatArray:
+    """Without touches left out: the distances of the class means themselves, spread by their own mean size."""
     shapes = []
-    for selection in selections:
-        readout: Readout = selection.readout
-        # Row y of G is z at the mean of class y.
-        typical = float(np.mean(readout.novelty(readout.gram)))
-        size = float(np.mean(np.diagonal(readout.gram)))
-        shapes.append([typical, max(size, 1e-9) / UNMEASURED])
+    for readout in readouts:
+        derived = readout.derived()
+        sizes = np.diagonal(derived.gram)
+        typical = np.einsum("ri,ij,rj->r", derived.gram, derived.background, derived.gram) - sizes
+        shapes.append([float(typical.mean()), max(float(sizes.mean()), 1e-9) / UNMEASURED])
     return np.array(shapes)

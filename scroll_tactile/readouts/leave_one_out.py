@@ -1,69 +1,179 @@
-"""Leave-one-out scores: of each touch by a readout that never observed it, its row taken out of the statistics.
+"""Leave-one-out scores: of each sampled touch by a readout that never observed it, its rows taken out of the statistics.
 
-Readouts of folds know two thirds of what was observed, and are wrong more often than the one that answers; scores that
-are calibrated on theirs are not sharp enough. Let S = S_w + N λ V, W = N S⁻¹ Mᵀ and G = M W as in `readouts`. A row x
-of a material with n rows and mean m, u = x − m and q = uᵀ S⁻¹ u, leaves by
+A touch of k rows with mean x̄, of a material of n rows with mean m, adds to S_w the columns U of `readout`: its rows
+about their mean and its way √(n k / (n − k)) (x̄ − m). Without it, by Sherman, Morrison and Woodbury (1950; Bartlett
+1951 for a row),
 
-    S⁻¹ + f S⁻¹ u uᵀ S⁻¹,  f = k / (1 − k q),  k = n / (n − 1)     (Sherman and Morrison 1950; Bartlett 1951)
+    K'⁻¹ = K⁻¹ − K⁻¹ Uᵀ E U K⁻¹,    E = (U K⁻¹ Uᵀ − I)⁻¹,    m' = m − k / (n − k) (x̄ − m),
 
-and its material's mean becomes m − u / (n − 1). With g = Wᵀ u / N all scores follow from G, g and q, so that the
-whole takes one factorisation. The ridge N λ V stays what it is.
+so that all of its scores follow from products with K⁻¹ of its rows and of the means: one inverse serves for all. The
+covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
+matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
+
+A touch of which the statistics hold more rows than the sample (copies; windows, in a memory that an earlier version
+compacted) leaves with as many of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, centred_means, require_definite
+from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, contrasts
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import one_thread, within_scatter
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.sample import TouchSample
 
-__all__ = ["leave_one_out_scores"]
+__all__ = ["LeftOut", "left_out"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def leave_one_out_scores(
-    statistics: Statistics, scale: Scale, readout: Readout, rows: FloatArray, places: Sequence[int]
-) -> FloatArray:
-    """Scores, shape (N, C), that `lda` would give rows of a scale had each, alone, never been observed.
+@dataclass(frozen=True)
+class LeftOut:
+    """What a scale says of the sampled touches, each left out, of N rows and the R reference materials.
 
-    readout: of all the statistics of the scale. rows: in codes, shape (N, d), each one that was added to them.
-    places: of their materials among the readout's classes, each of two rows or more, shape (N,).
-
-    Raises numpy.linalg.LinAlgError where the scatter with its ridge is not positive definite to working precision.
+    rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
+    about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
     """
-    from scipy.linalg.lapack import dpotrf, dpotrs
 
-    counts, sums = statistics.totals(scale)
-    total = int(counts.sum())
-    _, means = centred_means(counts, sums)
-    own = np.asarray(places, dtype=np.intp)
-    apart = rows - readout.center - means[own]
-    system = within_scatter(statistics.total_second(scale), counts, sums)
-    system[np.diag_indices_from(system)] += readout.penalties
-    with one_thread():
-        factor, failed = dpotrf(np.asfortranarray(system), lower=0, overwrite_a=1)
-        require_definite(readout.penalty, failed)
-        solved, _ = dpotrs(factor, apart.T, lower=0)
-    length = np.einsum("nd,dn->n", apart, solved)
-    along, gram = apart @ readout.weights / total, readout.gram / total
-    i, count = np.arange(len(own)), counts[own].astype(np.float64)
-    gain = count / (count - 1)
-    gain = gain / (1 - gain * length)
-    # The products of the other materials' means with the row, then that of its own, which has lost it.
-    onto = gram[own] + along
-    reach = along.copy()  # S⁻¹ u on each mean
-    mean, share = along[i, own], 1 / (count - 1)
-    onto[i, own] -= share * (mean + length)
-    reach[i, own] -= share * length
-    sizes = np.tile(np.diagonal(gram), (len(own), 1))
-    sizes[i, own] += share * (share * length - 2 * mean)
-    onto += (gain * (mean + length))[:, None] * reach
-    sizes += gain[:, None] * np.square(reach)
-    scores: FloatArray = total * (onto - sizes / 2)
-    return scores
+    rows: dict[tuple[int, int], int]
+    names: list[str]
+    scores: FloatArray
+    z: FloatArray
+    distances: FloatArray
+
+
+def left_out(
+    readout: Readout, task: Task, sample: TouchSample, stages: Sequence[Sequence[Scale]], kind: ReadoutName
+) -> LeftOut:
+    """Leave each sampled touch out of the readout of a scale that was just made of a task.
+
+    stages: the scales that judge at each stage, ascending. Touches of materials that have no others are not there.
+    """
+    names = [readout.names[place] for place in readout.reference]
+    own = {name: i for i, name in enumerate(names)}
+    groups: dict[int, list[tuple[int, list[int], FloatArray, float, int]]] = {}
+    for number, (material, _, touch) in enumerate(sample):
+        judged = [
+            i for i, (stage, place, _) in enumerate(touch.pairs.tolist())
+            if stage < len(stages) and place < len(stages[stage]) and stages[stage][place] == readout.scale
+        ]  # fmt: skip
+        if not judged or material not in own:
+            continue
+        weight = float(max(touch.pairs[judged[0], 2], len(judged)))
+        if readout.counts[readout.reference[own[material]]] > weight:
+            at = touch.pairs[judged, 0].tolist()
+            rows = touch.rows[judged] - readout.origin
+            groups.setdefault(len(judged), []).append((number, at, rows, weight, own[material]))
+    left, index, parts = _Leaving(readout, task, kind), {}, []
+    for members in groups.values():
+        for number, at, *_ in members:
+            for stage in at:
+                index[number, stage] = len(index)
+        rows, weights, owners = (np.stack([member[i] for member in members]) for i in (2, 3, 4))
+        parts.append(left.out(np.asarray(rows), np.asarray(weights), np.asarray(owners)))
+    joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
+    return LeftOut(index, names, *joined)
+
+
+class _Leaving:
+    """Takes touches out of one readout; all of M touches with k rows each, shape (M, k, d), at once."""
+
+    def __init__(self, readout: Readout, task: Task, kind: ReadoutName) -> None:
+        from scipy.linalg.lapack import dpotrf
+
+        self.readout, self.kind = readout, kind
+        self.derived = readout.derived()
+        self.means, self.solved = readout.means_of(self.derived.reference)
+        self.counts = readout.counts[readout.reference]
+        self.total = float(self.counts.sum())
+        self.center = readout.shares @ self.means
+        # The whole is that of the reference materials alone, weighed as if they were all.
+        self.excess = readout.rows / self.total
+        spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
+        with one_thread():
+            system = task.scatter + np.asfortranarray(spread.T @ spread)
+            system[np.diag_indices(len(system))] += readout.penalty
+            self.factor, failed = dpotrf(system, lower=0, overwrite_a=1)
+        if failed:
+            raise np.linalg.LinAlgError(f"the scatter of the whole is not positive definite at row {failed}")
+
+    def out(
+        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Scores, z and distances, each of shape (M·k, R), of rows about the origin.
+
+        weights: the rows of the statistics that each touch stands for, shape (M,). own: its material among the
+        reference, shape (M,).
+        """
+        touches, count, dimension = rows.shape
+        with one_thread():
+            solved = self.readout.solve(rows.reshape(-1, dimension)).reshape(rows.shape)
+            counts = self.counts[own]
+            mean = np.sqrt(weights * counts / (counts - weights))[:, None]
+            share = np.sqrt(weights / count)[:, None, None]
+            columns = _columns(rows, share, mean * (rows.mean(axis=1) - self.means[own]))
+            outer = _columns(solved, share, mean * (solved.mean(axis=1) - self.solved[own]))
+            crossed = columns @ outer.transpose(0, 2, 1)
+            inner = np.linalg.inv(crossed - np.eye(count))
+            onto = rows @ outer.transpose(0, 2, 1)  # U K⁻¹ p of the rows, (M, k, columns)
+            classes = np.einsum("nid,rd->nri", outer, self.means, optimize=True)  # and of the means, (M, R, columns)
+            onto_inner, classes_inner = onto @ inner, classes @ inner
+            z = rows @ self.solved.T - onto_inner @ classes.transpose(0, 2, 1)
+            sizes = np.einsum("rd,rd->r", self.means, self.solved) - np.einsum("nri,nri->nr", classes, classes_inner)
+            i = np.arange(touches)
+            change = np.sqrt(weights / (counts * (counts - weights)))
+            z[i, :, own] += change[:, None] * onto_inner[:, :, -1]
+            sizes[i, own] += 2 * change * classes_inner[i, own, -1] - np.square(change) * (1 + inner[:, -1, -1])
+            length = np.einsum("nkd,nkd->nk", rows, solved) - np.einsum("nki,nki->nk", onto, onto_inner)
+            whole, leverage = self._whole(rows, weights, own, share)
+        gamma = self.readout.gamma
+        lda = gamma * (z - sizes[:, None, :] / 2)
+        distances = gamma * (length - whole)[:, :, None] - 2 * lda
+        centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
+        scores = lda if self.kind == "lda" else self._ridge(rows, own, leverage)
+        return tuple(part.reshape(touches * count, -1) for part in (scores, centred, distances))  # type: ignore[return-value]
+
+    def _whole(
+        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp], share: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The squared length of each row about the mean of all under T without its touch, (M, k), and B, (M, k, k)."""
+        from scipy.linalg.lapack import dtrtrs
+
+        touches, count, dimension = rows.shape
+        half = dtrtrs(self.factor, (rows - self.center).reshape(-1, dimension).T, lower=0, trans=1)[0].T
+        half = np.ascontiguousarray(half).reshape(rows.shape)
+        middle = half.mean(axis=1)
+        rest = (self.total - weights)[:, None]
+        columns = np.sqrt(self.excess) * _columns(half, share, np.sqrt(weights[:, None] * self.total / rest) * middle)
+        signs = -np.ones(count)
+        if self.excess > 1:
+            apart = dtrtrs(self.factor, (self.means - self.center).T, lower=0, trans=1)[0].T[own]
+            counts = self.counts[own]
+            way = np.sqrt(weights * counts / (counts - weights))[:, None] * (middle - apart)
+            columns = np.concatenate([columns, np.sqrt(self.excess - 1) * _columns(half, share, way)], axis=1)
+            signs = np.repeat([-1.0, 1.0], count)
+        inner = np.linalg.inv(columns @ columns.transpose(0, 2, 1) + np.diag(signs))
+        moved = half + (weights[:, None] / rest * middle)[:, None, :]
+        onto = moved @ columns.transpose(0, 2, 1)
+        whole = np.einsum("nkd,nkd->nk", moved, moved) - np.einsum("nki,nki->nk", onto, onto @ inner)
+        leverage = np.square(share) * (half @ half.transpose(0, 2, 1) + 1 / self.total)
+        return whole, leverage
+
+    def _ridge(self, rows: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray) -> FloatArray:
+        z = self.readout.gamma * (rows @ self.solved.T)
+        z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
+        fitted = self.readout.shares + z @ self.derived.background
+        targets = np.zeros_like(fitted)
+        targets[np.arange(len(own)), :, own] = 1.0
+        return np.asarray(np.linalg.solve(np.eye(rows.shape[1]) - leverage, fitted - leverage @ targets))
+
+
+def _columns(rows: FloatArray, share: FloatArray, way: FloatArray) -> FloatArray:
+    """The contrasts of the rows of each touch and its way, shape (M, k, d)."""
+    own = contrasts(rows.shape[1])
+    return np.concatenate([share * (own @ rows), way[:, None]], axis=1)

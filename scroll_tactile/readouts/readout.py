@@ -1,145 +1,359 @@
-"""Readouts: classifiers computed from the statistics of one scale, and what they say of novelty.
+"""Readouts: discriminants of one scale, solved once from the exact statistics and followed from touch to touch.
 
-With class means m_y (about the mean of all rows, p_y their shares), scaled features and
-Σ = S_w / N + λ I, one Cholesky factorisation gives W = Σ⁻¹ Mᵀ and G = M W, and everything else is C × C:
+With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `shrinkage`), Σ⁻¹ = γ K⁻¹ with
+K = S_w + P I, P = ρ / (1 − ρ) tr S_w / d and γ = N / (1 − ρ). All that answers need of a row x are
 
-- lda, linear discriminant analysis:      s_y = z_y − G_yy / 2,            z = Wᵀ x;
-- ridge on 0/1 targets, the paper's f_t:  s = p + H z,                     H = (P⁻¹ + G)⁻¹,
-  since (Σ + Mᵀ P M)⁻¹ Mᵀ P = W H (push-through identity), with M P Mᵀ the scatter between classes;
-- relative Mahalanobis distance (Ren et al. 2021, arXiv 2106.09022), the distance to the nearest class under
-  Σ less that to the whole under Σ + Mᵀ P M:  −2 max_y s_y(lda) + zᵀ H z  (Woodbury; xᵀ Σ⁻¹ x cancels).
+    z_y = γ m_yᵀ K⁻¹ x,    g_y = γ m_yᵀ K⁻¹ m_y,    G = γ M K⁻¹ Mᵀ of some reference materials,
+
+rows and means about a fixed origin, and with p_y the shares of the reference materials and z, G about their mean:
+
+- lda, linear discriminant analysis:      s_y = z_y − g_y / 2;
+- ridge on 0/1 targets, the paper's f_t:  s = p + H z,    H = (((1 − ρ) P)⁻¹ + G)⁻¹    (push-through identity);
+- relative Mahalanobis distance (Ren et al. 2021, arXiv 2106.09022), the distance to the nearest class less that to the
+  whole, whose covariance is Σ + (1 − ρ) Mᵀ P M:  −2 max_y s_y(lda) + zᵀ H z    (Woodbury; xᵀ Σ⁻¹ x cancels).
+
+A touch of a known class adds to S_w its rows about their mean and its way √(n k / (n + k)) (x̄ − m). With U all such
+columns since K was inverted and D their signs, −1 for what was retracted (Woodbury 1950):
+
+    (K + Uᵀ D U)⁻¹ = K⁻¹ − Vᵀ E V,    V = U K⁻¹,    E = (D + U K⁻¹ Uᵀ)⁻¹,
+
+at 2 d² operations a row. Nothing drifts: U grows to a part of d, and then K is inverted again from the integers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.readouts.shrinkage import shrinkage
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Readout", "ReadoutName", "Task", "centred_means", "fit_readout", "require_definite"]
+__all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task", "columns_of", "contrasts", "inverted"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+Places = npt.NDArray[np.intp]
 ReadoutName = Literal["lda", "ridge"]
+Change = tuple[str, npt.NDArray[np.int32], int]
+"""A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
-UNIT = 2.0**BITS
+EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
+LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
+LEAST_RANK = 32
 
 
 @dataclass(frozen=True)
 class Task:
-    """Statistics of one scale made ready to fit: scaled, so that λ means the same for any features.
+    """What a readout is solved from, taken of the statistics at one moment.
 
-    covariance: S_w / N of scaled features, shape (d, d), upper triangle in Fortran's order.
-    means: class means about the mean of all rows, scaled, shape (C, d).
-    center: mean of all rows, shape (d,), and scale: total standard deviation (1 where it is 0), both in codes.
-    shares: p_y, shape (C,). rows: N.
+    scatter: S_w, shape (d, d), upper triangle in Fortran's order. origin: mean of all rows, shape (d,). names: the
+    materials with rows, counts: their rows, shape (C,). reference: the places of the materials that novelty and
+    calibration rest on. means: of the materials at `held`, about the origin, shape (H, d). touches: n.
     """
 
-    covariance: FloatArray
+    scale: Scale
+    scatter: FloatArray
+    origin: FloatArray
+    names: list[str]
+    counts: FloatArray
+    reference: Places
+    held: Places
     means: FloatArray
-    center: FloatArray
-    scale: FloatArray
-    shares: FloatArray
-    rows: int
+    touches: int
 
     @classmethod
-    def of(cls, scatter: FloatArray, counts: IntArray, sums: IntArray) -> Task:
-        """Make the task of a scatter within classes (taken over, see `within_scatter`), n_y and c_y."""
-        total = int(counts.sum())
-        shares = counts / total
-        center, means = centred_means(counts, sums)
-        variance = np.diagonal(scatter) / total + shares @ np.square(means)
-        # Rows of integers that differ at all differ by more than this: below it is only the means' rounding.
-        constant = variance < 0.25 / total
-        scale = np.sqrt(np.where(constant, 1.0, variance))
-        means[:, constant] = 0.0
-        scatter *= (1.0 / (total * scale))[:, None]
-        scatter *= 1.0 / scale
-        return cls(scatter, means / scale, center, scale, shares, total)
+    def of(cls, statistics: Statistics, scale: Scale, reference: Sequence[str]) -> Task:
+        """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
+        names = statistics.names(scale)
+        places = {name: place for place, name in enumerate(names)}
+        own = np.array([places[name] for name in reference if name in places], dtype=np.intp)
+        counts = statistics.counts(scale, names)
+        total = sum(int_sums.sum(axis=0) for _, int_sums in statistics.blocks(scale))
+        origin = (total.astype(np.longdouble) / counts.sum()).astype(np.float64)
+        held = np.arange(len(names)) if len(names) <= EAGER else own
+        means = class_means(statistics, scale, [names[place] for place in held], origin)
+        return cls(
+            scale, statistics.scatter(scale), origin, names, counts.astype(np.float64), own, held, means,
+            statistics.touches,
+        )  # fmt: skip
 
 
-def centred_means(counts: IntArray, sums: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The mean of all rows, shape (d,), and the class means about it, shape (C, d), of n_y and c_y."""
-    # Long double: a class mean keeps the digits that its distance from the centre needs.
-    exact = sums.astype(np.longdouble) / counts[:, None]
-    center = (counts / counts.sum()).astype(np.longdouble) @ exact
-    return center.astype(np.float64), (exact - center).astype(np.float64)
+def class_means(statistics: Statistics, scale: Scale, names: Sequence[str], origin: FloatArray) -> FloatArray:
+    """The means of materials about an origin, shape (C, d), in codes."""
+    # Long double: a class mean keeps the digits that its distance from the origin needs.
+    exact = statistics.sums(scale, names).astype(np.longdouble) / statistics.counts(scale, names)[:, None]
+    return (exact - origin).astype(np.float64)
+
+
+def inverted(system: FloatArray) -> FloatArray:
+    """The inverse of a positive definite system, both upper triangles in Fortran's order; the system is taken over.
+
+    Raises numpy.linalg.LinAlgError where it is not positive definite to working precision.
+    """
+    from scipy.linalg.lapack import dpotrf, dpotri
+
+    factor, failed = dpotrf(system, lower=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError(f"the scatter with its ridge is not positive definite at row {failed}")
+    inverse: FloatArray = dpotri(factor, lower=0, overwrite_c=1)[0]
+    return inverse
+
+
+@lru_cache(maxsize=64)
+def contrasts(count: int) -> FloatArray:
+    """Helmert's orthonormal contrasts of so many rows, shape (count − 1, count): their Gram matrix is the centring."""
+    contrasts = np.zeros((count - 1, count))
+    for i in range(1, count):
+        contrasts[i - 1, :i], contrasts[i - 1, i] = 1.0, -float(i)
+        contrasts[i - 1] /= np.sqrt(i * (i + 1.0))
+    return contrasts
+
+
+def columns_of(rows: FloatArray, way: FloatArray | None) -> FloatArray:
+    """What rows, shape (k, d), add to the scatter: their contrasts, and the way of the class mean where there is one."""
+    own = contrasts(len(rows)) @ rows if len(rows) > 1 else rows[:0]
+    return own if way is None else np.vstack([own, way])
+
+
+class Readout:
+    """The readout of one scale: of a task, and of the touches that came and went since.
+
+    names: the materials, in the order of their places. penalty: P. share: ρ. rows: N. Not for several threads at once.
+
+    Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
+    """
+
+    def __init__(self, task: Task, statistics: Statistics) -> None:
+        self.scale = task.scale
+        self.names = list(task.names)
+        self.places = {name: place for place, name in enumerate(self.names)}
+        self.reference = task.reference
+        self.origin = task.origin
+        self.counts = task.counts
+        self._statistics = statistics
+        dimension = len(task.origin)
+        trace = float(np.trace(task.scatter))
+        self.share = shrinkage(task.scatter, task.touches) if trace > 0 else 0.0
+        # Of single touches there is no scatter: then the nearest mean answers.
+        spread = trace / dimension * self.share / (1 - self.share)
+        self.penalty = spread if trace > 0 else max(float(np.mean(np.square(task.means))), 1.0)
+        system = task.scatter.copy(order="F")
+        system[np.diag_indices(dimension)] += self.penalty
+        room = max(LEAST_RANK, dimension // LARGEST_RANK)
+        with one_thread():
+            self._inverse = inverted(system)
+        self._rank = 0
+        self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
+        self._inner = np.zeros((room, room))  # D + U K⁻¹ Uᵀ
+        self._held: dict[int, int] = {}  # place → row of the next three
+        self._means = np.empty((0, dimension))
+        self._solved = np.empty((0, dimension))  # K⁻¹ m
+        self._crossed = np.empty((room, 0))  # U K⁻¹ m
+        self._hold(task.held, task.means)
+        self._derived: _Derived | None = None
+
+    @property
+    def rows(self) -> float:
+        """N."""
+        return float(self.counts.sum())
+
+    @property
+    def gamma(self) -> float:
+        """γ, by which K⁻¹ becomes Σ⁻¹."""
+        return self.rows / (1 - self.share)
+
+    @property
+    def shares(self) -> FloatArray:
+        """p of the reference materials, shape (R,)."""
+        counts = self.counts[self.reference]
+        return np.asarray(counts / counts.sum())
+
+    def solve(self, rows: FloatArray) -> FloatArray:
+        """K⁻¹ of the task times each of the rows, shape (k, d), not regarding what came since."""
+        from scipy.linalg.blas import dsymm
+
+        with one_thread():
+            solved: FloatArray = dsymm(1.0, self._inverse, rows.T, lower=0).T
+        return solved
+
+    def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
+        """Keep the means of more places, shape (k, d), and what follows from them."""
+        solved = self.solve(means)
+        first = len(self._held)
+        self._held |= {int(place): first + i for i, place in enumerate(places)}
+        self._means, self._solved = np.vstack([self._means, means]), np.vstack([self._solved, solved])
+        crossed = np.zeros((len(self._u), len(means)))
+        crossed[: self._rank] = self._u[: self._rank] @ solved.T
+        self._crossed = np.hstack([self._crossed, crossed])
+        self._derived = None
+
+    def follow(self, changes: Sequence[Change]) -> bool:
+        """Take in touches, in the order they came, that the statistics have already; False where it has to be solved
+        again: they are too many, or a material went.
+        """
+        changes = [change for change in changes if len(change[1])]
+        if self._rank + sum(len(rows) for _, rows, _ in changes) > len(self._u):
+            return False
+        self._hold_before(changes)
+        for material, rows, sign in changes:
+            place = self.places.get(material)
+            before = 0.0 if place is None else self.counts[place]
+            if sign < 0 and before <= len(rows):
+                return False
+            if place is None:
+                place = self.places[material] = len(self.names)
+                if len(self.reference) == place:  # all materials, and this one too
+                    self.reference = np.append(self.reference, place)
+                self.names.append(material)
+                self.counts = np.append(self.counts, 0.0)
+            self._follow(place, rows - self.origin, sign, before)
+        self._derived = None
+        return True
+
+    def _hold_before(self, changes: Sequence[Change]) -> None:
+        """Hold the materials that will change, as they were before."""
+        absent: dict[str, list[Change]] = {}
+        for change in changes:
+            place = self.places.get(change[0])
+            if place is not None and place not in self._held:
+                absent.setdefault(change[0], []).append(change)
+        for name, pending in absent.items():
+            later = sum((sign * rows.sum(axis=0, dtype=np.int64) for _, rows, sign in pending), np.int64(0))
+            total = self._statistics.sums(self.scale, [name])[0] - later
+            mean = total.astype(np.longdouble) / self.counts[self.places[name]] - self.origin
+            self._hold([self.places[name]], mean.astype(np.float64)[None])
+
+    def _follow(self, place: int, rows: FloatArray, sign: int, before: float) -> None:
+        count, mean = len(rows), rows.mean(axis=0)
+        after = before + sign * count
+        if before:
+            held = self._held[place]
+            step = mean - self._means[held]
+            way = np.sqrt(before * count / after) * step
+            new = columns_of(rows, way)
+        else:
+            new = columns_of(rows, None)
+        solved = self.solve(np.vstack([new, mean]))
+        first, last = self._rank, self._rank + len(new)
+        self._u[first:last], self._v[first:last] = new, solved[:-1]
+        cross = self._u[:last] @ solved[:-1].T
+        self._inner[:last, first:last], self._inner[first:last, :last] = cross, cross.T
+        self._inner[range(first, last), range(first, last)] += sign
+        self._rank = last
+        self.counts[place] = after
+        self._crossed[first:last] = new @ self._solved.T
+        if not before:
+            self._hold([place], mean[None])
+            return
+        # The last column is the way of the class mean, so the mean's own solution follows from it.
+        share = sign * count / after
+        self._means[held] += share * step
+        self._solved[held] += share * (solved[-1] - self._solved[held])
+        self._crossed[:last, held] = self._u[:last] @ self._solved[held]
+
+    def derived(self) -> _Derived:
+        """What the answers of this moment need, made again after a change."""
+        if self._derived is None:
+            self._derived = _Derived.of(self)
+        return self._derived
+
+    def sizes_of(self, inner: FloatArray) -> FloatArray:
+        """γ m_yᵀ K⁻¹ m_y of the materials held, shape (H,). inner: E."""
+        crossed = self._crossed[: self._rank]
+        sizes = np.einsum("hd,hd->h", self._means, self._solved) - np.einsum("rh,rh->h", crossed, inner @ crossed)
+        return np.asarray(self.gamma * sizes)
+
+    def products(self, held: Places, inner: FloatArray) -> FloatArray:
+        """γ M K⁻¹ Mᵀ of some of the materials held, about the origin, shape (k, k). inner: E."""
+        crossed = self._crossed[: self._rank, held]
+        products = self._means[held] @ self._solved[held].T - crossed.T @ (inner @ crossed)
+        return np.asarray(self.gamma * (products + products.T) / 2)
+
+    def means_of(self, held: Places) -> tuple[FloatArray, FloatArray]:
+        """The means of some materials held, about the origin, and K⁻¹ of the task times them, shape (k, d)."""
+        return self._means[held], self._solved[held]
+
+    def inner(self) -> FloatArray:
+        """E, shape (r, r)."""
+        return np.asarray(np.linalg.inv(self._inner[: self._rank, : self._rank]))
+
+    def held(self, places: Sequence[int] | Places) -> Places:
+        """Where the materials at some places are held; those that were not are from now on."""
+        absent = [int(place) for place in places if int(place) not in self._held]
+        if absent:
+            names = [self.names[place] for place in absent]
+            self._hold(absent, class_means(self._statistics, self.scale, names, self.origin))
+        return np.array([self._held[int(place)] for place in places], dtype=np.intp)
+
+    def project(self, codes: FloatArray, held: Places) -> FloatArray:
+        """z of codes of shape (d,) for materials that are `held`, about the origin, shape (k,)."""
+        row = codes - self.origin
+        z = self._solved[held] @ row
+        if self._rank:
+            z -= (self.derived().inner @ (self._v[: self._rank] @ row)) @ self._crossed[: self._rank, held]
+        return np.asarray(self.gamma * z)
+
+    def scores(self, codes: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
+        """The scores of the materials at some places for codes of shape (d,), shape (k,)."""
+        if kind == "ridge":
+            derived = self.derived()
+            scores = self.shares + derived.background @ self.centred(codes)
+            rank = {int(place): i for i, place in enumerate(self.reference)}
+            return np.asarray(scores[[rank[int(place)] for place in places]])
+        held = self.held(places)
+        return np.asarray(self.project(codes, held) - self.derived().sizes[held] / 2)
+
+    def centred(self, codes: FloatArray) -> FloatArray:
+        """z of the reference materials about their mean, shape (R,)."""
+        derived = self.derived()
+        z = self.project(codes, derived.reference)
+        return np.asarray(z - self.shares @ z - derived.towards)
+
+    def novelty(self, codes: FloatArray, places: Sequence[int] | Places) -> float:
+        """Relative Mahalanobis distance of codes (d,); the materials at `places` are those that may be the nearest."""
+        derived, held = self.derived(), self.held(places)
+        derived = self.derived()
+        z = self.project(codes, np.concatenate([derived.reference, held]))
+        about, own = z[: len(derived.reference)], z[len(derived.reference) :]
+        centre = self.shares @ about
+        nearest = float((own - derived.sizes[held] / 2).max())
+        z = about - centre - derived.towards
+        return float(-2.0 * nearest + 2.0 * centre - derived.size + z @ derived.background @ z)
 
 
 @dataclass(frozen=True)
-class Readout:
-    """A classifier of one scale.
+class _Derived:
+    """What follows from a readout at one moment.
 
-    penalty: λ, as a share of a scaled feature's variance.
-    center: mean of all rows, in codes, shape (d,).
-    weights: W in codes, shape (d, C); z = (x − center) @ weights for codes x.
-    gram: G, shape (C, C). ridge: H, shape (C, C). shares: p_y, shape (C,).
-    penalties: N λ v, v the features' variances, in codes², shape (d,): what is added to S_w to solve for W.
+    inner: E. sizes: g of the materials held, shape (H,). reference: where the reference materials are held. gram: their
+    G, about their mean, shape (R, R). background: H. towards: what is taken off z beside its mean to bring it about
+    the mean of the reference materials, shape (R,). size: γ μᵀ K⁻¹ μ of that mean.
     """
 
-    penalty: float
-    center: FloatArray
-    weights: FloatArray
+    inner: FloatArray
+    sizes: FloatArray
+    reference: Places
     gram: FloatArray
-    ridge: FloatArray
-    shares: FloatArray
-    penalties: FloatArray
+    background: FloatArray
+    towards: FloatArray
+    size: float
 
     @classmethod
-    def of(cls, task: Task, penalty: float, solved: FloatArray) -> Readout:
-        """The readout of a task, from Σ⁻¹ Mᵀ of its scaled features, shape (d, C)."""
-        gram = task.means @ solved
-        gram = (gram + gram.T) / 2
-        ridge = np.linalg.inv(np.diag(1.0 / task.shares) + gram)
-        penalties = task.rows * penalty * np.square(task.scale)
-        weights = solved / task.scale[:, None]
-        return cls(penalty, task.center, weights, gram, (ridge + ridge.T) / 2, task.shares, penalties)
-
-    def project(self, codes: npt.NDArray[np.floating]) -> FloatArray:
-        """z of codes of shape (…, d), shape (…, C): all that any answer needs."""
-        z: FloatArray = (codes - self.center) @ self.weights
-        return z
-
-    def scores(self, z: FloatArray, kind: ReadoutName) -> FloatArray:
-        """The scores of the classes, shape (…, C)."""
-        if kind == "lda":
-            lda: FloatArray = z - np.diagonal(self.gram) / 2
-            return lda
-        ridge: FloatArray = self.shares + z @ self.ridge
-        return ridge
-
-    def novelty(self, z: FloatArray, candidates: npt.NDArray[np.intp] | None = None) -> FloatArray:
-        """Relative Mahalanobis distance, shape (…,); `candidates` are the classes that may be the nearest."""
-        scores = self.scores(z, "lda")
-        nearest = scores.max(axis=-1) if candidates is None else scores[..., candidates].max(axis=-1)
-        distance: FloatArray = -2.0 * nearest + np.einsum("...i,ij,...j->...", z, self.ridge, z)
-        return distance
-
-
-def fit_readout(task: Task, penalty: float) -> Readout:
-    """Fit a readout with λ = penalty > 0; the task is left as it was.
-
-    Raises numpy.linalg.LinAlgError where Σ is not positive definite to working precision: λ is too small.
-    """
-    from scipy.linalg.lapack import dpotrf, dpotrs
-
-    system = task.covariance.copy(order="F")
-    system[np.diag_indices_from(system)] += penalty
-    with one_thread():
-        factor, failed = dpotrf(system, lower=0, overwrite_a=1)
-        require_definite(penalty, failed)
-        solved, _ = dpotrs(factor, task.means.T, lower=0)
-        return Readout.of(task, penalty, solved)
-
-
-def require_definite(penalty: float, failed: int) -> None:
-    """Raise numpy.linalg.LinAlgError where a factorisation says at which row Σ + λ I failed; 0 where it did not."""
-    if failed:
-        raise np.linalg.LinAlgError(
-            f"the covariance with λ = {penalty:g} is not positive definite at row {failed}: λ is too small"
-        )
+    def of(cls, readout: Readout) -> _Derived:
+        reference, shares = readout.held(readout.reference), readout.shares
+        with one_thread():
+            inner = readout.inner()
+            gram = readout.products(reference, inner)
+            onto = gram @ shares
+            size = float(shares @ onto)
+            gram = gram - onto[:, None] - onto + size
+            background = np.linalg.inv(np.diag(1.0 / ((1 - readout.share) * shares)) + gram)
+            sizes = readout.sizes_of(inner)
+        return cls(inner, sizes, reference, gram, (background + background.T) / 2, onto - size, size)

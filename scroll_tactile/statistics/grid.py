@@ -34,7 +34,7 @@ def in_units(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
     return scaled
 
 
-def mean_code(total: npt.NDArray[np.integer], rows: int) -> npt.NDArray[np.int64]:
-    """Σ x / n rounded to integers (halves upward), the same on every machine; total: Σ x, any shape; rows: n."""
+def mean_code(total: npt.NDArray[np.integer], rows: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Σ x / n rounded to integers (halves upward), the same on every machine; total: Σ x, any shape; rows: n > 0."""
     whole: npt.NDArray[np.int64] = total.astype(np.int64)
     return (2 * whole + rows) // (2 * rows)

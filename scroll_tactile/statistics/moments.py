@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
 from scroll_tactile.errors import CapacityError
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.grid import BITS, mean_code
 
 __all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "require_room", "within_scatter"]
 
@@ -130,32 +130,32 @@ def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) 
         put(piece, np.take(flat, lower[first : first + PIECE]).astype(np.int64), out=piece)
 
 
-def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+def within_scatter(packed: IntArray, classes: Iterable[tuple[IntArray, IntArray]], dimension: int) -> FloatArray:
     """S_w = A − Σ_y c_y c_yᵀ / n_y, shape (d, d), in units of codes²: the upper triangle, in Fortran's order.
 
-    What stands below the diagonal means nothing. packed: A as in SecondMoment; counts: n_y, shape (C,); sums: c_y,
-    shape (C, d). With m_y the integer next to c_y / n_y and r_y = c_y − n_y m_y, c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ +
-    r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is rounded is the scatter itself, whatever the
-    distance of the means from zero. Classes of no rows are left out.
+    What stands below the diagonal means nothing. packed: A as in SecondMoment. classes: blocks of at most 1024 classes
+    with rows: n_y, shape (B,), and c_y, shape (B, d). With m_y the integer next to c_y / n_y and r_y = c_y − n_y m_y,
+    c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ + r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is
+    rounded is the scatter itself, whatever the distance of the means from zero.
     """
-    present = counts > 0
-    counts, sums = counts[present], sums[present]
-    dimension = sums.shape[1]
-    means = (2 * sums + counts[:, None]) // (2 * counts[:, None])
-    rests = sums - counts[:, None] * means
     # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
     centred = np.zeros((dimension, dimension), dtype=np.int64)
     centred.reshape(-1)[_lower(dimension)] = packed
+    rounded = np.zeros((dimension, dimension))
     with one_thread():
-        for first in range(0, len(counts), 1024):  # so many products of two limbs stay below 2⁵³
-            block = slice(first, first + 1024)
-            high = sums[block] >> LIMB
-            low = sums[block] - (high << LIMB)
-            mean, rest = means[block].astype(np.float64), rests[block].astype(np.float64)
-            product = (high.astype(np.float64).T @ mean).astype(np.int64)
-            product <<= LIMB
-            centred -= product
+        for counts, sums in classes:  # the products of 1024 classes in two limbs stay below 2⁵³
+            means = mean_code(sums, counts[:, None])
+            rests = sums - counts[:, None] * means
+            high = sums >> LIMB
+            low = sums - (high << LIMB)
+            mean, rest = means.astype(np.float64), rests.astype(np.float64)
+            if high.any():
+                product = (high.astype(np.float64).T @ mean).astype(np.int64)
+                product <<= LIMB
+                centred -= product
             centred -= (low.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
-        scaled = rests / np.sqrt(np.maximum(counts, 1))[:, None]
-        scatter = centred - scaled.T @ scaled
-    return scatter.T
+            rest /= np.sqrt(counts)[:, None]
+            rounded += rest.T @ rest
+    rounded *= -1.0
+    rounded += centred
+    return rounded.T

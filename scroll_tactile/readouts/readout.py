@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.moments import one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task", "columns_of", "contrasts", "inverted"]
@@ -47,25 +47,23 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
 LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
+FEW = 8  # rows that are solved for one by one: half of the time of a product of matrices
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a readout is solved from, taken of the statistics at one moment.
+    """What a readout is solved from, copied from the statistics at one moment, so that solving waits for nobody.
 
-    scatter: S_w, shape (d, d), upper triangle in Fortran's order. origin: mean of all rows, shape (d,). names: the
-    materials with rows, counts: their rows, shape (C,). reference: the places of the materials that novelty and
-    calibration rest on. means: of the materials at `held`, about the origin, shape (H, d). touches: n.
+    packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
+    shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
     """
 
     scale: Scale
-    scatter: FloatArray
-    origin: FloatArray
+    packed: IntArray
     names: list[str]
-    counts: FloatArray
+    counts: IntArray
+    sums: IntArray
     reference: Places
-    held: Places
-    means: FloatArray
     touches: int
 
     @classmethod
@@ -74,22 +72,24 @@ class Task:
         names = statistics.names(scale)
         places = {name: place for place, name in enumerate(names)}
         own = np.array([places[name] for name in reference if name in places], dtype=np.intp)
-        counts = statistics.counts(scale, names)
-        total = sum(int_sums.sum(axis=0) for _, int_sums in statistics.blocks(scale))
-        origin = (total.astype(np.longdouble) / counts.sum()).astype(np.float64)
-        held = np.arange(len(names)) if len(names) <= EAGER else own
-        means = class_means(statistics, scale, [names[place] for place in held], origin)
-        return cls(
-            scale, statistics.scatter(scale), origin, names, counts.astype(np.float64), own, held, means,
-            statistics.touches,
-        )  # fmt: skip
+        packed, (counts, sums) = statistics.second(scale).packed().copy(), statistics.totals(scale)
+        return cls(scale, packed, names, counts, sums, own, statistics.touches)
+
+    @cached_property
+    def scatter(self) -> FloatArray:
+        """S_w, shape (d, d), upper triangle in Fortran's order."""
+        return within_scatter(self.packed, self.counts, self.sums)
+
+    @property
+    def origin(self) -> FloatArray:
+        """The mean of all rows, shape (d,)."""
+        return np.asarray((self.sums.sum(axis=0).astype(np.longdouble) / self.counts.sum()).astype(np.float64))
 
 
-def class_means(statistics: Statistics, scale: Scale, names: Sequence[str], origin: FloatArray) -> FloatArray:
+def class_means(counts: IntArray, sums: IntArray, origin: FloatArray) -> FloatArray:
     """The means of materials about an origin, shape (C, d), in codes."""
     # Long double: a class mean keeps the digits that its distance from the origin needs.
-    exact = statistics.sums(scale, names).astype(np.longdouble) / statistics.counts(scale, names)[:, None]
-    return (exact - origin).astype(np.float64)
+    return (sums.astype(np.longdouble) / counts[:, None] - origin).astype(np.float64)
 
 
 def inverted(system: FloatArray) -> FloatArray:
@@ -136,28 +136,30 @@ class Readout:
         self.places = {name: place for place, name in enumerate(self.names)}
         self.reference = task.reference
         self.origin = task.origin
-        self.counts = task.counts
+        self.counts = task.counts.astype(np.float64)
         self._statistics = statistics
-        dimension = len(task.origin)
-        trace = float(np.trace(task.scatter))
-        self.share = shrinkage(task.scatter, task.touches) if trace > 0 else 0.0
+        dimension = len(self.origin)
+        held = np.arange(len(self.names)) if len(self.names) <= EAGER else task.reference
+        means = class_means(task.counts[held], task.sums[held], self.origin)
+        scatter = task.scatter.copy(order="F")
+        trace = float(np.trace(scatter))
+        self.share = shrinkage(scatter, task.touches) if trace > 0 else 0.0
         # Of single touches there is no scatter: then the nearest mean answers.
         spread = trace / dimension * self.share / (1 - self.share)
-        self.penalty = spread if trace > 0 else max(float(np.mean(np.square(task.means))), 1.0)
-        system = task.scatter.copy(order="F")
-        system[np.diag_indices(dimension)] += self.penalty
+        self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
+        scatter[np.diag_indices(dimension)] += self.penalty
         room = max(LEAST_RANK, dimension // LARGEST_RANK)
-        with one_thread():
-            self._inverse = inverted(system)
         self._rank = 0
         self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
-        self._inner = np.zeros((room, room))  # D + U K⁻¹ Uᵀ
+        self._inner = np.empty((room, room))  # E
         self._held: dict[int, int] = {}  # place → row of the next three
         self._means = np.empty((0, dimension))
         self._solved = np.empty((0, dimension))  # K⁻¹ m
         self._crossed = np.empty((room, 0))  # U K⁻¹ m
-        self._hold(task.held, task.means)
         self._derived: _Derived | None = None
+        with one_thread():
+            self._inverse = inverted(scatter)
+            self._hold(held, means)
 
     @property
     def rows(self) -> float:
@@ -176,11 +178,15 @@ class Readout:
         return np.asarray(counts / counts.sum())
 
     def solve(self, rows: FloatArray) -> FloatArray:
-        """K⁻¹ of the task times each of the rows, shape (k, d), not regarding what came since."""
-        from scipy.linalg.blas import dsymm
+        """K⁻¹ of the task times each of the rows, shape (k, d), not regarding what came since.
 
-        with one_thread():
-            solved: FloatArray = dsymm(1.0, self._inverse, rows.T, lower=0).T
+        Whoever calls has BLAS on one thread.
+        """
+        from scipy.linalg.blas import dsymm, dsymv
+
+        if 0 < len(rows) <= FEW:
+            return np.stack([dsymv(1.0, self._inverse, row, lower=0) for row in rows])
+        solved: FloatArray = dsymm(1.0, self._inverse, rows.T, lower=0).T
         return solved
 
     def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
@@ -201,21 +207,26 @@ class Readout:
         changes = [change for change in changes if len(change[1])]
         if self._rank + sum(len(rows) for _, rows, _ in changes) > len(self._u):
             return False
-        self._hold_before(changes)
-        for material, rows, sign in changes:
-            place = self.places.get(material)
-            before = 0.0 if place is None else self.counts[place]
-            if sign < 0 and before <= len(rows):
-                return False
-            if place is None:
-                place = self.places[material] = len(self.names)
-                if len(self.reference) == place:  # all materials, and this one too
-                    self.reference = np.append(self.reference, place)
-                self.names.append(material)
-                self.counts = np.append(self.counts, 0.0)
-            self._follow(place, rows - self.origin, sign, before)
+        with one_thread():
+            self._hold_before(changes)
+            for material, rows, sign in changes:
+                place = self.places.get(material)
+                before = 0.0 if place is None else self.counts[place]
+                if sign < 0 and before <= len(rows):
+                    return False
+                if place is None:
+                    place = self._new_place(material)
+                self._follow(place, rows - self.origin, sign, before)
         self._derived = None
         return True
+
+    def _new_place(self, material: str) -> int:
+        place = self.places[material] = len(self.names)
+        if len(self.reference) == place:  # all materials, and this one too
+            self.reference = np.append(self.reference, place)
+        self.names.append(material)
+        self.counts = np.append(self.counts, 0.0)
+        return place
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
@@ -236,17 +247,14 @@ class Readout:
         if before:
             held = self._held[place]
             step = mean - self._means[held]
-            way = np.sqrt(before * count / after) * step
-            new = columns_of(rows, way)
+            stretch = np.sqrt(before * count / after)
+            new = columns_of(rows, stretch * step)
         else:
             new = columns_of(rows, None)
-        solved = self.solve(np.vstack([new, mean]))
+        solved = self.solve(new) if len(new) else new
         first, last = self._rank, self._rank + len(new)
-        self._u[first:last], self._v[first:last] = new, solved[:-1]
-        cross = self._u[:last] @ solved[:-1].T
-        self._inner[:last, first:last], self._inner[first:last, :last] = cross, cross.T
-        self._inner[range(first, last), range(first, last)] += sign
-        self._rank = last
+        self._u[first:last], self._v[first:last] = new, solved
+        self._border(self._u[:last] @ solved.T, sign)
         self.counts[place] = after
         self._crossed[first:last] = new @ self._solved.T
         if not before:
@@ -255,8 +263,21 @@ class Readout:
         # The last column is the way of the class mean, so the mean's own solution follows from it.
         share = sign * count / after
         self._means[held] += share * step
-        self._solved[held] += share * (solved[-1] - self._solved[held])
+        self._solved[held] += share / stretch * solved[-1]
         self._crossed[:last, held] = self._u[:last] @ self._solved[held]
+
+    def _border(self, cross: FloatArray, sign: int) -> None:
+        """Border E, the inverse of D + U K⁻¹ Uᵀ, by the last columns of that matrix without D, shape (r + k, k)."""
+        first, last = self._rank, len(cross)
+        inner, above = self._inner[:first, :first], cross[:first]
+        onto = inner @ above
+        corner = np.linalg.inv(cross[first:] + sign * np.eye(last - first) - above.T @ onto)
+        corner = (corner + corner.T) / 2
+        beside = -onto @ corner
+        inner -= beside @ onto.T
+        self._inner[:first, first:last], self._inner[first:last, :first] = beside, beside.T
+        self._inner[first:last, first:last] = corner
+        self._rank = last
 
     def derived(self) -> _Derived:
         """What the answers of this moment need, made again after a change."""
@@ -281,15 +302,17 @@ class Readout:
         return self._means[held], self._solved[held]
 
     def inner(self) -> FloatArray:
-        """E, shape (r, r)."""
-        return np.asarray(np.linalg.inv(self._inner[: self._rank, : self._rank]))
+        """E, shape (r, r): a view, until the next change."""
+        return self._inner[: self._rank, : self._rank]
 
     def held(self, places: Sequence[int] | Places) -> Places:
         """Where the materials at some places are held; those that were not are from now on."""
         absent = [int(place) for place in places if int(place) not in self._held]
         if absent:
             names = [self.names[place] for place in absent]
-            self._hold(absent, class_means(self._statistics, self.scale, names, self.origin))
+            counts, sums = self._statistics.counts(self.scale, names), self._statistics.sums(self.scale, names)
+            with one_thread():
+                self._hold(absent, class_means(counts, sums, self.origin))
         return np.array([self._held[int(place)] for place in places], dtype=np.intp)
 
     def project(self, codes: FloatArray, held: Places) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -130,31 +130,32 @@ def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) 
         put(piece, np.take(flat, lower[first : first + PIECE]).astype(np.int64), out=piece)
 
 
-def within_scatter(packed: IntArray, classes: Iterable[tuple[IntArray, IntArray]], dimension: int) -> FloatArray:
+def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
     """S_w = A − Σ_y c_y c_yᵀ / n_y, shape (d, d), in units of codes²: the upper triangle, in Fortran's order.
 
-    What stands below the diagonal means nothing. packed: A as in SecondMoment. classes: blocks of at most 1024 classes
-    with rows: n_y, shape (B,), and c_y, shape (B, d). With m_y the integer next to c_y / n_y and r_y = c_y − n_y m_y,
+    What stands below the diagonal means nothing. packed: A as in SecondMoment; counts: n_y > 0, shape (C,); sums: c_y,
+    shape (C, d). With m_y the integer next to c_y / n_y and r_y = c_y − n_y m_y,
     c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ + r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is
     rounded is the scatter itself, whatever the distance of the means from zero.
     """
     # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
+    dimension = sums.shape[1]
     centred = np.zeros((dimension, dimension), dtype=np.int64)
     centred.reshape(-1)[_lower(dimension)] = packed
     rounded = np.zeros((dimension, dimension))
     with one_thread():
-        for counts, sums in classes:  # the products of 1024 classes in two limbs stay below 2⁵³
-            means = mean_code(sums, counts[:, None])
-            rests = sums - counts[:, None] * means
-            high = sums >> LIMB
-            low = sums - (high << LIMB)
-            mean, rest = means.astype(np.float64), rests.astype(np.float64)
+        for first in range(0, len(counts), 1024):  # the products of so many in two limbs stay below 2⁵³
+            rows, total = counts[first : first + 1024, None], sums[first : first + 1024]
+            means = mean_code(total, rows)
+            high = total >> LIMB
+            low = total - (high << LIMB)
+            mean, rest = means.astype(np.float64), (total - rows * means).astype(np.float64)
             if high.any():
                 product = (high.astype(np.float64).T @ mean).astype(np.int64)
                 product <<= LIMB
                 centred -= product
             centred -= (low.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
-            rest /= np.sqrt(counts)[:, None]
+            rest /= np.sqrt(rows)
             rounded += rest.T @ rest
     rounded *= -1.0
     rounded += centred

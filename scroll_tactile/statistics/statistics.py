@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import SecondMoment, require_room, within_scatter
+from scroll_tactile.statistics.moments import SecondMoment, require_room
 
 __all__ = ["Statistics"]
 
@@ -124,16 +124,10 @@ class Statistics:
         """Sums of codes of each material, shape (C, d)."""
         return self._sums[scale][[self._places[name] for name in names]]
 
-    def blocks(self, scale: Scale) -> Iterator[tuple[IntArray, IntArray]]:
-        """Rows, shape (B,), and sums of codes, shape (B, d), of `names(scale)`, at most 1024 at a time."""
+    def totals(self, scale: Scale) -> tuple[IntArray, IntArray]:
+        """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`."""
         names = self.names(scale)
-        for first in range(0, len(names), 1024):
-            block = names[first : first + 1024]
-            yield self.counts(scale, block), self.sums(scale, block)
-
-    def scatter(self, scale: Scale) -> npt.NDArray[np.float64]:
-        """The scatter within materials, S_w, as `within_scatter` gives it."""
-        return within_scatter(self._seconds[scale].packed(), self.blocks(scale), self.dimension)
+        return self.counts(scale, names), self.sums(scale, names)
 
     def second(self, scale: Scale) -> SecondMoment:
         """The second moment of a scale, over all materials."""

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
+import numpy as np
+
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
@@ -336,7 +338,7 @@ class TactileLearner:
             with self._ledger.lock:
                 model, filling = self._current.present(self._ledger), self._current.filling(self._ledger)
                 version, reader = self._ledger.version, self._reader() if tuned else None
-                candidates = candidates_of(scene, model.names)
+                candidates = candidates_of(scene, model.names, model.known)
             if not candidates:
                 return version, lambda: Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
             encoded = self._extractor.encode(touch, model, filling, lambda columns: model.needed(candidates, columns))
@@ -416,8 +418,8 @@ class TactileLearner:
         self, model: Model, candidates: Sequence[str], encoded: Encoded, logits: Mapping[str, float] | None
     ) -> Prediction:
         judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
-        chances = zip(candidates, judgement.probability.tolist(), strict=True)
-        ranking = sorted(chances, key=lambda entry: (-entry[1], entry[0]))
+        order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
+        ranking = list(zip(map(candidates.__getitem__, order), judgement.probability[order].tolist(), strict=True))
         known = bool(judgement.novelty <= judgement.calibration.threshold(self._settings.false_alarms))
         tuned = logits is not None
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, encoded.seconds, tuned=tuned)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -64,8 +65,10 @@ def require_name(material: str) -> None:
         raise MaterialError(f"expected a name of printable characters; came {material!r}")
 
 
-def candidates_of(scene: Sequence[str] | None, names: list[str]) -> list[str]:
+def candidates_of(scene: Sequence[str] | None, names: list[str], known: AbstractSet[str]) -> list[str]:
     """The materials of a scene, in alphabetical order; all that were observed where it is None.
+
+    names: all, in that order. known: the same.
 
     Raises InputError for an empty one, UnknownMaterialError for one that names what was never observed.
     """
@@ -76,11 +79,10 @@ def candidates_of(scene: Sequence[str] | None, names: list[str]) -> list[str]:
     wanted = list(dict.fromkeys(scene))
     if not wanted:
         raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
-    observed = set(names)
-    missing = [name for name in wanted if name not in observed]
+    missing = [name for name in wanted if name not in known]
     if missing:
         raise UnknownMaterialError(
-            f"the scene names {missing}, which were never observed; observed were "
+            f"the scene names {missing[:30]}, which were never observed; observed were "
             f"{names if len(names) <= 30 else len(names)}"
         )
     return sorted(wanted)

@@ -2,9 +2,9 @@
 
 A touch may be of a material that was observed: then its composition is that material's, weighed by the probabilities
 of the materials. Or it is of one never observed: then the heads answer, ridge regressions over the materials. The
-novelty tells the two apart. All are measured on the sampled touches, each scored by readouts that never observed it, and
-by heads that never observed its material. All of it is a function of the statistics, the sample and the
-descriptions: a material described after it was touched gives the same as one described before, to the bit.
+novelty tells the two apart. All are measured on the sampled touches, each scored by readouts that never observed it,
+and by heads that never observed its material. A material described after it was touched gives the same as one described
+before, to the bit.
 """
 
 from __future__ import annotations
@@ -71,9 +71,7 @@ class Composer:
         stage = self._stage(encoded.columns)
         heads, scales, calibration = self.stages[stage], self.model.stages[stage], self.model.calibrations[stage]
         z = combined(self.model, stage, self.spaces[stage].names, encoded.means)
-        readouts = {scale: self.model.readouts[scale] for scale in scales}
-        distances = [readout.novelty(encoded.means[scale], range(len(readout.names))) for scale, readout in readouts.items()]
-        new = float(heads.novel(calibration.novelty(np.array(distances))))
+        new = float(heads.novel(self.model.novelty(scales, calibration, encoded.means, self.model.names)))
         # Bayes: the curve is that of as many new touches as known ones.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected

@@ -1,14 +1,15 @@
 """The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
 
-Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is fitted,
-the shrinkage and the calibration, follows when the memory has grown by an eighth: a sixteenth earlier a thread begins to
-fit it, to the integers. When which of them answers depends on the calls that came and not on how fast that thread is,
-so the same calls give the same answers.
+Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is
+fitted, the shrinkage and the calibration, follows when the memory has grown by an eighth: a sixteenth earlier a thread
+begins to fit it, to the integers. When which of them answers depends on the calls that came and not on how fast that
+thread is, so the same calls give the same answers.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import cast
 
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
@@ -49,13 +50,14 @@ class CurrentModel:
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
         self._take_in(ledger)
         model, behind = self._model, self._behind
-        if model is None or behind is None or self._overdue(model, memory):
-            model = self._adopted(memory)
-        elif behind:
+        if model is None or behind != []:
+            self._model = None  # until it is whole again: Ctrl-C may come at any point
             self._exact = False
-            if not model.follow(memory, behind):
+            followed = model is not None and behind is not None and not self._overdue(model, memory)
+            if not followed or not cast(Model, model).follow(memory, cast("list[Added]", behind)):
                 model = self._adopted(memory)
-        self._model, self._behind = model, []
+            self._model, self._behind = model, []
+        assert model is not None
         self.prepare(ledger)
         return model
 
@@ -75,7 +77,7 @@ class CurrentModel:
         memory = ledger.memory
         self._take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
-            self._coming = None
+            self._model, self._coming = None, None
             self._model, self._behind = self._fitted(memory), []
         return self._model
 

@@ -57,7 +57,7 @@ class Filling:
         lower = np.tril_indices(channels)
         second = np.zeros((channels, channels))
         # The triangle is packed row by row: the channels' rows are its beginning.
-        second[lower] = statistics.total_second(CHANNELS)[: len(lower[0])] / rows
+        second[lower] = statistics.second(CHANNELS).packed()[: len(lower[0])] / rows
         second += np.tril(second, -1).T
         mean = sums.sum(axis=0)[:channels] / rows
         unit = float(in_units(np.ones(1), bound)[0])  # a reading of 1, in codes

@@ -1,4 +1,4 @@
-"""The model: everything that predictions need of a memory, fitted to it and nothing else, and followed as it changes."""
+"""The model: everything that predictions need of a memory, fitted to it alone, and followed as it changes."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["Draft", "Judgement", "Model"]
 
 FloatArray = npt.NDArray[np.float64]
+
+NEGLIGIBLE = 40.0  # of a logit: ten thousand materials so far behind have 4e-14 of the probability together
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Draft:
         statistics, sample = memory.statistics, list(memory.sample)
         names = list(statistics.materials)
         if kind == "ridge" and len(names) > EAGER:
-            raise InputError(f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"')
+            raise InputError(f'readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"')
         # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if scale != CHANNELS and statistics.second(scale).rows]
@@ -82,7 +84,7 @@ class Draft:
 class Model:
     """Everything that predictions need of one state of a memory.
 
-    names: the materials. stages: for each, the scales that judge there; those of NOISE come last where noise is read.
+    names: the materials, in alphabetical order; known: the same. stages: for each, the scales that judge there.
     readouts: scale → its readout. calibrations: of the stages, as far as any touch reached them. apart: scale → the
     sampled touches left out. longest: the columns of the longest touch that was learned. noisy: the calibration of
     touches observed through noise; None where none were learned. fitted_to: the touches that it was fitted to.
@@ -98,7 +100,9 @@ class Model:
         self.kind: ReadoutName = draft.kind
         self.plan: WindowPlan = draft.memory.plan
         self.names, self.longest, self.fitted_to = draft.names, draft.longest, draft.touches
+        self.known = frozenset(self.names)
         self.readouts, self.apart = readouts, apart
+        self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
         self.materials = [material for material, *_ in draft.sample]
         learned = self.plan.noisy and all(scale in readouts for scale in NOISE)
         self.noisy = calibrations.pop() if learned else None
@@ -117,6 +121,8 @@ class Model:
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
                 return False
         self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
+        self.known = frozenset(self.names)
+        self._of_all = {}
         return True
 
     def is_last(self, columns: int) -> bool:
@@ -148,24 +154,24 @@ class Model:
         if noisy:
             assert self.noisy is not None
             chances = _chances(self._weighted(NOISE, self.noisy, means, candidates))
-            return Judgement(chances, self._novelty(NOISE, self.noisy, means, candidates), self.noisy)
+            return Judgement(chances, self.novelty(NOISE, self.noisy, means, candidates), self.noisy)
         decided = self._decided(candidates, len(self.plan.stages(columns)))
         probability, mass = np.ones(len(candidates)), 1.0
         for i, (stage, members) in enumerate(decided):
-            names = [candidates[place] for place in members]
+            names = candidates if len(members) == len(candidates) else [candidates[place] for place in members]
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
                 logits = self._weighted(self.stages[stage], self.calibrations[stage], means, names)
-            probability[members] = _chances(logits) * mass
-            later = decided[i + 1][1] if i + 1 < len(decided) else []
+            probability[np.asarray(members)] = _chances(logits) * mass
+            later = np.asarray(decided[i + 1][1] if i + 1 < len(decided) else [], dtype=np.intp)
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
         stage = max(stage for stage, members in decided if best in members)
         calibration = self.calibrations[stage]
-        return Judgement(probability, self._novelty(self.stages[stage], calibration, means, candidates), calibration)
+        return Judgement(probability, self.novelty(self.stages[stage], calibration, means, candidates), calibration)
 
-    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
+    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
         groups = [
             self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]
@@ -176,29 +182,47 @@ class Model:
             if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
         ]
 
-    def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> list[int]:
+    def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> Sequence[int]:
         """The places of the candidates that were observed at all of these scales."""
         known = [self.readouts[scale].places for scale in scales]
+        if all(len(places) == len(self.names) for places in known):
+            return range(len(candidates))
         return [i for i, name in enumerate(candidates) if all(name in places for places in known)]
+
+    def _places(self, scale: Scale, names: Sequence[str]) -> npt.NDArray[np.intp]:
+        """The places of those materials that a scale knows."""
+        places = self.readouts[scale].places
+        if names is not self.names:
+            return np.array([places[name] for name in names if name in places], dtype=np.intp)
+        if scale not in self._of_all:
+            self._of_all[scale] = self._places(scale, list(names))
+        return self._of_all[scale]
 
     def _weighted(
         self, scales: Sequence[Scale], calibration: Calibration, means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
-        logits = np.zeros(len(names))
-        for scale, weight in zip(scales, calibration.weights, strict=True):
-            readout = self.readouts[scale]
-            logits += weight * readout.scores(means[scale], [readout.places[name] for name in names], self.kind)
+        weighed = list(zip(scales, calibration.weights, strict=True))
+        places = {scale: self._places(scale, names) for scale in scales}
+        chosen, logits = np.arange(len(names)), np.zeros(len(names))
+        if len(names) > EAGER:
+            bounds = np.zeros(len(names))
+            for scale, weight in weighed:
+                scores, errors = self.readouts[scale].coarse(means[scale])
+                logits += weight * scores[places[scale]]
+                bounds += weight * errors[places[scale]]
+            # What is left out comes to less than a rounding of the answer's probability.
+            chosen = np.flatnonzero(logits + bounds >= (logits - bounds).max() - NEGLIGIBLE)
+            chosen = chosen[np.argsort(-logits[chosen], kind="stable")[:EAGER]]
+            logits[chosen] = 0.0
+        for scale, weight in weighed:
+            logits[chosen] += weight * self.readouts[scale].scores(means[scale], places[scale][chosen], self.kind)
         return logits
 
-    def _novelty(
+    def novelty(
         self, scales: Sequence[Scale], calibration: Calibration, means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> float:
-        distances = []
-        for scale in scales:
-            readout = self.readouts[scale]
-            distances.append(
-                readout.novelty(means[scale], [readout.places[name] for name in names if name in readout.places])
-            )
+        """The standardised novelty of a touch at some scales, if it is one of these materials that it may be."""
+        distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
         return float(calibration.novelty(np.array(distances)))
 
 

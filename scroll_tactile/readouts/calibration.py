@@ -1,7 +1,8 @@
 """Calibration: from scores to probabilities, and from distances to "never observed", by touches left out.
 
 Each sampled touch is scored by readouts that never observed it (`leave_one_out`). On these scores s one weight w_k a
-scale is fitted, which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706.04599):
+scale is fitted, which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017,
+arXiv 1706.04599):
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
@@ -18,10 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
+from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled, left_out
 from scroll_tactile.readouts.readout import Readout, ReadoutName, Task
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.sample import TouchSample
 
 __all__ = [
     "FEWEST",
@@ -75,9 +75,12 @@ UNMEASURED = 5.0  # spreads: where too little could be left out to measure the d
 
 
 def calibrate(
-    sample: TouchSample, stages: Sequence[Sequence[Scale]], tasks: Mapping[Scale, Task], readouts: Mapping[Scale, Readout],
+    sample: Sampled,
+    stages: Sequence[Sequence[Scale]],
+    tasks: Mapping[Scale, Task],
+    readouts: Mapping[Scale, Readout],
     kind: ReadoutName,
-) -> tuple[list[Calibration], dict[Scale, LeftOut]]:  # fmt: skip
+) -> tuple[list[Calibration], dict[Scale, LeftOut]]:
     """Calibrate every stage, given as the scales that judge there, of which all have a readout.
 
     tasks: what the readouts were just made of. Also returns what each scale says of the touches left out.
@@ -85,25 +88,31 @@ def calibrate(
     apart = {scale: left_out(readouts[scale], tasks[scale], sample, stages, kind) for scale in readouts}
     materials = [material for material, *_ in sample]
     return [
-        calibrate_stage(stage, materials, [readouts[scale] for scale in scales], [apart[scale] for scale in scales], kind)
+        calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
         for stage, scales in enumerate(stages)
         if all(scale in readouts for scale in scales)
     ], apart
 
 
 def calibrate_stage(
-    stage: int, materials: Sequence[str], readouts: Sequence[Readout], apart: Sequence[LeftOut], kind: ReadoutName
+    stage: int, materials: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kind: ReadoutName
 ) -> Calibration:
-    """Calibrate one stage. materials: of the sampled touches. readouts, apart: of the scales that judge, ascending."""
+    """Calibrate one stage.
+
+    materials: of the sampled touches. scales: of those that judge, ascending, the readout and what it left out.
+    """
+    apart = [left for _, left in scales]
     names = common_names(apart)
     touches = judged_touches(stage, apart) if len(names) > 1 else []
     prior = np.full(len(apart), PRIOR_WEIGHT[kind] / len(apart))
+    if not touches:
+        return Calibration(prior, _assumed([readout for readout, _ in scales]), np.zeros(0))
     scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
     distances = np.stack([_picked(left, left.distances, names, touches, stage).min(axis=1) for left in apart], axis=1)
     own = {name: i for i, name in enumerate(names)}
     weights = fit_weights(scores, [own[materials[touch]] for touch in touches], prior)
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(readouts), np.zeros(0))
+        return Calibration(weights, _assumed([readout for readout, _ in scales]), np.zeros(0))
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
     unsorted = Calibration(weights, shape, np.zeros(0)).novelty(distances)
@@ -128,7 +137,8 @@ def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[i
     """The values of some touches at a stage for some of the materials, shape (touches, names)."""
     own = {name: i for i, name in enumerate(left.names)}
     rows = np.array([left.rows[touch, stage] for touch in touches], dtype=np.intp)
-    return values[np.ix_(rows, [own[name] for name in names])]
+    picked: FloatArray = values[np.ix_(rows, np.array([own[name] for name in names]))]
+    return picked
 
 
 def fit_weights(scores: FloatArray, targets: Sequence[int], prior: FloatArray) -> FloatArray:
@@ -136,8 +146,6 @@ def fit_weights(scores: FloatArray, targets: Sequence[int], prior: FloatArray) -
 
     scores: of touches left out, shape (touches, scales, classes). targets: the class of each.
     """
-    if not len(targets):
-        return prior
     gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:

@@ -1,8 +1,8 @@
-"""Leave-one-out scores: of each sampled touch by a readout that never observed it, its rows taken out of the statistics.
+"""Leave-one-out scores: of each sampled touch by a readout that never observed it.
 
-A touch of k rows with mean x̄, of a material of n rows with mean m, adds to S_w the columns U of `readout`: its rows
-about their mean and its way √(n k / (n − k)) (x̄ − m). Without it, by Sherman, Morrison and Woodbury (1950; Bartlett
-1951 for a row),
+Its rows are taken out of the statistics. A touch of k rows with mean x̄, of a material of n rows with mean m, adds to
+S_w the columns U of `system`: its rows about their mean and its way √(n k / (n − k)) (x̄ − m). Without it, by Sherman,
+Morrison and Woodbury (1950; Bartlett 1951 for a row),
 
     K'⁻¹ = K⁻¹ − K⁻¹ Uᵀ E U K⁻¹,    E = (U K⁻¹ Uᵀ − I)⁻¹,    m' = m − k / (n − k) (x̄ − m),
 
@@ -16,20 +16,23 @@ compacted) leaves with as many of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, ReadoutName, Task, contrasts
+from scroll_tactile.readouts.readout import Readout, ReadoutName, Task
+from scroll_tactile.readouts.system import contrasts
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import TouchSample
+from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["LeftOut", "left_out"]
+__all__ = ["LeftOut", "Sampled", "left_out"]
 
 FloatArray = npt.NDArray[np.float64]
+Sampled = Iterable[tuple[str, bytes, SampledTouch]]
+"""Material, key and rows of the touches that readouts are calibrated on: a `TouchSample`, or what was copied of it."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class LeftOut:
 
 
 def left_out(
-    readout: Readout, task: Task, sample: TouchSample, stages: Sequence[Sequence[Scale]], kind: ReadoutName
+    readout: Readout, task: Task, sample: Sampled, stages: Sequence[Sequence[Scale]], kind: ReadoutName
 ) -> LeftOut:
     """Leave each sampled touch out of the readout of a scale that was just made of a task.
 
@@ -69,7 +72,8 @@ def left_out(
             at = touch.pairs[judged, 0].tolist()
             rows = touch.rows[judged] - readout.origin
             groups.setdefault(len(judged), []).append((number, at, rows, weight, own[material]))
-    left, index, parts = _Leaving(readout, task, kind), {}, []
+    index: dict[tuple[int, int], int] = {}
+    left, parts = _Leaving(readout, task, kind), []
     for members in groups.values():
         for number, at, *_ in members:
             for stage in at:
@@ -88,12 +92,12 @@ class _Leaving:
 
         self.readout, self.kind = readout, kind
         self.derived = readout.derived()
-        self.means, self.solved = readout.means_of(self.derived.reference)
+        self.means, self.solved = readout.means_solved()
         self.counts = readout.counts[readout.reference]
         self.total = float(self.counts.sum())
         self.center = readout.shares @ self.means
         # The whole is that of the reference materials alone, weighed as if they were all.
-        self.excess = readout.rows / self.total
+        self.excess = float(readout.counts.sum()) / self.total
         spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
         with one_thread():
             system = task.scatter + np.asfortranarray(spread.T @ spread)
@@ -112,7 +116,7 @@ class _Leaving:
         """
         touches, count, dimension = rows.shape
         with one_thread():
-            solved = self.readout.solve(rows.reshape(-1, dimension)).reshape(rows.shape)
+            solved = self.readout.system.solve(rows.reshape(-1, dimension)).reshape(rows.shape)
             counts = self.counts[own]
             mean = np.sqrt(weights * counts / (counts - weights))[:, None]
             share = np.sqrt(weights / count)[:, None, None]
@@ -144,7 +148,7 @@ class _Leaving:
         """The squared length of each row about the mean of all under T without its touch, (M, k), and B, (M, k, k)."""
         from scipy.linalg.lapack import dtrtrs
 
-        touches, count, dimension = rows.shape
+        _, count, dimension = rows.shape
         half = dtrtrs(self.factor, (rows - self.center).reshape(-1, dimension).T, lower=0, trans=1)[0].T
         half = np.ascontiguousarray(half).reshape(rows.shape)
         middle = half.mean(axis=1)

@@ -22,7 +22,7 @@ LEAST, LARGEST = 1e-4, 0.99
 
 
 def shrinkage(scatter: npt.NDArray[np.float64], touches: int) -> float:
-    """ρ of a scatter, shape (d, d), of which the upper triangle is read, made of so many touches; it may be of any unit."""
+    """ρ of a scatter in any unit, shape (d, d), of which the upper triangle is read, made of so many touches."""
     dimension = len(scatter)
     diagonal = np.diagonal(scatter)
     trace = float(diagonal.sum())

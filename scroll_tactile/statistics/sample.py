@@ -23,7 +23,7 @@ __all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
 
 T = TypeVar("T")
-Codes = Mapping[Scale, npt.NDArray[np.int32]]
+Codes = dict[Scale, npt.NDArray[np.int32]]
 
 
 Stages = Sequence[Mapping[Scale, Sequence[int]]]

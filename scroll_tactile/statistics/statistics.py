@@ -23,6 +23,7 @@ __all__ = ["Statistics"]
 IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
+
 class Statistics:
     """Counts and sums by material and scale, and the second moment of each scale.
 
@@ -83,9 +84,7 @@ class Statistics:
         """
         place = self._places.get(material)
         if place is None or not self._observations[place] or not self._lengths[columns]:
-            raise UnknownMaterialError(
-                f"{material!r} has no observation of {columns} columns that could be taken out"
-            )
+            raise UnknownMaterialError(f"{material!r} has no observation of {columns} columns that could be taken out")
         for scale, rows in codes.items():
             self._seconds[scale].remove(rows)
             self._rows[scale][place] -= len(rows)

@@ -29,6 +29,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.statistics.moments import one_thread
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
@@ -417,7 +418,8 @@ class TactileLearner:
     def _answer(
         self, model: Model, candidates: Sequence[str], encoded: Encoded, logits: Mapping[str, float] | None
     ) -> Prediction:
-        judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
+        with one_thread():
+            judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
         order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
         ranking = list(zip(map(candidates.__getitem__, order), judgement.probability[order].tolist(), strict=True))
         known = bool(judgement.novelty <= judgement.calibration.threshold(self._settings.false_alarms))

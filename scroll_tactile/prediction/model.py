@@ -15,6 +15,7 @@ from scroll_tactile.readouts.calibration import Calibration, calibrate
 from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
 from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
+from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
 __all__ = ["Draft", "Judgement", "Model"]
@@ -70,8 +71,9 @@ class Draft:
         Raises CapacityError where the system has not the memory for it; nothing was changed then.
         """
         try:
-            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
-            calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
+            with one_thread():
+                readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+                calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
         except MemoryError as error:
             raise CapacityError(
                 f"the system has no memory left to fit the readouts of {len(self.names)} materials: what was observed "

@@ -120,9 +120,9 @@ def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) 
     # Late, here and in `readouts`: a fifth of a second, that whoever only looks at a memory is spared.
     from scipy.linalg.blas import dsyrk
 
-    # The transposed view is Fortran's order, and its upper triangle our lower one. With BLAS's own threads: exact
-    # all the same, and switching to one and back took longer than the product.
-    upper = dsyrk(1.0, codes.astype(np.float64).T, lower=0)
+    with one_thread():
+        # The transposed view is Fortran's order, and its upper triangle our lower one.
+        upper = dsyrk(1.0, codes.astype(np.float64).T, lower=0)
     flat, lower = upper.T.reshape(-1), _lower(codes.shape[1])
     # Piece by piece, in the processor's cache: the whole triangle at once took twice as long, in fresh pages.
     for first in range(0, len(packed), PIECE):

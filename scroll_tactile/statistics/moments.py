@@ -143,18 +143,22 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     centred = np.zeros((dimension, dimension), dtype=np.int64)
     centred.reshape(-1)[_lower(dimension)] = packed
     rounded = np.zeros((dimension, dimension))
+    # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
+    largest = int(np.abs(sums).max(initial=1))
+    block = min(1024, 2 ** (53 - BITS) // largest)
+    limbs, block = (False, block) if block >= 64 else (True, 1024)
     with one_thread():
-        for first in range(0, len(counts), 1024):  # the products of so many in two limbs stay below 2⁵³
-            rows, total = counts[first : first + 1024, None], sums[first : first + 1024]
+        for first in range(0, len(counts), block):
+            rows, total = counts[first : first + block, None], sums[first : first + block]
             means = mean_code(total, rows)
-            high = total >> LIMB
-            low = total - (high << LIMB)
             mean, rest = means.astype(np.float64), (total - rows * means).astype(np.float64)
-            if high.any():
+            if limbs:
+                high = total >> LIMB
                 product = (high.astype(np.float64).T @ mean).astype(np.int64)
                 product <<= LIMB
                 centred -= product
-            centred -= (low.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
+                total = total - (high << LIMB)
+            centred -= (total.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
             rest /= np.sqrt(rows)
             rounded += rest.T @ rest
     rounded *= -1.0

@@ -24,11 +24,6 @@ __all__ = ["Generations", "highest_number", "numbers", "remove_others"]
 
 logger = logging.getLogger(__name__)
 
-# The current one, and the one before it in case a disk error spoils the current: then recovery
-# replays only the journal's rows since then. More would only cost space. A base stays beside them,
-# for the rows that it stands for have no arrays of their own any more.
-KEPT_GENERATIONS = 2
-
 Answer = TypeVar("Answer")
 
 
@@ -40,8 +35,6 @@ class Generations:
         self._parent = folder / GENERATIONS
         self._journal = journal
         self._committing = threading.Lock()
-        # Numbers of generations that failed to verify: they do not count as a fallback.
-        self._spoilt: set[int] = set()
         self._worker = ThreadPoolExecutor(1, f"store commit {folder.name}")
         self._queue = threading.Lock()
         self._waiting: Draft | None = None
@@ -69,8 +62,7 @@ class Generations:
                 return self._load(row)
             except DamageError as damage:
                 if self._is_named(row):
-                    self._spoilt.add(row.number)
-                    logger.warning("%s; falling back to an older generation", damage)
+                    logger.warning("%s; replaying the journal behind an older generation, or all of it", damage)
 
     def base(self) -> Generation | None:
         """Return the generation that stands for the compacted rows, None when there is none."""
@@ -117,22 +109,24 @@ class Generations:
             number = 1 + max([highest_number(self._parent), *(row.number for row in earlier)])
             content = write_group(self._parent, number, draft, self._journal.identity)
             row = GenerationRow.of(number, draft.upto, int(base), time.time(), draft.attributes, content)
-            kept = {row.number for row in self._kept(earlier, base=base)}
+            kept = {row.number for row in self._kept(earlier, draft, base=base)}
             # When this fails the folder stays, for the next commit or open to remove: what could not be
             # synced may be on the disk all the same, and name it after a crash.
             self._journal.make_current(row, forget={row.number for row in earlier} - kept)
             self._remove_unnamed()
             return number
 
-    def _kept(self, earlier: list[GenerationRow], *, base: bool) -> list[GenerationRow]:
+    @staticmethod
+    def _kept(earlier: list[GenerationRow], draft: Draft, *, base: bool) -> list[GenerationRow]:
         """Return which of the earlier generations, the newest first, stay beside a new one."""
-        sound = [row for row in earlier if row.sound and row.number not in self._spoilt]
         if base:
-            # Only the newest: recovery from an older one may need arrays that go with this commit.
-            return sound[:1]
-        # Nobody knows whether a row that fails its checksum is that of the base.
-        bases = [row for row in earlier if row.sound and row.base]
-        return sound[: KEPT_GENERATIONS - 1] + bases[:1] + [row for row in earlier if not row.sound]
+            # `compact` has just read the newest. Recovery from an older one would need arrays that go with this commit.
+            return earlier[:1]
+        # Not the one before, as the journal has its rows; but the rows of a base have no arrays of their own any more,
+        # and nobody knows whether a row that fails its checksum is that of a base.
+        sound = [row for row in earlier if row.sound]
+        current = [row for row in sound[:1] if row.upto > draft.upto]
+        return [*current, *[row for row in sound if row.base][:1], *(row for row in earlier if not row.sound)]
 
     def compact(self, draft: Draft) -> None:
         """Commit a base; raise DamageError or RecordError where no sound generation with all rows is beside it."""

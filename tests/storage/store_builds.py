@@ -2,11 +2,12 @@
 
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager
 
 import numpy as np
 
 from store import Store, check_store
+from store.generations import Generations
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}
@@ -31,9 +32,24 @@ def commit(call, upto):
     return call(state(upto), upto=upto, attributes={"n": upto}, chunks={"rows": 25})
 
 
+@contextmanager
+def two_kept():
+    """While it lasts a commit keeps the generation before it, as releases up to 0.2 did: stores may have two."""
+    real = Generations._kept
+
+    def kept(earlier, draft, *, base):
+        return earlier[:1] if base else [*earlier[:1], *(row for row in earlier[1:] if row.base)]
+
+    Generations._kept = staticmethod(kept)
+    try:
+        yield
+    finally:
+        Generations._kept = staticmethod(real)
+
+
 def build(path, *, compacted=False, last=LAST):
     """Twenty rows, generations up to rows 10 and 15, and, where compacted, a base up to row 6 in place of the first."""
-    with Store.open(path, identity=IDENTITY) as opened:
+    with two_kept(), Store.open(path, identity=IDENTITY) as opened:
         for number in range(1, last + 1):
             add(opened, number)
             if number in (10, 15):

@@ -33,9 +33,9 @@ class Gate:
         return self.write(parent, number, draft, identity)
 
 
-def test_the_current_and_the_one_before_it_are_kept(opened):
+def test_only_the_current_one_is_kept(opened):
     assert [opened.commit(ONE, upto=0) for _ in range(4)] == [1, 2, 3, 4]
-    assert folders(opened.path) == ["00000003", "00000004"]
+    assert folders(opened.path) == ["00000004"]
 
 
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
@@ -196,3 +196,25 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
     with pytest.raises(StoreError) as caught:
         opened.latest()
     assert not isinstance(caught.value, DamageError)
+
+
+@pytest.mark.parametrize("instant", ["GroupReader", "_read_array"])
+def test_a_reader_whose_generation_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
+    opened.commit(ONE, upto=0)
+    owner = store.generations if instant == "GroupReader" else store.groups
+    real = getattr(owner, instant)
+    waiting = [2, 3, 4]
+
+    def replaced(*args, **options):
+        if waiting:
+            monkeypatch.setattr(owner, instant, real)
+            opened.commit({"x": np.arange(waiting[0])}, upto=0)
+            del waiting[0]
+            monkeypatch.setattr(owner, instant, replaced)
+        return real(*args, **options)
+
+    with Store.open(opened.path, mode="read") as reader:
+        monkeypatch.setattr(owner, instant, replaced)
+        found = reader.latest()
+    assert (found.number, found.arrays["x"].tolist()) == (4, [0, 1, 2, 3])
+    assert caplog.records == []

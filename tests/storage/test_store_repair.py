@@ -24,6 +24,7 @@ from store_builds import (
     same_arrays,
     spoil,
     state,
+    two_kept,
     values,
 )
 
@@ -299,7 +300,7 @@ def test_what_the_log_holds_is_kept_with_the_damaged_journal(path, tmp_path):
 
 
 def test_a_journal_of_another_store_keeps_its_rows_and_no_generation_of_this_one(path, tmp_path):
-    with Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
+    with two_kept(), Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
         for number in range(1, 4):
             add(other, number)
         for upto in (2, 3):

@@ -14,8 +14,6 @@ from store.exceptions import RecordError, VersionError
 __all__ = [
     "array_digest",
     "check_arrays",
-    "check_chunks",
-    "chunk_digest",
     "decode_payload",
     "encode_payload",
     "flat_bytes",
@@ -83,23 +81,6 @@ def _check_array(name: str, array: np.ndarray) -> None:
         )
 
 
-def check_chunks(chunks: Mapping[str, int] | None, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
-    """Return the rows of a chunk of each array that is to be kept in chunks; None counts as none of them.
-
-    Raises RecordError for a name that is no array's, an array without a first axis, and rows that are no int
-    of 1 or more.
-    """
-    checked = dict(chunks or {})
-    for name, rows in checked.items():
-        if name not in arrays:
-            raise RecordError(f"chunks names {name!r}, but the arrays are {sorted(arrays)}")
-        if arrays[name].ndim == 0:
-            raise RecordError(f"array {name!r} has no axes, and so no rows to keep in chunks: leave it out of chunks")
-        if isinstance(rows, bool) or not isinstance(rows, int) or rows < 1:
-            raise RecordError(f"a chunk of array {name!r} is to have {rows!r} rows; give an int of 1 or more")
-    return checked
-
-
 def flat_bytes(array: np.ndarray) -> np.ndarray:
     """Return the bytes of a C-contiguous array, in C order, as a uint8 vector that shares its memory."""
     if array.nbytes == 0:
@@ -109,20 +90,9 @@ def flat_bytes(array: np.ndarray) -> np.ndarray:
 
 def array_digest(array: np.ndarray) -> str:
     """Return the sha256, in hexadecimal, over the dtype, the shape and the bytes of a C-contiguous array."""
-    digest = hashlib.sha256(_heading(array))
+    digest = hashlib.sha256(f"{array.dtype.str};{','.join(map(str, array.shape))};".encode("ascii"))
     digest.update(flat_bytes(array).data)
     return digest.hexdigest()
-
-
-def chunk_digest(chunk: np.ndarray) -> str:
-    """Return a BLAKE2b of 16 bytes, in hexadecimal, over the same of C-contiguous rows of an array."""
-    digest = hashlib.blake2b(_heading(chunk), digest_size=16)
-    digest.update(flat_bytes(chunk).data)
-    return digest.hexdigest()
-
-
-def _heading(array: np.ndarray) -> bytes:
-    return f"{array.dtype.str};{','.join(map(str, array.shape))};".encode("ascii")
 
 
 def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:

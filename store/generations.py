@@ -9,9 +9,6 @@ from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from pathlib import Path
-from typing import TypeVar
-
-import numpy as np
 
 from store.exceptions import DamageError, RecordError, StoreError, reported
 from store.files import remove_tree
@@ -23,8 +20,6 @@ from store.schema import GENERATIONS
 __all__ = ["Generations", "highest_number", "numbers", "remove_others"]
 
 logger = logging.getLogger(__name__)
-
-Answer = TypeVar("Answer")
 
 
 class Generations:
@@ -66,17 +61,13 @@ class Generations:
 
     def base(self) -> Generation | None:
         """Return the generation that stands for the compacted rows, None when there is none."""
-        return self._read(lambda row: bool(row.base), self._load)
-
-    def read_rows(self, name: str, first: int, last: int, number: int | None) -> np.ndarray:
-        """Return some rows of an array that is kept in chunks."""
-        rows = self._read(
-            lambda row: number in (None, row.number), lambda row: self._reader(row).rows(name, first, last)
-        )
-        if rows is None:
-            wanted = "no generation" if number is None else f"generation {number} no longer"
-            raise StoreError(f"{self._folder} has {wanted}: look at the newest again, with latest()")
-        return rows
+        while (row := self._find(lambda row: bool(row.base))) is not None:
+            try:
+                return self._load(row)
+            except DamageError:
+                if self._is_named(row):
+                    raise
+        return None
 
     def _find(self, wanted: Callable[[GenerationRow], bool]) -> GenerationRow | None:
         return next((row for row in self._journal.generations() if wanted(row)), None)
@@ -85,22 +76,10 @@ class Generations:
         # A writer may have replaced and removed it while it was read: that is no damage.
         return self._find(lambda named: named.number == row.number) is not None
 
-    def _read(self, wanted: Callable[[GenerationRow], bool], read: Callable[[GenerationRow], Answer]) -> Answer | None:
-        while (row := self._find(wanted)) is not None:
-            try:
-                return read(row)
-            except DamageError:
-                if self._is_named(row):
-                    raise
-        return None
-
-    def _reader(self, row: GenerationRow) -> GroupReader:
-        _, content = row.verified(self._journal.path)
-        return GroupReader(self._parent / folder_name(row.number), row.number, content)
-
     def _load(self, row: GenerationRow) -> Generation:
-        attributes, _ = row.verified(self._journal.path)
-        return Generation(row.number, row.upto, attributes, self._reader(row).arrays())
+        attributes, content = row.verified(self._journal.path)
+        reader = GroupReader(self._parent / folder_name(row.number), row.number, content)
+        return Generation(row.number, row.upto, attributes, reader.arrays())
 
     def commit(self, draft: Draft, *, base: bool = False) -> int:
         """Write a draft as a generation, make the journal name it, and return its number."""

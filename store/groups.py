@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from store.encoding import array_digest, chunk_digest, flat_bytes
+from store.encoding import array_digest, flat_bytes
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import remove_tree, sync_folder, sync_tree
 from store.records import JSON, from_json
@@ -41,23 +41,24 @@ def folder_name(number: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Checked arrays that are to become a generation; `attributes` is JSON, `chunks` name → rows of a chunk."""
+    """Checked arrays that are to become a generation; `attributes` is JSON."""
 
     arrays: Mapping[str, np.ndarray]
     upto: int
     attributes: str
-    chunks: Mapping[str, int]
 
 
 def write_group(parent: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> dict[str, Any]:
     """Write a draft as a durable zarr group in `parent`; return what a reader verifies it against.
 
-    That is the group's format and, for each array, its dtype, shape and sha256, and for an array kept in
-    chunks a digest of each chunk, as JSON. The group also describes itself so, and names
-    its store, so that it verifies without the journal. On any error nothing is left behind.
+    That is the group's format and, for each array, its dtype, shape and sha256, as JSON. The group also
+    describes itself so, and names its store, so that it verifies without the journal. On any error nothing is left behind.
     Raises StoreFullError, ReadOnlyError or StoreError.
     """
-    described = {name: _describe(array, draft.chunks.get(name)) for name, array in draft.arrays.items()}
+    described = {
+        name: {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
+        for name, array in draft.arrays.items()
+    }
     content = {"format": GROUP_VERSION, "arrays": described}
     known = {"number": number, "upto": draft.upto, "attributes": from_json(draft.attributes), "identity": identity}
     known |= content
@@ -82,14 +83,6 @@ def _own_digest(known: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
-def _describe(array: np.ndarray, rows: int | None) -> dict[str, Any]:
-    described = {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
-    if rows is None:
-        return described
-    pieces = [chunk_digest(array[first : first + rows]) for first in range(0, len(array), rows)]
-    return described | {"rows": rows, "chunks": pieces}
-
-
 def _write_zarr(path: Path, attributes: dict[str, Any], draft: Draft) -> None:
     # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
     import zarr
@@ -106,7 +99,7 @@ def _write_zarr(path: Path, attributes: dict[str, Any], draft: Draft) -> None:
             name,
             shape=plain.shape,
             dtype=plain.dtype,
-            **_layout(plain, draft.chunks.get(name)),
+            chunks=_chunks(plain),
             compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
             fill_value=0,
             attributes={"dtype": array.dtype.str},
@@ -116,17 +109,13 @@ def _write_zarr(path: Path, attributes: dict[str, Any], draft: Draft) -> None:
         target[...] = plain
 
 
-def _layout(array: np.ndarray, rows: int | None) -> dict[str, Any]:
-    if rows is not None:
-        # One file for all the chunks: hundreds of small ones would each have to be made durable.
-        rest = tuple(max(1, length) for length in array.shape[1:])
-        return {"chunks": (rows, *rest), "shards": (rows * max(1, -(-len(array) // rows)), *rest)}
+def _chunks(array: np.ndarray) -> tuple[int, ...]:
     lengths, piece = [], array.nbytes
     for length in array.shape:
         slab = piece // max(length, 1)
         lengths.append(max(1, length if piece <= CHUNK_BYTES else CHUNK_BYTES // max(slab, 1)))
         piece = slab * lengths[-1]
-    return {"chunks": tuple(lengths)}
+    return tuple(lengths)
 
 
 class GroupReader:
@@ -157,84 +146,40 @@ class GroupReader:
         """Return all the arrays, verified, writable and the caller's own."""
         return {name: self._array(name) for name in self._described}
 
-    def rows(self, name: str, first: int, last: int) -> np.ndarray:
-        """Return rows `first` to before `last` of an array that is kept in chunks, and verify only those chunks.
-
-        Raises RecordError for an array that is not there or not in chunks, and for rows that it does not have.
-        """
-        described = self._described.get(name)
-        if described is None or "rows" not in described:
-            kept = sorted(name for name, described in self._described.items() if "rows" in described)
-            raise RecordError(
-                f"generation {self._number} in {self._path} keeps {kept} in chunks, not {name!r}: read it as a whole"
-            )
-        length, step = described["shape"][0], described["rows"]
-        if not 0 <= first <= last <= length:
-            raise RecordError(
-                f"array {name!r} of generation {self._number} has rows 0 to {length}, not {first} to {last}"
-            )
-        pieces = [np.empty((0, *described["shape"][1:]), described["dtype"])]
-        for chunk in range(first // step, -(-last // step) if last > first else 0):
-            begin = chunk * step
-            pieces.append(self._chunk(name, chunk)[max(first - begin, 0) : last - begin])
-        return np.concatenate(pieces)
-
     def damage(self) -> Iterator[DamageError]:
-        """Yield what is wrong with the arrays, array by array and chunk by chunk; nothing where all verifies."""
-        for name, described in self._described.items():
-            sound = True
-            for chunk in range(len(described.get("chunks", ()))):
-                try:
-                    self._chunk(name, chunk)
-                except DamageError as damage:
-                    sound = False
-                    yield damage
+        """Yield what is wrong with the arrays, array by array; nothing where all verifies."""
+        for name in self._described:
             try:
                 self._array(name)
             except DamageError as damage:
-                if sound:
-                    yield damage
+                yield damage
 
     def _array(self, name: str) -> np.ndarray:
+        import zarr
+
         folder = self._path / name
         what = f"array {name!r} of generation {self._number} in {folder}"
-        array = self._read(name, what, folder, slice(None))
+        try:
+            node = self._group[name]
+            array = _read_array(node, self._described[name]) if isinstance(node, zarr.Array) else None
+        except Exception as error:
+            raise _unreadable(error, what, folder) from error
         if array is None or array_digest(array) != self._described[name]["sha256"]:
             raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
         return array
 
-    def _chunk(self, name: str, chunk: int) -> np.ndarray:
-        described = self._described[name]
-        file = self._path / name / "c" / "/".join("0" * (len(described["shape"]) + (described["dtype"][1] == "U")))
-        begin, end = chunk * described["rows"], min(described["shape"][0], (chunk + 1) * described["rows"])
-        what = f"chunk {chunk} (rows {begin} to {end}) of array {name!r} of generation {self._number} in {file}"
-        piece = self._read(name, what, file, slice(begin, end))
-        if piece is None or chunk_digest(piece) != described["chunks"][chunk]:
-            raise DamageError(f"{what} is not what was written: its digest differs", path=file)
-        return piece
 
-    def _read(self, name: str, what: str, path: Path, rows: slice) -> np.ndarray | None:
-        import zarr
-
-        try:
-            node = self._group[name]
-            return _read_array(node, self._described[name], rows) if isinstance(node, zarr.Array) else None
-        except Exception as error:
-            raise _unreadable(error, what, path) from error
-
-
-def _read_array(node: zarr.Array[Any], described: Mapping[str, Any], rows: slice) -> np.ndarray | None:
+def _read_array(node: zarr.Array[Any], described: Mapping[str, Any]) -> np.ndarray | None:
     shape, dtype = tuple(described["shape"]), np.dtype(described["dtype"])
     text = dtype.kind == "U"
     stored = ((*shape, dtype.itemsize // 4), np.dtype("<u4")) if text else (shape, dtype)
     # Before it is read: a flipped bit in a shape could ask for more memory than there is.
     if (node.shape, node.dtype) != stored:
         return None
-    # zarr gives a scalar for a 0-d array, which has no rows to choose from.
-    plain = np.asarray(node[rows] if shape else node[...])
+    plain = np.asarray(node[...])
     if not text:
         return np.require(plain, requirements=["C", "W"])
-    array = np.empty(plain.shape[:-1], dtype)
+    array = np.empty(shape, dtype)
     flat_bytes(array)[:] = flat_bytes(np.asarray(plain, order="C"))
     return array
 

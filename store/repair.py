@@ -178,9 +178,8 @@ def _row_to_keep(survey: Survey, plan: _Plan, found: FoundGeneration) -> Generat
     if found.own is not None:
         parent = found.folder.parent
         arrays = GroupReader(found.folder, number, content).arrays()
-        chunks = {name: described["rows"] for name, described in content["arrays"].items() if "rows" in described}
         number = 1 + highest_number(parent)
-        draft = Draft(arrays, found.upto, found.row.attributes.decode(), chunks)
+        draft = Draft(arrays, found.upto, found.row.attributes.decode())
         content = write_group(parent, number, draft, survey.identity or {})
     base = found.upto == plan.base and (found.is_base or (plan.fresh and found is plan.generations[0]))
     return GenerationRow.of(number, found.upto, int(base), found.row.time, found.row.attributes.decode(), content)

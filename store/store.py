@@ -13,7 +13,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from store.encoding import check_arrays, check_chunks, encode_payload
+from store.encoding import check_arrays, encode_payload
 from store.exceptions import (
     CompactedError,
     NotAStoreError,
@@ -245,36 +245,21 @@ class Store:
         self._check_open()
         return self._generations.base()
 
-    def read_rows(self, name: str, first: int, last: int, *, generation: int | None = None) -> np.ndarray:
-        """Return rows `first` to before `last` of an array that was committed with `chunks`, and read no others.
-
-        They are of the newest generation, or of the one with the number `generation`, which need not be
-        the newest any more but must still be there. It verifies only what it reads: damage elsewhere in
-        the array does not matter here.
-
-        Raises RecordError for an array that is not kept in chunks or has no such rows, DamageError that
-        names file, array and chunk, VersionError, and StoreError where the generation is not there.
-        """
-        self._check_open()
-        return self._generations.read_rows(name, first, last, generation)
-
     def commit(
         self,
         arrays: Mapping[str, np.ndarray],
         *,
         upto: int,
         attributes: Mapping[str, JSON] | None = None,
-        chunks: Mapping[str, int] | None = None,
     ) -> int:
         """Write a generation that contains the records up to `upto`, make it current, return its number.
 
-        chunks: name → rows of a chunk, for arrays of which `read_rows` is to read a part. Each is one file.
         The generation with the highest `upto` is current, and of several with the same the last committed.
         It waits for a background commit first, and raises its failure here in place of committing.
-        Raises RecordError for arrays, attributes, chunks or an `upto` that cannot be kept, StoreFullError,
+        Raises RecordError for arrays, attributes or an `upto` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the generation before then stays current.
         """
-        draft = self._draft(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes)
         self._idle()
         return self._generations.commit(draft)
 
@@ -284,7 +269,6 @@ class Store:
         *,
         upto: int,
         attributes: Mapping[str, JSON] | None = None,
-        chunks: Mapping[str, int] | None = None,
     ) -> None:
         """Let a base stand for the records up to `upto`: they give up their arrays and keep their heads.
 
@@ -294,7 +278,7 @@ class Store:
         that generation cannot be read back, and as `commit`. It gives the space back to the disk where there
         is room to do so, and logs a warning where there is not.
         """
-        draft = self._draft(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes)
         self._idle()
         self._generations.compact(draft)
 
@@ -304,7 +288,6 @@ class Store:
         *,
         upto: int,
         attributes: Mapping[str, JSON] | None = None,
-        chunks: Mapping[str, int] | None = None,
     ) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
@@ -312,17 +295,11 @@ class Store:
         raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
         What cannot be kept is refused at once, with RecordError.
         """
-        draft = self._draft(arrays, upto, attributes, chunks)
+        draft = self._draft(arrays, upto, attributes)
         self._generations.raise_failure()
         self._generations.commit_later(draft)
 
-    def _draft(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        upto: int,
-        attributes: Mapping[str, JSON] | None,
-        chunks: Mapping[str, int] | None,
-    ) -> Draft:
+    def _draft(self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None) -> Draft:
         self._check_open(write=True)
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a generation")
@@ -333,8 +310,7 @@ class Store:
                 f"upto must be a sequence from {first}, the last that was compacted, to {last}, the last that there "
                 f"is, not {upto!r}"
             )
-        checked = check_arrays(arrays)
-        return Draft(checked, upto, to_json("attributes", attributes), check_chunks(chunks, checked))
+        return Draft(check_arrays(arrays), upto, to_json("attributes", attributes))
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""

@@ -49,8 +49,8 @@ class Problem:
 def check_store(path: str | PathLike[str], *, progress: Progress | None = None) -> list[Problem]:
     """Return all that is wrong with the store in folder `path`, the journal first; nothing for a sound one.
 
-    It verifies every checksum: SQLite's structure of the journal, each row and its arrays, each array and
-    chunk of each generation, and what these say of themselves. It writes nothing and takes no lock, and a
+    It verifies every checksum: SQLite's structure of the journal, each row and its arrays, each array
+    of each generation, and what these say of themselves. It writes nothing and takes no lock, and a
     writer may be at work (SQLite may make its two files beside the journal, as for any reader).
     `progress` is called with what is being verified, how many of it are done, and how many there are.
 

@@ -260,7 +260,7 @@ class Ledger:
                 base = memory.until(store, upto) if upto < memory.sequence else memory
                 arrays, attributes = base.to_arrays(base_at=upto)
                 with self._mutation():
-                    store.compact(arrays, upto=upto, attributes=attributes, chunks=base.chunks())
+                    store.compact(arrays, upto=upto, attributes=attributes)
                     memory.base = upto
                     memory.retracted = {sequence for sequence in memory.retracted if sequence > upto}
                 give_back_scratch()
@@ -305,8 +305,7 @@ class Ledger:
             return
         arrays, attributes = self._memory.to_arrays()
         try:
-            chunks = self._memory.chunks()
-            self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes, chunks=chunks)
+            self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes)
         except StoreError as error:
             # The journal has it all; only the next opening has more to replay.
             logger.warning("%s: no generation could be written: %s", self.store.path, error)
@@ -318,7 +317,7 @@ class Ledger:
         if self.store is not None:
             arrays, attributes = self._memory.to_arrays()
             self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
-            self.store.commit(arrays, upto=self._saved, attributes=attributes, chunks=self._memory.chunks())
+            self.store.commit(arrays, upto=self._saved, attributes=attributes)
 
     def close(self) -> None:
         """As `TactileLearner.close`."""

@@ -270,11 +270,6 @@ class Memory:
                 arrays |= own
         return arrays, attributes
 
-    def chunks(self) -> dict[str, int]:
-        """Rows in a chunk of the arrays that are read piece by piece: an exemplar of the usual length is one read."""
-        lengths = [len(exemplar.readings) for exemplar in self.exemplars or ()]
-        return {"exemplar-readings": int(np.median(lengths))} if lengths else {}
-
     @classmethod
     def load(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int = 0) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""

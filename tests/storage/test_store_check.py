@@ -8,7 +8,7 @@ import threading
 from contextlib import closing
 
 import pytest
-from store_builds import LAST, add, change, commit, contents, damage, flip, flip_chunk, folders, state, values
+from store_builds import LAST, add, change, commit, contents, damage, flip, folders, state, values
 
 import store.schema
 from store import DamageError, NotAStoreError, Problem, Store, StoreError, VersionError, check_store, repair_store
@@ -115,11 +115,7 @@ def rows_of(folder):
 
 
 GENERATIONS = {
-    "a chunk": (lambda folder: flip(rows_of(folder), 30), "chunk 0 (rows 0 to 25) of array 'rows'"),
-    "another chunk": (
-        lambda folder: flip_chunk(rows_of(folder), 2, 4),
-        "chunk 2 (rows 50 to 75) of array 'rows'",
-    ),
+    "a file": (lambda folder: flip(rows_of(folder), 30), "array 'rows' of generation"),
     "an array": (lambda folder: flip(folder / "names" / "c" / "0" / "0", 20), "array 'names' of generation"),
     "an array's description": (lambda folder: (folder / "sum" / "zarr.json").write_text("{}"), "array 'sum'"),
     "an array's folder": (lambda folder: shutil.rmtree(folder / "sum"), "array 'sum' of generation"),
@@ -130,7 +126,7 @@ GENERATIONS = {
 
 @pytest.mark.parametrize("choose", [newest, older])
 @pytest.mark.parametrize(("spoil", "said"), GENERATIONS.values(), ids=GENERATIONS)
-def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said, choose):
+def test_damaged_generations_are_named_by_file_and_array(path, spoil, said, choose):
     folder = choose(path)
     spoil(folder)
     problems = check_store(path)
@@ -138,12 +134,6 @@ def test_damaged_generations_are_named_by_file_array_and_chunk(path, spoil, said
     assert all(problem.path.is_relative_to(folder) and str(problem.path) in problem.what for problem in problems)
     base = folder.name == "00000003"
     assert {problem.kind for problem in problems} == {"lost" if base else "spare"}
-
-
-def test_every_damaged_chunk_is_named_and_no_other(path):
-    for chunk in (0, 3):
-        flip_chunk(rows_of(newest(path)), chunk, 4)
-    assert [problem.what.split(" (")[0] for problem in check_store(path)] == ["chunk 0", "chunk 3"]
 
 
 def test_the_only_copy_of_a_state_is_lost(path):
@@ -178,7 +168,7 @@ def test_a_generation_of_another_store_is_found(path, tmp_path):
     with Store.open(tmp_path / "other", identity={"for": "other checks"}) as other:
         other.append("a", "b", b"")
         for upto in (0, 1):
-            other.commit(state(upto), upto=upto, chunks={"rows": 25})
+            other.commit(state(upto), upto=upto)
     shutil.rmtree(newest(path))
     shutil.copytree(newest(tmp_path / "other"), newest(path))
     assert "it says another identity: {'for': 'other checks'}" in found(path)
@@ -325,10 +315,10 @@ def test_everything_that_is_wrong_is_told_at_once(path):
         "DELETE FROM payload WHERE sequence = 12",
         "UPDATE meta SET value = '' WHERE key = 'created'",
     )
-    flip_chunk(rows_of(newest(path)), 1, 4)
+    flip(rows_of(newest(path)))
     flip(older(path) / "names" / "c" / "0" / "0", 20)
     told = found(path)
-    for said in ("created", "row 8 fails", "row 12 has lost", "row 18 fails", "chunk 1 (rows 25", "array 'names'"):
+    for said in ("created", "row 8 fails", "row 12 has lost", "row 18 fails", "array 'rows'", "array 'names'"):
         assert said in told
 
 

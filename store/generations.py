@@ -45,8 +45,8 @@ class Generations:
                     row.number,
                 )
 
-    def latest(self) -> Generation | None:
-        """Return the newest generation that verifies, None when there is none."""
+    def latest(self, only: Collection[str] | None = None) -> Generation | None:
+        """Return the newest generation that verifies, None when there is none; only: the arrays to read, or all."""
         passed: set[int] = set()
         while True:
             row = self._find(lambda row: row.number not in passed)
@@ -54,7 +54,7 @@ class Generations:
                 return None
             passed.add(row.number)
             try:
-                return self._load(row)
+                return self._load(row, only)
             except DamageError as damage:
                 if self._is_named(row):
                     logger.warning("%s; replaying the journal behind an older generation, or all of it", damage)
@@ -74,12 +74,19 @@ class Generations:
 
     def _is_named(self, row: GenerationRow) -> bool:
         # A writer may have replaced and removed it while it was read: that is no damage.
-        return self._find(lambda named: named.number == row.number) is not None
+        return row.number in self.named()
 
-    def _load(self, row: GenerationRow) -> Generation:
+    def named(self) -> set[int]:
+        """Return the numbers of the generations that the journal names just now."""
+        return {row.number for row in self._journal.generations()}
+
+    def _load(self, row: GenerationRow, only: Collection[str] | None = None) -> Generation:
         attributes, content = row.verified(self._journal.path)
-        reader = GroupReader(self._parent / folder_name(row.number), row.number, content)
-        return Generation(row.number, row.upto, attributes, reader.arrays())
+        names = [name for name in content["arrays"] if only is None or name in only]
+        arrays = {}
+        if names or only is None:
+            arrays = GroupReader(self._parent / folder_name(row.number), row.number, content).arrays(names)
+        return Generation(row.number, row.upto, attributes, arrays)
 
     def commit(self, draft: Draft, *, base: bool = False) -> int:
         """Write a draft as a generation, make the journal name it, and return its number."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time as clock
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +13,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from store.backup import back_up
 from store.encoding import check_arrays, encode_payload
 from store.exceptions import (
     CompactedError,
@@ -31,6 +32,7 @@ from store.journal import Journal
 from store.lock import WriterLock
 from store.records import JSON, Generation, Head, Record, check_key, check_text, check_time, from_json, to_json
 from store.schema import GENERATIONS, JOURNAL_FILE
+from store.survey import Progress
 from store.writeahead import require_whole_log
 
 __all__ = ["Store"]
@@ -216,14 +218,16 @@ class Store:
             yield record
             after = record.sequence
 
-    def latest(self) -> Generation | None:
+    def latest(self, *, only: Collection[str] | None = None) -> Generation | None:
         """Return the newest generation that verifies, None when there is none.
 
-        A logged warning names the file and the array of each one that it passes over.
+        only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
+        over. With none it is the generation's attributes, in well below a millisecond.
+        A logged warning names the file and the array of each generation that it passes over.
         Raises VersionError for a generation of a newer format.
         """
         self._check_open()
-        return self._generations.latest()
+        return self._generations.latest(only)
 
     @property
     def newest(self) -> int | None:
@@ -321,6 +325,19 @@ class Store:
     def _idle(self) -> None:
         self._generations.wait()
         self._generations.raise_failure()
+
+    def backup(self, destination: str | os.PathLike[str], *, progress: Progress | None = None) -> None:
+        """Copy the store to the new folder `destination`, also while it is written, from here or elsewhere.
+
+        The copy is the store as it was at one moment since the call: all records durable then, and the generations.
+        It appears there verified, complete and durable, or not at all; a power cut may leave a folder named
+        `destination`.….partial. Nobody who writes waits for it. `progress` is called as by `check_store`.
+
+        Raises NotAStoreError where something is at `destination` or it lies inside the store, DamageError where the
+        copy does not verify, StoreFullError, ReadOnlyError or another StoreError.
+        """
+        self._check_open()
+        back_up(self.path, Path(destination).absolute(), self._generations.named, progress)
 
     def size(self) -> dict[str, int]:
         """Return the bytes on the disk: {"journal": …, "generations": …}."""

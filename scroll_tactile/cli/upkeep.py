@@ -1,4 +1,4 @@
-"""`scroll-tactile memory …`: checking, repairing, compacting, merging and retracting."""
+"""`scroll-tactile memory …`: checking, repairing, copying, compacting, merging and retracting."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.markup import escape
 from scroll_tactile.cli.everyday import MemoryFolder
 from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say
 from scroll_tactile.errors import ScrollTactileError
-from store import StoreError, check_store, repair_store
+from store import Store, StoreError, check_store, repair_store
 
 __all__ = ["memory"]
 
@@ -79,6 +79,18 @@ def compact(
         done = learner.compact(keep=keep)
     before, after = done.bytes_before / 2**20, done.bytes_after / 2**20
     say(f"rows up to {done.upto} are compacted; on disk {before:.1f} MB before, {after:.1f} MB after")
+
+
+@memory.command()
+def backup(
+    folder: MemoryFolder,
+    target: Annotated[Path, typer.Argument(help="The copy: a folder that is not there yet.", show_default=False)],
+) -> None:
+    """Copy a memory, also while it is used: verified, whole, on the disk when it appears, or not there at all."""
+    with Store.open(folder, mode="read") as store, progress_bar() as progress:
+        store.backup(target, progress=progress)
+    with Store.open(target, mode="read") as copy:
+        say(f"written: {escape(str(target))}, with rows 1 to {copy.last}; every checksum holds")
 
 
 @memory.command()

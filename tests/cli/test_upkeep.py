@@ -2,6 +2,10 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,11 +80,14 @@ class TestCheckAndRepair:
         assert f"kept up to row {kept}" in result
         assert 0 < kept < 12
 
-    @pytest.mark.parametrize("command", ["check", "repair", "compact", "export", "retract", "forget", "merge"])
+    @pytest.mark.parametrize(
+        "command", ["check", "repair", "backup", "compact", "export", "retract", "forget", "merge"]
+    )
     def test_what_is_no_memory_is_refused(self, tmp_path, command):
         more = {
             "compact": ["--yes"],
             "export": [tmp_path / "out"],
+            "backup": [tmp_path / "copy"],
             "retract": [1],
             "forget": ["a"],
             "merge": [tmp_path, "--shared", "once"],
@@ -116,6 +123,51 @@ class TestRetracting:
             learner.retract(1)
         assert "rows up to 10 are compacted; on disk" in words(run("memory", "compact", path, "--keep", "2", "--yes"))
         assert "were compacted" in refused("memory", "retract", path, 4)
+
+
+WRITER = """
+import sys
+from touches import SETTINGS, stream
+from scroll_tactile import TactileLearner
+
+with TactileLearner.open(sys.argv[1], **SETTINGS) as learner:
+    for seed in range(4, 400):
+        learner.observe("d", stream((seed, 60)))
+        print(learner.digest(), flush=True)
+"""
+
+
+class TestBackup:
+    def test_a_copy_under_a_writer_is_a_state_that_it_acknowledged(self, path, tmp_path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            digests = [learner.digest()]
+        home = Path(__file__).resolve().parents[1]
+        writer = subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(path)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join([str(home), str(home.parent)])},
+        )
+        try:
+            digests += [writer.stdout.readline().strip() for _ in range(3)]
+            said = words(run("memory", "backup", path, tmp_path / "copy"))
+            assert writer.poll() is None
+        finally:
+            writer.terminate()
+            digests += [line.strip() for line in writer.stdout]
+            writer.stdout.close()
+            writer.wait()
+        assert "every checksum holds" in said
+        assert words(run("memory", "check", tmp_path / "copy")) == "sound: every checksum holds"
+        with TactileLearner.open(tmp_path / "copy", **SETTINGS) as learner:
+            # The writer may have been ended between making the last durable and telling its digest.
+            assert learner.digest() in digests[3:]
+            assert f"with rows 1 to {learner._ledger.store.last};" in said
+
+    def test_what_is_there_stays(self, path, tmp_path):
+        (tmp_path / "copy").mkdir()
+        assert "is there already" in refused("memory", "backup", path, tmp_path / "copy")
+        assert "inside" in refused("memory", "backup", path, path / "copy")
 
 
 class TestExport:

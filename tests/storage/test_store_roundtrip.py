@@ -1,6 +1,7 @@
 """What goes into the store comes back with the same bytes; what could not is refused."""
 
 import json
+import shutil
 import string
 import subprocess
 import sys
@@ -201,3 +202,19 @@ def test_importing_is_light():
     where = Path(store.__file__).parents[1]
     found = subprocess.run([sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"
+
+
+def test_the_attributes_of_a_generation_or_some_of_its_arrays_are_read_without_the_others(tmp_path, caplog):
+    arrays = {"a": np.arange(3), "b": np.arange(4.0), "c": np.array(["é"])}
+    with Store.open(tmp_path, identity={}) as opened:
+        assert opened.latest(only=()) is None
+        opened.commit(arrays, upto=0, attributes={"made": "now"})
+        (tmp_path / "generations" / "00000001" / "b" / "zarr.json").unlink()
+        found = opened.latest(only=["c", "none such", "a"])
+        assert same(found.arrays, {"a": arrays["a"], "c": arrays["c"]})
+        assert caplog.records == []
+        assert opened.latest(only=["b"]) is None
+        assert "array 'b' of generation 1" in caplog.text
+        shutil.rmtree(tmp_path / "generations" / "00000001")
+        found = opened.latest(only=())
+        assert (found.number, found.upto, found.attributes, found.arrays) == (1, 0, {"made": "now"}, {})

@@ -1,0 +1,254 @@
+"""A copy of a store that is in use: complete, verified and durable when it appears."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from store_builds import (
+    add,
+    as_after_a_crash,
+    change,
+    commit,
+    contents,
+    damage,
+    flip,
+    folders,
+    same_arrays,
+)
+
+import store.backup
+from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
+
+WRITER = """
+import sys
+import numpy as np
+from store import Store
+
+with Store.open(sys.argv[1], identity={}) as opened:
+    number = 0
+    while True:
+        number += 1
+        opened.append("a", f"row {number}", b"", arrays={"x": np.arange(number % 2000)})
+        print(number, flush=True)
+        if number % 3 == 0:
+            opened.commit({"sum": np.array(number), "bulk": np.arange(20_000) + number}, upto=number)
+"""
+
+
+def kept(folder):
+    """What is in a folder but for the two files that SQLite makes for any reader, and the writer's lock."""
+    found = contents(folder)
+    return {name: found[name] for name in found if not name.endswith(("-shm", "-wal", "lock", "holder.json"))}
+
+
+def same_store(found, expected):
+    assert damage(found) == []
+    with Store.open(found, mode="read") as ours, Store.open(expected, mode="read") as theirs:
+        assert (ours.identity, ours.last, ours.compacted, ours.newest) == (
+            theirs.identity,
+            theirs.last,
+            theirs.compacted,
+            theirs.newest,
+        )
+        assert list(ours.heads()) == list(theirs.heads())
+        for mine, other in zip(ours.records(ours.compacted), theirs.records(theirs.compacted), strict=True):
+            assert same_arrays(mine.arrays, other.arrays)
+        for mine, other in ((ours.latest(), theirs.latest()), (ours.base(), theirs.base())):
+            assert (mine is None) == (other is None)
+            assert mine is None or same_arrays(mine.arrays, other.arrays)
+    return True
+
+
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_a_copy_is_the_store_and_goes_on_by_itself(either, tmp_path, mode):
+    before = kept(either)
+    with Store.open(either, mode=mode) as opened:
+        opened.backup(tmp_path / "new" / "copy")
+        opened.backup(str(tmp_path / "another"))
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["copy"]
+    assert sorted(path.name for path in (tmp_path / "new" / "copy").iterdir()) == ["generations", "journal.sqlite"]
+    assert same_store(tmp_path / "new" / "copy", either)
+    assert kept(either) == before
+    assert folders(tmp_path / "another") == folders(either)
+    with Store.open(tmp_path / "another") as copy:
+        assert add(copy, 99).sequence == 21
+        commit(copy.commit, 21)
+    assert damage(tmp_path / "another") == []
+
+
+def test_a_store_without_rows_or_with_a_log_is_copied_too(opened, tmp_path):
+    opened.backup(tmp_path / "empty")
+    assert same_store(tmp_path / "empty", opened.path)
+    add(opened, 1)
+    crashed = as_after_a_crash(opened, tmp_path / "crashed")
+    assert (crashed / "journal.sqlite-wal").stat().st_size > 0
+    with Store.open(crashed, mode="read") as reader:
+        reader.backup(tmp_path / "copy")
+    assert same_store(tmp_path / "copy", opened.path)
+
+
+def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
+    add(opened, 1)
+    with opened.batch():
+        add(opened, 2)
+        opened.backup(tmp_path / "copy")
+    with Store.open(tmp_path / "copy", mode="read") as copy:
+        assert copy.last == 1
+
+
+def test_a_generation_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
+    real, instants = store.backup._copy_tree, ["before", "after", "within"]
+    with Store.open(plain) as writer:
+        commit(writer.commit, 20)
+
+        def replaced(source, target):
+            # The first call of each attempt copies the folder, those within it its arrays.
+            outer = source.parent.name == "generations"
+            instant = instants[-1] if instants else ""
+            if instants and (instant == "within") != outer:
+                instants.pop()
+                if instant == "after":
+                    real(source, target)
+                commit(writer.commit, 20)
+                if instant == "after":
+                    return
+            real(source, target)
+
+        monkeypatch.setattr(store.backup, "_copy_tree", replaced)
+        with Store.open(plain, mode="read") as reader:
+            reader.backup(tmp_path / "copy")
+        assert instants == []
+    assert same_store(tmp_path / "copy", plain)
+    assert folders(tmp_path / "copy") == ["00000006"]
+
+
+def test_rows_that_come_while_it_is_made_are_in_none_of_its_parts(plain, tmp_path, monkeypatch):
+    """All parts are of one moment: the journal, too, though it is copied last."""
+    real = store.backup._copy_generations
+    with Store.open(plain) as writer:
+        as_it_was = shutil.copytree(plain, tmp_path / "before", ignore=shutil.ignore_patterns("*-shm", "lock"))
+
+        def and_then(*arguments):
+            real(*arguments)
+            add(writer, 21)
+            commit(writer.commit, 21)
+            commit(writer.compact, 21)
+
+        monkeypatch.setattr(store.backup, "_copy_generations", and_then)
+        writer.backup(tmp_path / "copy")
+    assert same_store(tmp_path / "copy", as_it_was)
+
+
+def test_what_is_there_is_not_written_over(plain, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "door").symlink_to(plain)
+    before = kept(tmp_path)
+    with Store.open(plain, mode="read") as opened:
+        for name in ("folder", "file", "link", "s"):
+            with pytest.raises(NotAStoreError, match="is there already"):
+                opened.backup(tmp_path / name)
+        for inside in (
+            plain / "copy",
+            plain / "generations" / "9",
+            tmp_path / "door" / "copy",
+            plain / ".." / "s" / "c",
+        ):
+            with pytest.raises(NotAStoreError, match="inside"):
+                opened.backup(inside)
+    assert kept(tmp_path) == before
+    assert list((tmp_path / "folder").iterdir()) == []
+
+
+def test_a_damaged_store_is_not_copied(plain, tmp_path):
+    change(plain, "UPDATE record SET label = 'z' WHERE sequence = 18")
+    with Store.open(plain) as opened, pytest.raises(DamageError, match=r"s/journal.sqlite|row 18 fails") as caught:
+        opened.backup(tmp_path / "copy")
+    assert caught.value.path == plain
+    repair_store(plain)
+    flip(plain / "generations" / "00000002" / "rows" / "c" / "0" / "0")
+    with Store.open(plain) as opened, pytest.raises(DamageError, match="array 'rows' of generation 2"):
+        opened.backup(tmp_path / "copy")
+    (plain / "generations" / "00000002" / "zarr.json").unlink()
+    with Store.open(plain) as opened, pytest.raises(DamageError, match="generation 2"):
+        opened.backup(tmp_path / "copy")
+    shutil.rmtree(plain / "generations" / "00000002")
+    with Store.open(plain) as opened, pytest.raises(StoreError, match="generations/00000002: No such file"):
+        opened.backup(tmp_path / "copy")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
+
+
+def test_a_full_or_forbidden_disk_leaves_nothing(tmp_path, small_disk):
+    with Store.open(tmp_path / "s", identity={}) as opened:
+        for number in range(40):
+            opened.append("a", "b", b"", arrays={"x": np.random.default_rng(number).integers(0, 2**60, 5000)})
+        with pytest.raises(StoreFullError, match="free some space"):
+            opened.backup(small_disk / "copy")
+        assert list(small_disk.iterdir()) == []
+        opened.commit({"x": np.random.default_rng(0).integers(0, 2**60, 200_000)}, upto=40)
+        with pytest.raises(StoreFullError):
+            opened.backup(small_disk / "copy")
+        assert list(small_disk.iterdir()) == []
+        subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+        with pytest.raises(ReadOnlyError):
+            opened.backup(small_disk / "copy")
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
+def test_all_of_it_is_durable_before_it_appears(plain, tmp_path, monkeypatch):
+    events, fsync, rename = [], os.fsync, os.rename
+    monkeypatch.setattr(
+        os, "fsync", lambda file: (events.append(str(Path(f"/proc/self/fd/{file}").readlink())), fsync(file))
+    )
+    monkeypatch.setattr(os, "rename", lambda old, new: (events.append(("rename", str(old))), rename(old, new)))
+    with Store.open(plain, mode="read") as opened:
+        opened.backup(tmp_path / "copy")
+    (i,) = (i for i in range(len(events)) if events[i][0] == "rename")
+    draft, copy = events[i][1], tmp_path / "copy"
+    written = {str(path).replace(str(copy), draft) for path in (copy, *copy.rglob("*"))}
+    assert set(events[:i]) >= written
+    assert events[i + 1 :] == [str(tmp_path)]
+
+
+def test_copies_made_under_a_writer_in_another_process_are_states_that_it_acknowledged(tmp_path):
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / "s")],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(store.__file__).parents[1])},
+    )
+    acknowledged = [0]
+
+    def hear():
+        for line in writer.stdout:
+            acknowledged.append(int(line))
+
+    heard = threading.Thread(target=hear)
+    heard.start()
+    try:
+        while acknowledged[-1] < 4:
+            assert writer.poll() is None
+        for i in range(6):
+            before = acknowledged[-1]
+            with Store.open(tmp_path / "s", mode="read") as reader:
+                reader.backup(tmp_path / str(i))
+            assert damage(tmp_path / str(i)) == []
+            with Store.open(tmp_path / str(i), mode="read") as copy:
+                last, newest = copy.last, copy.latest()
+                # One more may be durable that was not yet told.
+                assert before <= last <= acknowledged[-1] + 1
+                assert [len(record.arrays["x"]) for record in copy.records()] == [n % 2000 for n in range(1, last + 1)]
+                assert newest.number == copy.newest
+                assert newest.upto == newest.arrays["sum"] <= last
+                assert last - newest.upto <= 3
+    finally:
+        writer.kill()
+        heard.join()
+        writer.stdout.close()
+        writer.wait()

@@ -6,6 +6,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Mapping
+from io import BytesIO
 
 import numpy as np
 
@@ -140,33 +141,21 @@ def decode_payload(payload: bytes) -> dict[str, np.ndarray]:
     Raises VersionError for a payload of a newer version and ValueError for bytes that are no payload.
     """
     try:
-        return _decode(_Cursor(payload))
-    except (struct.error, UnicodeDecodeError, RuntimeError, TypeError) as error:
+        return _decode(BytesIO(payload))
+    except (struct.error, UnicodeDecodeError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"not a payload of arrays: {error}") from error
 
 
-class _Cursor:
-    def __init__(self, payload: bytes) -> None:
-        self._payload, self._position = memoryview(payload), 0
+def _decode(stream: BytesIO) -> dict[str, np.ndarray]:
+    def unpack(layout: str) -> tuple[int, ...]:
+        return struct.unpack(layout, stream.read(struct.calcsize(layout)))
 
-    def take(self, length: int) -> bytes:
-        part = bytes(self._payload[self._position : self._position + length])
-        if len(part) != length:
-            raise ValueError("the payload ends early")
-        self._position += length
-        return part
+    def text() -> str:
+        return stream.read(*unpack("<B")).decode("ascii")
 
-    def unpack(self, layout: str) -> tuple[int, ...]:
-        return struct.unpack(layout, self.take(struct.calcsize(layout)))
-
-    def text(self) -> str:
-        return self.take(*self.unpack("<B")).decode("ascii")
-
-
-def _decode(cursor: _Cursor) -> dict[str, np.ndarray]:
-    if cursor.take(4) != MAGIC:
+    if stream.read(4) != MAGIC:
         raise ValueError("the payload does not start with its magic number")
-    version, count = cursor.unpack("<BH")
+    version, count = unpack("<BH")
     if version > PAYLOAD_VERSION:
         raise VersionError(
             f"a record's arrays are written in payload format {version}; this release reads up to "
@@ -174,20 +163,22 @@ def _decode(cursor: _Cursor) -> dict[str, np.ndarray]:
         )
     described = []
     for _ in range(count):
-        name, dtype = cursor.text(), cursor.text()
-        (dimensions,) = cursor.unpack("<B")
-        array = np.empty(cursor.unpack(f"<{dimensions}Q"), np.dtype(dtype))
-        codec, size, stored = cursor.unpack("<BQQ")
+        name, dtype = text(), text()
+        (dimensions,) = unpack("<B")
+        array = np.empty(unpack(f"<{dimensions}Q"), np.dtype(dtype))
+        codec, size, stored = unpack("<BQQ")
         if array.nbytes != size:
             raise ValueError(f"array {name!r} of {array.nbytes} bytes is said to have {size}")
         described.append((name, array, codec, stored))
     for _, array, codec, stored in described:
-        _fill(array, codec, cursor.take(stored))
+        _fill(array, codec, stream.read(stored), stored)
     return {name: array for name, array, _, _ in described}
 
 
-def _fill(array: np.ndarray, codec: int, buffer: bytes) -> None:
+def _fill(array: np.ndarray, codec: int, buffer: bytes, size: int) -> None:
     target = flat_bytes(array)
+    if len(buffer) != size:
+        raise ValueError("the payload ends early")
     if codec == RAW:
         target[:] = np.frombuffer(buffer, np.uint8)
     elif codec == BLOSC:

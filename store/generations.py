@@ -48,36 +48,30 @@ class Generations:
     def latest(self, only: Collection[str] | None = None) -> Generation | None:
         """Return the newest generation that verifies, None when there is none; only: the arrays to read, or all."""
         passed: set[int] = set()
-        while True:
-            row = self._find(lambda row: row.number not in passed)
-            if row is None:
-                return None
+        while (row := self._find(lambda row: row.number not in passed)) is not None:
             passed.add(row.number)
             try:
                 return self._load(row, only)
             except DamageError as damage:
-                if self._is_named(row):
+                if row.number in self.named():
                     logger.warning("%s; replaying the journal behind an older generation, or all of it", damage)
+        return None
 
     def base(self) -> Generation | None:
-        """Return the generation that stands for the compacted rows, None when there is none."""
+        """Return the generation that stands for the compacted rows, None when there are none."""
         while (row := self._find(lambda row: bool(row.base))) is not None:
             try:
                 return self._load(row)
             except DamageError:
-                if self._is_named(row):
+                if row.number in self.named():
                     raise
         return None
 
     def _find(self, wanted: Callable[[GenerationRow], bool]) -> GenerationRow | None:
         return next((row for row in self._journal.generations() if wanted(row)), None)
 
-    def _is_named(self, row: GenerationRow) -> bool:
-        # A writer may have replaced and removed it while it was read: that is no damage.
-        return row.number in self.named()
-
     def named(self) -> set[int]:
-        """Return the numbers of the generations that the journal names just now."""
+        """Return the numbers of the generations that the journal names just now: a writer replaces and removes them."""
         return {row.number for row in self._journal.generations()}
 
     def _load(self, row: GenerationRow, only: Collection[str] | None = None) -> Generation:

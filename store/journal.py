@@ -222,9 +222,7 @@ class Journal:
             raise self._damage(f"the arrays of row {head.sequence} are missing from", head.sequence)
         try:
             if payload_digest(payload) == digest:
-                return Record(
-                    head.sequence, head.kind, head.label, head.key, head.time, head.attributes, decode_payload(payload)
-                )
+                return Record(**vars(head), arrays=decode_payload(payload))
         except (TypeError, ValueError):
             pass
         raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)

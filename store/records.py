@@ -71,15 +71,9 @@ class Head:
 
 # Without eq: comparing arrays element by element has no single truth value.
 @dataclass(frozen=True, eq=False)
-class Record:
-    """One durable row of the journal, as `Head`; the arrays are fresh copies, the caller's to change."""
+class Record(Head):
+    """One durable row of the journal, with its arrays: fresh copies, the caller's to change."""
 
-    sequence: int
-    kind: str
-    label: str
-    key: bytes
-    time: float
-    attributes: Mapping[str, JSON]
     arrays: Mapping[str, np.ndarray]
 
 

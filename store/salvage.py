@@ -7,7 +7,6 @@ import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -120,34 +119,22 @@ class Salvage:
     def _open(self, undo: ExitStack) -> None:
         log = self.path.with_name(self.path.name + LOG)
         frame, fault = damaged_frame(log), header_fault(self.path)
-        if frame is not None:
-            self.damage.append(describe_frame(log, frame))
-        fits = fault is None
-        if fault is not None:
-            self.damage.append(fault)
-        elif frame is None:
-            connection = undo.enter_context(closing(connect(self.path, write=False)))
-            if fits := self._is_readable(connection):
-                self._connection = connection
-                self.damage += self._found_by_sqlite()
-                return
-            self.damage.append(f"the tables of {self.path} are not where and what they were made as")
-        copy = _mended(self.path, Path(undo.enter_context(TemporaryDirectory())), page=not fits, log=frame is not None)
-        self._connection = undo.enter_context(closing(connect(copy, write=False)))
-        if not self._is_readable(self._connection) and fits:
-            self.damage.append(f"the tables of {self.path} are not where and what they were made as")
-
-    def _is_readable(self, connection: sqlite3.Connection) -> bool:
-        # With a writable schema SQLite reads even a file that is shorter than it says; nothing is written.
-        for setting in ("OFF", "ON"):
+        self.damage += [] if frame is None else [describe_frame(log, frame)]
+        self.damage += [] if fault is None else [fault]
+        if not self.damage:
+            self._connection = undo.enter_context(closing(connect(self.path, write=False)))
             try:
-                connection.execute(f"PRAGMA writable_schema = {setting}")
-                return has_our_schema(connection)
+                if has_our_schema(self._connection):
+                    self.damage += self._found_by_sqlite()
+                    return
+                self.damage.append(f"the tables of {self.path} are not where and what they were made as")
             except SQLITE_ERRORS as error:
                 self._require_damage(error)
-                if setting == "OFF":
-                    self.damage.append(f"SQLite refuses to read {self.path}: {error}")
-        return False
+                self.damage.append(f"SQLite refuses to read {self.path}: {error}")
+        copy = _mended(self.path, Path(undo.enter_context(TemporaryDirectory())), log=frame is not None)
+        self._connection = undo.enter_context(closing(connect(copy, write=False)))
+        # So SQLite reads even a file that is shorter than it says; nothing is written.
+        self._connection.execute("PRAGMA writable_schema = ON")
 
     def _found_by_sqlite(self) -> list[str]:
         rows, whole = self._until_damage("PRAGMA integrity_check")
@@ -238,13 +225,6 @@ class Salvage:
         """Return the payload of a row, not verified, None where there is none; and whether that could be read."""
         rows, whole = self._until_damage("SELECT bytes FROM payload WHERE sequence = ?", sequence)
         found = rows[0][0] if rows else None
-        if found is None and self.damage:
-            # A damaged index leads past the row; a scan from a little before or behind it still meets it.
-            near = "SELECT bytes, sequence FROM payload WHERE sequence"
-            for side in ("> ? - 256 ORDER BY sequence", "< ? + 256 ORDER BY sequence DESC"):
-                for row in islice(self._scan(f"{near} {side}", sequence), 512):
-                    if row is not None and row[1] == sequence:
-                        found = row[0]
         # A flipped bit can also change a value's type; no payload is empty.
         return (found if found is None or isinstance(found, bytes) else b""), whole
 
@@ -262,16 +242,15 @@ class Salvage:
         self._undo.close()
 
 
-def _mended(path: Path, scratch: Path, *, page: bool, log: bool) -> Path:
-    """Copy the journal and its log, and give the copies a new first page, or a log that SQLite reads to its end."""
+def _mended(path: Path, scratch: Path, *, log: bool) -> Path:
+    """Copy the journal, with a new first page, and its log, where that is damaged such that SQLite reads it to its end."""
     copy, beside = scratch / JOURNAL_FILE, path.with_name(path.name + LOG)
     shutil.copyfile(path, copy)
     if log:
         mend_log(beside, scratch / beside.name)
     elif beside.exists():
         shutil.copyfile(beside, scratch / beside.name)
-    if page:
-        build_journal(scratch / "new", {})
-        with copy.open("r+b") as file:
-            file.write(new_first_page((scratch / "new").read_bytes()[:PAGE_BYTES]))
+    build_journal(scratch / "new", {})
+    with copy.open("r+b") as file:
+        file.write(new_first_page((scratch / "new").read_bytes()[:PAGE_BYTES]))
     return copy

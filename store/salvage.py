@@ -243,7 +243,7 @@ class Salvage:
 
 
 def _mended(path: Path, scratch: Path, *, log: bool) -> Path:
-    """Copy the journal, with a new first page, and its log, where that is damaged such that SQLite reads it to its end."""
+    """Copy the journal, with a new first page, and its log; of a damaged log one that SQLite reads to its end."""
     copy, beside = scratch / JOURNAL_FILE, path.with_name(path.name + LOG)
     shutil.copyfile(path, copy)
     if log:

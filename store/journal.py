@@ -6,9 +6,8 @@ import logging
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
@@ -161,73 +160,53 @@ class Journal:
             self._last = sequence
             return sequence
 
-    def heads(self, after: int, last: int, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+    def rows(
+        self, after: int, last: int, *, arrays: bool, kind: str | None = None, label: str | None = None
+    ) -> Iterator[Head]:
         """Yield the verified rows behind `after` up to `last`, of one kind or label only where it is given.
 
-        Raises DamageError at the first of them that fails its checksum or, where all are asked for, is missing.
+        arrays: as records, one in memory at a time. Raises DamageError at the first that fails its checksum, whose
+        arrays do or are missing, or that is missing itself where all are asked for; CompactedError where a base has
+        the arrays' place.
         """
-        chosen = [f"{column} = ?" for column, value in (("kind", kind), ("label", label)) if value is not None]
-        values = [value for value in (kind, label) if value is not None]
-        where = " AND ".join(["sequence > ?", "sequence <= ?", *chosen])
-        query = f"SELECT {HEAD_COLUMNS} FROM record WHERE {where} ORDER BY sequence LIMIT {TOGETHER}"
+        chosen = {column: value for column, value in (("kind", kind), ("label", label)) if value is not None}
+        where = " AND ".join(["sequence > ?", "sequence <= ?", *(f"{column} = ?" for column in chosen)])
+        payload = ", (SELECT bytes FROM payload WHERE sequence = record.sequence)" if arrays else ""
+        together = 1 if arrays else TOGETHER
+        query = f"SELECT {HEAD_COLUMNS}{payload} FROM record WHERE {where} ORDER BY sequence LIMIT {together}"
         while after < last:
             with self._using(f"reading rows behind {after}") as connection:
-                rows = connection.execute(query, (after, last, *values)).fetchall()
-            for row in rows:
+                rows = connection.execute(query, (after, last, *chosen.values())).fetchall()
+            for *fields, payload in rows if arrays else ((*row, b"") for row in rows):
                 if not chosen:
-                    self._require_next(after, row[0])
-                yield self._head(row)[0]
-                after = row[0]
-            if len(rows) < TOGETHER:
+                    self._require_no_gap(after + 1, fields[0] - 1)
+                found = read_head(tuple(fields))
+                if found is None:
+                    raise self._damage(f"row {fields[0]} fails its checksum in", fields[0])
+                yield self._record(*found, payload) if arrays else found[0]
+                after = fields[0]
+            if len(rows) < together:
                 if not chosen:
-                    self._require_next(after, last + 1)
+                    self._require_no_gap(after + 1, last)
                 return
 
-    def _require_next(self, after: int, sequence: int) -> None:
-        for first, last in uncovered(after + 1, sequence - 1, self._lost):
-            raise self._damage(f"rows {first} to {last} are missing from", last)
+    def _require_no_gap(self, first: int, last: int) -> None:
+        for begin, end in uncovered(first, last, self._lost):
+            raise self._damage(f"rows {begin} to {end} are missing from", end)
 
-    def _head(self, row: tuple[Any, ...]) -> tuple[Head, bytes]:
-        """The verified row, and the digest of its payload."""
-        found = read_head(row)
-        if found is None:
-            raise self._damage(f"row {row[0]} fails its checksum in", row[0])
-        return found
-
-    def row_after(self, after: int) -> Record | None:
-        """Return the verified row that follows sequence `after`, with its arrays; None when that was the last.
-
-        Raises DamageError when the row or its arrays fail their checksums or are missing, and CompactedError
-        where a base has the arrays' place.
-        """
-        columns = ", ".join(f"record.{column}" for column in HEAD_COLUMNS.split(", "))
-        query = (
-            f"SELECT {columns}, payload.bytes FROM record LEFT JOIN payload ON payload.sequence = record.sequence"
-            " WHERE record.sequence > ? ORDER BY record.sequence LIMIT 1"
-        )
-        with self._using(f"reading row {after + 1}") as connection:
-            row = connection.execute(query, (after,)).fetchone()
-            missing_to = self.last() if row is None else row[0] - 1
-        if missing_to > after:
-            for first, last in uncovered(after + 1, missing_to, self._lost):
-                raise self._damage(f"rows {first} to {last} are missing from", last)
-            raise self._given_up(after + 1)
-        if row is None:
-            return None
-        *fields, payload = row
-        head, digest = self._head(tuple(fields))
+    def _record(self, head: Head, digest: bytes, payload: object) -> Record:
         if payload is None:
             if head.sequence <= self.compacted():
-                raise self._given_up(head.sequence)
+                raise self.given_up(head.sequence)
             raise self._damage(f"the arrays of row {head.sequence} are missing from", head.sequence)
-        try:
-            if payload_digest(payload) == digest:
+        # A flipped bit can also change a value's type.
+        with suppress(TypeError, ValueError):
+            if isinstance(payload, bytes) and payload_digest(payload) == digest:
                 return Record(**vars(head), arrays=decode_payload(payload))
-        except (TypeError, ValueError):
-            pass
         raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)
 
-    def _given_up(self, sequence: int) -> CompactedError:
+    def given_up(self, sequence: int) -> CompactedError:
+        """Return the error for a row whose arrays a base stands for."""
         return CompactedError(
             f"the arrays of row {sequence} of {self.path} were given up when rows 1 to {self.compacted()} were "
             "compacted"

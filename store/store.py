@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
 
@@ -176,7 +176,7 @@ class Store:
         for what, text in (("the kind", kind), ("the label", label)):
             if text is not None:
                 check_text(what, text)
-        return self._journal.heads(after, self._journal.last(), kind=kind, label=label)
+        return self._journal.rows(after, self._journal.last(), arrays=False, kind=kind, label=label)
 
     def record(self, sequence: int) -> Record:
         """Return the record of this sequence.
@@ -187,9 +187,9 @@ class Store:
         last = self._journal.last()
         if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= last:
             raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-        record = self._journal.row_after(sequence - 1)
-        assert record is not None
-        return record
+        for record in self._journal.rows(sequence - 1, sequence, arrays=True):
+            return cast(Record, record)
+        raise self._journal.given_up(sequence)
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -205,18 +205,9 @@ class Store:
                 f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
                 "base(), and continue behind its upto"
             )
-        return self._walk(after, self._journal.last())
-
-    def _walk(self, after: int, last: int) -> Iterator[Record]:
         # A query for each row, so that a reader that pauses holds no transaction open: that would
         # keep the write-ahead log from ever being emptied.
-        while after < last:
-            self._check_open()
-            record = self._journal.row_after(after)
-            if record is None:
-                return
-            yield record
-            after = record.sequence
+        return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
 
     def latest(self, *, only: Collection[str] | None = None) -> Generation | None:
         """Return the newest generation that verifies, None when there is none.

@@ -2,8 +2,10 @@
 tests/faults/space.py --observations 1000000`.
 
 With the default kernels and simulated BioTac touches: bytes of an observation (a row of the journal), of a material
-and of an exemplar (in each generation, of which two are kept), before and after compaction. Then synthetic features
-of 64 dimensions, in batches of 10 000, without exemplars; compacted; opened three times, each in a fresh process.
+and of an exemplar (in the generation), before and after compaction. Then the store alone, with as many small rows: how
+long opening takes, a reader's look whether something came, the newest generation and the rows behind it. Then synthetic
+features of 64 dimensions, in batches of 10 000, without exemplars; compacted; opened three times, each in a fresh
+process.
 """
 
 from __future__ import annotations
@@ -17,11 +19,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from faults.common import file_system, folder, parser, progress, run
 from faults.feeding import BIOTAC, TINY, endless, observe, touches
 from scroll_tactile import TactileLearner
+from store import Store
 
 BATCH = 10_000
 BAR = 2.0  # seconds to open
@@ -74,6 +79,36 @@ def apiece(home: Path, count: int) -> dict[str, float]:
     }
 
 
+def rows_alone(home: Path, count: int) -> dict[str, Any]:
+    """Milliseconds of what a reader does with a store of so many rows, of which the last 100 are in no generation."""
+    path = home / "rows"
+    with Store.open(path, identity={}) as store:
+        for begin in range(0, count, BATCH):
+            with store.batch():
+                for i in range(begin, min(begin + BATCH, count)):
+                    store.append(
+                        "a", f"material {i % 1000}", i.to_bytes(16), arrays={"x": np.arange(8, dtype=np.int16)}
+                    )
+        store.commit({"x": np.zeros(1000)}, upto=max(count - 100, 0))
+    figures: dict[str, Any] = {"rows": count, "bytes": sum(file.stat().st_size for file in path.rglob("*.sqlite"))}
+    for mode in ("read", "write"):
+        begun = time.perf_counter()
+        store = Store.open(path, mode=mode)
+        figures[f"ms to open to {mode}"] = 1e3 * (time.perf_counter() - begun)
+        for what, look in {
+            "look whether something came": lambda store: (store.newest, store.last, store.compacted),
+            "read the newest generation's attributes": lambda store: store.latest(only=()),
+            "read the newest generation": lambda store: store.latest(),
+            "read the rows behind it": lambda store: list(store.records(after=store.latest(only=()).upto)),
+            "find the rows of one material": lambda store: list(store.heads(label="material 7")),
+        }.items():
+            begun = time.perf_counter()
+            look(store)
+            figures[f"ms to {what}, {mode}"] = 1e3 * (time.perf_counter() - begun)
+        store.close()
+    return figures
+
+
 def million(home: Path, observations: int, minutes: float, openings: int) -> dict[str, Any]:
     """A large memory: as many observations as asked, or as fit into the time."""
     path, figures = home / "large", {"asked": observations}
@@ -115,6 +150,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         if not options.quick:  # a memory of the default kernels takes seconds to make
             figures["bytes"] = apiece(home, 100)
             progress(str(figures["bytes"]))
+        figures["rows"] = rows_alone(home, observations)
         figures["large"] = large = million(home, observations, options.minutes, 1 if options.quick else 3)
         figures["load after"] = os.getloadavg()[0]
     failures = [f"opened in {took:.2f} s" for took in large["seconds to open"] if took > BAR and not options.quick]

@@ -81,14 +81,12 @@ def apiece(home: Path, count: int) -> dict[str, float]:
 
 def rows_alone(home: Path, count: int) -> dict[str, Any]:
     """Milliseconds of what a reader does with a store of so many rows, of which the last 100 are in no generation."""
-    path = home / "rows"
+    path, x = home / "rows", np.arange(8, dtype=np.int16)
     with Store.open(path, identity={}) as store:
         for begin in range(0, count, BATCH):
             with store.batch():
                 for i in range(begin, min(begin + BATCH, count)):
-                    store.append(
-                        "a", f"material {i % 1000}", i.to_bytes(16), arrays={"x": np.arange(8, dtype=np.int16)}
-                    )
+                    store.append("a", f"material {i % 1000}", i.to_bytes(16), arrays={"x": x})
         store.commit({"x": np.zeros(1000)}, upto=max(count - 100, 0))
     figures: dict[str, Any] = {"rows": count, "bytes": sum(file.stat().st_size for file in path.rglob("*.sqlite"))}
     for mode in ("read", "write"):

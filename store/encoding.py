@@ -12,13 +12,7 @@ import numpy as np
 
 from store.exceptions import RecordError, VersionError
 
-__all__ = [
-    "array_digest",
-    "check_arrays",
-    "decode_payload",
-    "encode_payload",
-    "flat_bytes",
-]
+__all__ = ["array_digest", "check_arrays", "decode_payload", "encode_payload", "flat_bytes"]
 
 MAGIC = b"ARPL"
 PAYLOAD_VERSION = 1

@@ -11,25 +11,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from store.exceptions import (
-    SQLITE_ERRORS,
-    DamageError,
-    NotAStoreError,
-    VersionError,
-    from_sqlite,
-    is_damage,
-    reported,
-)
+from store.exceptions import SQLITE_ERRORS, DamageError, NotAStoreError, VersionError, from_sqlite, is_damage, reported
 from store.files import file_size
 from store.header import header_fault, holds_store, new_first_page
-from store.records import (
-    GENERATION_COLUMNS,
-    HEAD_COLUMNS,
-    GenerationRow,
-    Spans,
-    read_meta,
-    united,
-)
+from store.records import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, Spans, read_meta, united
 from store.schema import FORMAT_VERSION, JOURNAL_FILE, LOG, PAGE_BYTES, build_journal, connect, has_our_schema
 from store.writeahead import damaged_frame, describe_frame, mend_log
 

@@ -241,11 +241,7 @@ class Store:
         return self._generations.base()
 
     def commit(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        *,
-        upto: int,
-        attributes: Mapping[str, JSON] | None = None,
+        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
     ) -> int:
         """Write a generation that contains the records up to `upto`, make it current, return its number.
 
@@ -259,11 +255,7 @@ class Store:
         return self._generations.commit(draft)
 
     def compact(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        *,
-        upto: int,
-        attributes: Mapping[str, JSON] | None = None,
+        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
     ) -> None:
         """Let a base stand for the records up to `upto`: they give up their arrays and keep their heads.
 
@@ -278,11 +270,7 @@ class Store:
         self._generations.compact(draft)
 
     def commit_later(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        *,
-        upto: int,
-        attributes: Mapping[str, JSON] | None = None,
+        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
     ) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 

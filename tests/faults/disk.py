@@ -12,26 +12,23 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import shutil
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.memory.ledger
 from faults import shim as watch
+from faults.attempts import SUCCESS, Attempt, Trials
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, State, after, opened, perform, seen, settle, warm
+from faults.model import Operation, State, after, opened, warm
 from faults.plans import prepare
 from faults.shim import Shim
-from store import ReadOnlyError, StoreError, StoreFullError
 
-NEVER = 2**40
 SIZE = 12 * 2**20
 
 GROUND: Operation = ("batch", tuple(("observe", name, (i, 90)) for i in range(4) for name in "abü"))
@@ -81,124 +78,77 @@ def fill(where: Path, left: int) -> None:
             room -= file.write(bytes(min(room, 2**20)))
 
 
-class Bench:
+class Bench(Trials):
     """One memory, brought back to the same state before each operation."""
 
     def __init__(self, home: Path) -> None:
-        self.home = home
-        self.others = prepare(home)
-        self.failures: list[str] = []
-        self.outcomes: dict[str, Counter[str]] = {}
-        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
+        super().__init__(home, prepare(home))
         self.ground, _ = after(State(), GROUND, self.others)
-        with opened(home / "ground") as learner:
-            perform(learner, GROUND, home)
-        self.tried = 0
+        filling = Attempt(GROUND, home / "ground", home)
+        filling.learner = opened(filling.path)
+        filling.do()
+        filling.learner.close()
 
-    def ready(self, path: Path, operation: Operation) -> Any:
-        """A learner of a copy, None where it is to be opened."""
-        shutil.rmtree(path, ignore_errors=True)
-        shutil.copytree(self.home / "ground", path)
-        learner = None if operation[0] == "open" else opened(path)
-        if operation[0] == "close":
-            learner._ledger._saved = -1  # so that there is a generation to write
-        return learner
+    def ready(self, path: Path, operation: Operation) -> Attempt:
+        """An operation to be done with a fresh copy."""
+        return Attempt(operation, path, self.home, self.home / "ground")
 
-    def attempt(self, path: Path, learner: Any, operation: Operation) -> tuple[str, Any]:
-        """Do it: the name of the error, or "done", and the learner."""
-        try:
-            if operation[0] == "open":
-                return "done", opened(path)
-            if operation[0] == "close":
-                learner.close()
-                return "done", learner
-            perform(learner, operation, self.home)
-        except StoreError as error:
-            return type(error).__name__, learner
-        except Exception as error:
-            self.failures.append(f"{operation[0]} in {path.name}: not a StoreError: {error!r}")
-            return "not a StoreError", learner
-        return "done", learner
-
-    def require(self, where: str, learner: Any, state: State) -> None:
-        """What is seen of a learner is what is expected."""
-        found, differ = settle(seen(learner), [state])
-        if found is None:
-            self.failures.append(f"{where}: differs in {differ}")
-
-    def then(self, operation: Operation) -> State:
+    def then(self, attempt: Attempt, outcome: str) -> State:
         """The state after an operation."""
-        return self.ground if operation[0] in ("open", "close") else after(self.ground, operation, self.others)[0]
+        done = outcome == SUCCESS and not attempt.changes_nothing
+        return after(self.ground, attempt.operation, self.others)[0] if done else self.ground
 
-    def note(self, name: str, outcome: str) -> None:
-        """Count."""
-        self.tried += 1
-        self.outcomes.setdefault(name, Counter())[outcome] += 1
-
-    def examined(self, where: str, *rest: Any) -> None:
-        """As `afterwards`; what it raises is a failure, and not the end."""
-        try:
-            self.afterwards(where, *rest)
-        except Exception as error:
-            self.failures.append(f"{where}: afterwards {error!r}")
-
-    def afterwards(self, where: str, path: Path, learner: Any, operation: Operation, outcome: str) -> None:
+    def afterwards(self, where: str, attempt: Attempt, outcome: str) -> None:
         """With the fault over: nothing was changed by what was refused, and it can be done."""
-        done = outcome == "done"
-        if operation[0] in ("open", "close"):
-            learner = learner if outcome == "done" and operation[0] == "open" else opened(path)
-            done = True
-        self.require(f"{where}: after {outcome}", learner, self.then(operation) if done else self.ground)
-        if not done:
-            again, _ = self.attempt(path, learner, operation)
-            if again != "done":
+        if attempt.changes_nothing and not (outcome == SUCCESS and attempt.operation[0] == "open"):
+            attempt.learner = opened(attempt.path)
+        self.require(f"{where}: after {outcome}", attempt.learner, [self.then(attempt, outcome)])
+        if outcome != SUCCESS and not attempt.changes_nothing:
+            if (again := self.outcome(where, attempt.do)) != SUCCESS:
                 self.failures.append(f"{where}: when there was room again it said {again}")
-            self.require(f"{where}: done again", learner, self.then(operation))
-        learner.close()
-        with opened(path) as learner:
-            self.require(f"{where}: opened at last", learner, self.then(operation))
+            self.require(f"{where}: done again", attempt.learner, [self.then(attempt, SUCCESS)])
+        attempt.learner.close()
+        with opened(attempt.path) as learner:
+            self.require(f"{where}: opened at last", learner, [self.then(attempt, SUCCESS)])
 
 
 def full(bench: Bench, where: Path, rooms: list[int]) -> None:
     """Each operation with ever more room, until it fits."""
     for name, operation in OPERATIONS.items():
         for room in rooms:
-            path = where / "memory"
-            learner = bench.ready(path, operation)
+            attempt = bench.ready(where / "memory", operation)
             fill(where, room)
             told = f"{name}, {room} bytes left"
             with warnings_told(lambda text: None):
-                outcome, learner = bench.attempt(path, learner, operation)
-                if outcome not in ("done", "StoreFullError"):
+                outcome = bench.outcome(told, attempt.do)
+                if outcome not in (SUCCESS, "StoreFullError"):
                     bench.failures.append(f"{told}: {outcome}")
-                if learner is not None and operation[0] not in ("open", "close"):
-                    bench.require(told, learner, bench.then(operation) if outcome == "done" else bench.ground)
-                    with opened(path, "read") as reader:
-                        bench.require(
-                            f"{told}, a reader", reader, bench.then(operation) if outcome == "done" else bench.ground
-                        )
+                if attempt.learner is not None and not attempt.changes_nothing:
+                    expected = [bench.then(attempt, outcome)]
+                    bench.require(told, attempt.learner, expected)
+                    with opened(attempt.path, "read") as reader:
+                        bench.require(f"{told}, a reader", reader, expected)
                 (where / "filler").unlink()
-                bench.examined(told, path, learner, operation, outcome)
+                bench.examined(told, partial(bench.afterwards, told, attempt, outcome))
             bench.note(f"full: {name}", outcome)
-            if outcome == "done" and room:
+            if outcome == SUCCESS and room:
                 break
-        if bench.outcomes[f"full: {name}"][StoreFullError.__name__] == 0 and name != "open":
+        if bench.outcomes[f"full: {name}"]["StoreFullError"] == 0 and name != "open":
             bench.failures.append(f"{name}: was never refused by a full disk")
 
 
 def read_only(bench: Bench, where: Path) -> None:
     """A disk mounted to be read."""
-    path = where / "memory"
-    bench.ready(path, ("open",))
+    attempt = bench.ready(where / "memory", ("open",))
     subprocess.run(["mount", "-o", "remount,ro", where], check=True)
     try:
-        outcome, _ = bench.attempt(path, None, ("open",))
+        outcome = bench.outcome("opening to write on a read-only disk", attempt.do)
         bench.note("read-only: open to write", outcome)
-        if outcome != ReadOnlyError.__name__:
+        if outcome != "ReadOnlyError":
             bench.failures.append(f"opening to write on a read-only disk: {outcome}")
-        with opened(path, "read") as reader:
-            bench.require("opened to read on a read-only disk", reader, bench.ground)
-            bench.note("read-only: open to read", "done")
+        with opened(attempt.path, "read") as reader:
+            bench.require("opened to read on a read-only disk", reader, [bench.ground])
+            bench.note("read-only: open to read", SUCCESS)
     finally:
         subprocess.run(["mount", "-o", "remount,rw", where], check=True)
 
@@ -207,15 +157,16 @@ def from_now_on(bench: Bench, path: Path, name: str, error: int, allowed: tuple[
     """All writing calls fail from one instant on, and then no more."""
     shim = Shim()
     for operation_name, operation in OPERATIONS.items():
-        learner = bench.ready(path, operation)
+        told = f"{name}: {operation_name}"
+        attempt = bench.ready(path, operation)
         with warnings_told(lambda text: None):
             shim.arm(path, watch.FAIL, watch.WRITES, first=1, last=watch.FOREVER, error=error)
-            outcome, learner = bench.attempt(path, learner, operation)
+            outcome = bench.outcome(told, attempt.do)
             shim.disarm()
             if outcome not in allowed:
-                bench.failures.append(f"{name}: {operation_name}: {outcome}")
-            bench.examined(f"{name}: {operation_name}", path, learner, operation, outcome)
-        bench.note(f"{name}: {operation_name}", outcome)
+                bench.failures.append(f"{told}: {outcome}")
+            bench.examined(told, partial(bench.afterwards, told, attempt, outcome))
+        bench.note(told, outcome)
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:

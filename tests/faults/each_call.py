@@ -21,7 +21,6 @@ import errno
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -29,16 +28,14 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.memory.ledger
 from faults import shim as watch
+from faults.attempts import NEVER, SUCCESS, Attempt, Trials, copied
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, Other, State, after, one_scale, opened, perform, seen, settle, warm
+from faults.model import Operation, Other, State, after, one_scale, opened, perform, warm
 from faults.plans import prepare
 from faults.shim import Shim
 from faults.zygote import Zygote
-from store import StoreError
 
-NEVER = 2**40
 SLOW = ("compact", "fine_tune")
 GENERATIONS = ("fine-tune", "compact", "close", "compact all but 3", "observe, and a generation", "open")
 SECOND_LOOK = 3  # of so many calls of a step that writes generations one is looked at by opening anew, too
@@ -90,12 +87,9 @@ class Step:
     calls: Counter[str] = field(default_factory=Counter)
     outcomes: Counter[str] = field(default_factory=Counter)
 
-
-def copied(path: Path, to: Path) -> None:
-    """A copy as after a crash; what the lock's holder and SQLite have in memory only is left out."""
-    shutil.rmtree(to, ignore_errors=True)
-    if path.exists():
-        shutil.copytree(path, to, ignore=shutil.ignore_patterns("*-shm", "lock"))
+    def attempt(self, path: Path, home: Path) -> Attempt:
+        """The step, to be done on a fresh copy."""
+        return Attempt(self.operation, path, home, self.start, self.every)
 
 
 def plan(home: Path, others: dict[str, Other]) -> list[Step]:
@@ -133,42 +127,9 @@ def leave_unfinished(path: Path) -> None:
     (path / "holder.json.new").write_text("{", encoding="utf-8")
 
 
-class Attempt:
-    """One step done once, on a fresh copy, with one call of it failing."""
-
-    def __init__(self, step: Step, path: Path, home: Path, *, fresh: bool = True) -> None:
-        self.step, self.path, self.home = step, path, home
-        self.learner: Any = None
-        if not fresh:
-            return
-        copied(step.start, path)
-        path.parent.mkdir(exist_ok=True)
-        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
-        if step.operation[0] != "open":
-            self.learner = opened(path)
-        if step.operation[0] == "close":
-            # Opening replayed all rows: nothing would be written.
-            self.learner._ledger._saved = -1
-
-    def do(self) -> Any:
-        """Do the step, and wait for what goes on behind it."""
-        scroll_tactile.memory.ledger.SNAPSHOT_EVERY = self.step.every
-        try:
-            if self.step.operation[0] == "open":
-                self.learner = opened(self.path)
-                return None
-            if self.step.operation[0] == "close":
-                return self.learner.close()
-            result = perform(self.learner, self.step.operation, self.home)
-            self.learner._ledger.store._generations.wait()
-            return result
-        finally:
-            scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER
-
-
 def crash(channel: Connection, step: Step, path: Path, home: Path, how: str, number: int) -> None:
     """The child: do a step, and end in the middle of it; it returns where there is no such call."""
-    attempt = Attempt(step, path, home)
+    attempt = step.attempt(path, home)
     mode, what, error = MODES[how]
     shim = Shim()
     with warnings_told(lambda text: None):
@@ -178,109 +139,79 @@ def crash(channel: Connection, step: Step, path: Path, home: Path, how: str, num
     channel.send("not reached")
 
 
-class Trial:
+class Trial(Trials):
     """All the calls of all the steps."""
 
     def __init__(self, home: Path, zygote: Zygote, others: dict[str, Other]) -> None:
-        self.home, self.zygote, self.others = home, zygote, others
-        self.path = home / "run" / "memory"
-        self.shim = Shim()
-        self.failures: list[str] = []
+        super().__init__(home, others)
+        self.zygote, self.path, self.shim = zygote, home / "run" / "memory", Shim()
         self.shown = 0
-        self.tried: Counter[str] = Counter()
 
     def fail(self, step: Step, how: str, number: int) -> bool:
         """Let call `number` fail; whether there was one."""
         mode, what, error = MODES[how]
-        attempt = Attempt(step, self.path, self.home)
+        attempt = step.attempt(self.path, self.home)
         warned: list[str] = []
         with warnings_told(warned.append):
             self.shim.arm(self.path.parent, mode, what, first=number, error=error)
-            outcome = self._outcome(attempt.do)
+            outcome = self.outcome(where := f"{step.name}, {how} at call {number}", attempt.do)
             _, hit = self.shim.disarm()
-            where = f"{step.name}, {how} at call {number} ({hit})"
+            where += f" ({hit})"
             if hit:
-                if outcome == "success":
+                if outcome == SUCCESS:
                     outcome += ", warned" if warned else ""
-                self._note(step, how, hit, outcome)
-                self._examined(where, lambda: self._goes_on(where, attempt, outcome, number))
-            elif outcome != "success":
+                self._count(step, how, hit, outcome)
+                self.examined(where, lambda: self._goes_on(where, step, attempt, outcome, number))
+            elif outcome != SUCCESS:
                 self.failures.append(f"{where}: {outcome} without a fault")
-        self._let_go(attempt)
+        if attempt.learner is not None:
+            self.outcome(f"{where}: closing", attempt.learner.close)
         return bool(hit)
 
-    def _outcome(self, do: Callable[[], Any]) -> str:
-        try:
-            do()
-        except StoreError as error:
-            return type(error).__name__
-        except Exception as error:
-            return f"not a StoreError: {error!r}"
-        return "success"
-
-    def _note(self, step: Step, how: str, hit: str, outcome: str) -> None:
-        self.tried[how] += 1
+    def _count(self, step: Step, how: str, hit: str, outcome: str) -> None:
+        self.note(how, outcome)
         step.calls[hit.split(maxsplit=1)[0]] += 1
         step.outcomes[f"{how}: {outcome}"] += 1
-        if outcome.startswith("not a StoreError"):
-            self.failures.append(f"{step.name}, {how} ({hit}): {outcome}")
 
-    def _examined(self, where: str, look: Callable[[], None]) -> None:
-        try:
-            look()
-        except Exception as error:
-            self.failures.append(f"{where}: afterwards {error!r}")
-
-    def _goes_on(self, where: str, attempt: Attempt, outcome: str, number: int) -> None:
-        step, done = attempt.step, outcome.startswith("success")
+    def _goes_on(self, where: str, step: Step, attempt: Attempt, outcome: str, number: int) -> None:
         if self._second_look(step, number):
             copied(self.path, crashed := self.home / "crashed")
             with opened(crashed, "read" if (crashed / "journal.sqlite").exists() else "write") as learner:
-                self._require(f"{where}: as it lay on the disk then", seen(learner), [step.before, step.then])
+                self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then])
         if step.operation[0] == "close" or attempt.learner is None:
             attempt.learner = opened(self.path)
-        state = step.then if done else step.before
-        self._require(f"{where}: the learner, after {outcome}", seen(attempt.learner), [state])
-        self._finish(where, attempt, state, number)
+        state = step.then if outcome.startswith(SUCCESS) else step.before
+        self.require(f"{where}: the learner, after {outcome}", attempt.learner, [state])
+        self._finish(where, step, attempt.learner, state, number)
 
-    def _finish(self, where: str, attempt: Attempt, state: State, number: int) -> None:
+    def _finish(self, where: str, step: Step, learner: Any, state: State, number: int) -> None:
         """Go on from a state as if nothing had been: what was not done is done again, and one more observation."""
-        step, learner, thorough = attempt.step, attempt.learner, number % THOROUGH == 0
+        thorough = number % THOROUGH == 0
         if state is not step.then and (thorough or step.operation[0] not in SLOW):
             if (again := perform(learner, step.operation, self.home)) != step.result:
                 self.failures.append(f"{where}: done again it gave {again}, expected {step.result}")
             state = step.then
         state, _ = after(state, OBSERVE, self.others)
         perform(learner, OBSERVE, self.home)
-        self._require(f"{where}: after one more", seen(learner), [state])
+        self.require(f"{where}: after one more", learner, [state])
         # Closing the store alone writes no generation: what was told is in the journal.
         if not thorough:
             learner._ledger.store._generations.raise_failure = lambda: None
-        outcome = self._outcome(learner.close if thorough else learner._ledger.store.close)
-        if outcome != "success":
+        outcome = self.outcome(f"{where}: closing", learner.close if thorough else learner._ledger.store.close)
+        if outcome != SUCCESS:
             step.outcomes[f"closing told of the failure before it: {outcome}"] += 1
         if self._second_look(step, number):
             with opened(self.path) as again:
-                self._require(f"{where}: opened at last", seen(again), [state])
+                self.require(f"{where}: opened at last", again, [state])
 
     def _second_look(self, step: Step, number: int) -> bool:
         return step.name not in GENERATIONS or number % SECOND_LOOK == 0
-
-    def _require(self, where: str, found: dict[str, Any], states: list[State]) -> State:
-        state, differ = settle(found, states)
-        if state is None:
-            self.failures.append(f"{where}: differs in {differ}")
-        return state or states[-1]
 
     def told(self) -> None:
         """Show failures as they come."""
         for failure in self.failures[self.shown :]:
             progress(f"FAILED {failure}")
         self.shown = len(self.failures)
-
-    def _let_go(self, attempt: Attempt) -> None:
-        if attempt.learner is not None:
-            self._outcome(attempt.learner.close)
 
     def crash(self, step: Step, how: str, number: int) -> bool:
         """End the process at call `number`, and look at what is left; whether there was one."""
@@ -293,17 +224,16 @@ class Trial:
         if status != -9:
             self.failures.append(f"{where}: the child ended with {status}")
             return True
-        self._note(step, how, "-", "killed")
+        self._count(step, how, "-", "killed")
         with warnings_told(lambda text: self.failures.append(f"{where}: warned {text}")):
-            self._examined(where, lambda: self._recovers(where, step, number))
+            self.examined(where, lambda: self._recovers(where, step, number))
         return True
 
     def _recovers(self, where: str, step: Step, number: int) -> None:
-        attempt = Attempt(step, self.path, self.home, fresh=False)
-        attempt.learner = opened(self.path)
-        state = self._require(f"{where}: opened again", seen(attempt.learner), [step.before, step.then])
+        learner = opened(self.path)
+        state = self.require(f"{where}: opened again", learner, [step.before, step.then])
         step.outcomes["found as after" if state is step.then and step.then != step.before else "found as before"] += 1
-        self._finish(where, attempt, state, number)
+        self._finish(where, step, learner, state, number)
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
@@ -324,10 +254,10 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
                 while attempt(step, how, number):
                     number += stride
                     trial.told()
-            progress(f"{step.name}: {sum(trial.tried.values())} calls so far, {len(trial.failures)} failures")
+            progress(f"{step.name}: {trial.tried} calls so far, {len(trial.failures)} failures")
     return {
         "every": {"calls": every, "but of steps alike": {name: every * times for name, times in ALIKE.items()}},
-        "calls": dict(trial.tried),
+        "calls": {how: sum(counted.values()) for how, counted in trial.outcomes.items()},
         "steps": {step.name: dict(step.calls) for step in steps},
         "outcomes": {step.name: dict(step.outcomes) for step in steps},
         "failures": trial.failures,

@@ -11,14 +11,16 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
-from scroll_tactile.memory.exemplars import Exemplar, ranked_exemplars
+from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
+from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.current import CurrentModel
@@ -28,6 +30,7 @@ from scroll_tactile.results import Compacted, Composition, Constituent, Merged, 
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
 from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 
@@ -139,16 +142,24 @@ class TactileLearner:
             learner = cls.__new__(cls)
             learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
             learner._unverified = (identity, store.path) if embedding is None else None
-            plan = learner._plan
-            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, exemplars), store)
+            # An embedding of its user's own may not be there when a row is read: such rows have codes of their own.
+            plan, encode = learner._plan, learner._codes_of if capabilities_of(found).exact else None
+            bare = encode is not None and identity.embedding.configuration is not None
+            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, exemplars, encode), store, bare)
         except BaseException:
             store.close()
             raise
         return learner
 
+    def _codes_of(self, readings: npt.NDArray[np.float32]) -> Codes:
+        """The rows of codes of a touch whose readings a memory kept."""
+        touch = Stream(self._sensor, readings)
+        extractor = self._verified()
+        return extractor.codes(extractor.image(touch), touch.key)
+
     def __getstate__(self) -> dict[str, Any]:
         with self._ledger.lock:
-            arrays, attributes = self._ledger.memory.to_arrays()
+            arrays, attributes = self._ledger.snapshot()
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
             held = arrays, attributes, self._ledger.memory.sequence
@@ -461,8 +472,7 @@ class TactileLearner:
     def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
         """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order."""
         with self._ledger.lock:
-            memory = self._ledger.memory
-            return {} if memory.exemplars is None else ranked_exemplars(memory.exemplars, memory.statistics)
+            return self._ledger.ranked_exemplars()
 
     def fine_tune(
         self,

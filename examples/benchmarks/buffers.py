@@ -23,10 +23,11 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, mean_code, quotas, rank
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
 from scroll_tactile.pipelines.classification import hold_out
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import mean_code
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap", "run_buffers"]
 
@@ -90,10 +91,11 @@ class _Pooled:
         self._pool, self._means = ExemplarSample(capacity, ratio=ratio), means
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
-        self._pool.add(Exemplar(material, key, np.zeros((0, 0), np.float32), code, Scale("window", 1)))
+        self._pool.add(material, key, Exemplar(material, key, {}, code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
-        ranked = rank(self._pool, lambda material, _: self._means[material])
+        held = [source for *_, source in self._pool if isinstance(source, Exemplar)]
+        ranked = rank(held, self._pool.exemplars, lambda material, _: self._means[material])
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 

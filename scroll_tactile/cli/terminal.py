@@ -89,7 +89,7 @@ def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -
 
     with Store.open(path, mode="read") as store:
         identity = Identity.read(store)
-    return TactileLearner.open(path, embedding=AbsentEmbedding(identity), mode=mode)
+    return TactileLearner.open(path, embedding=AbsentEmbedding(identity, path), mode=mode)
 
 
 def percent(share: float) -> str:

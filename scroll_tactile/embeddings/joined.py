@@ -58,6 +58,7 @@ class Joined:
             rest=rest,
             embeds_windows=True,
             composite=True,
+            exact=all(part.exact for part in declared),
         )
 
     def __repr__(self) -> str:

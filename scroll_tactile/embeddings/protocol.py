@@ -49,6 +49,7 @@ class Capabilities:
     embeds_noise: it has `is_noisy(image)` and `embed_noisy(images)`, see `NoiseEmbedding`.
     composite: it has `parts`, see `CompositeEmbedding`.
     tunable: it has `network()`, a copy of its network to be fine-tuned, see `Vision.network`.
+    exact: its features are the same bits on every machine, so that a memory need not keep them beside the readings.
     """
 
     partial_windows: bool = True
@@ -61,6 +62,7 @@ class Capabilities:
     embeds_noise: bool = False
     composite: bool = False
     tunable: bool = False
+    exact: bool = False
 
 
 @runtime_checkable

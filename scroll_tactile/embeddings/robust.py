@@ -88,6 +88,7 @@ class Robust:
             penalties=inside.penalties,
             embeds_windows=True,
             embeds_noise=True,
+            exact=inside.exact,
         )
 
     def __repr__(self) -> str:

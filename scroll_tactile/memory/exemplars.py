@@ -8,21 +8,31 @@ the statistics hold.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.errors import InputError
+from scroll_tactile.memory.rows import Arrays, Codes, Readings, unpack_readings
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import BITS, mean_code
+from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import Sample
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.sample import Sample, Stages
 
-__all__ = ["CANDIDATES", "Exemplar", "ExemplarSample", "herd", "quotas", "rank", "ranked_exemplars"]
+__all__ = [
+    "CANDIDATES",
+    "Exemplar",
+    "ExemplarSample",
+    "Source",
+    "exemplars_from_arrays",
+    "exemplars_to_arrays",
+    "herd",
+    "quotas",
+    "rank",
+]
 
 IntArray = npt.NDArray[np.int64]
 
@@ -109,133 +119,122 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class Exemplar:
-    """A stream kept raw, with what herding needs of it.
+    """A stream with its readings, and what herding needs of it.
 
-    readings: float32 of shape (T, n), for a camera (T, height, width, 3), in the sensor's unit.
-    code: mean code of its windows at its widest scale, rounded: int32 of shape (d,). scale: their width in columns.
+    packed: its readings as arrays of a journal row. code: the last of its rows of codes at its widest scale, int32 of
+    shape (d,): the mean of all that judges there. scale: that scale.
     """
 
     material: str
     key: bytes
-    readings: npt.NDArray[np.float32]
+    packed: Arrays
     code: npt.NDArray[np.int32]
     scale: Scale
 
     @classmethod
-    def of(
-        cls,
-        material: str,
-        key: bytes,
-        readings: npt.NDArray[np.float32],
-        codes: Mapping[Scale, npt.NDArray[np.int32]],
-    ) -> Exemplar:
-        """The exemplar of a stream; codes: for each scale those of its windows, shape (windows, d)."""
-        scale = max(scale for scale, rows in codes.items() if len(rows))
-        code = mean_code(codes[scale].sum(axis=0, dtype=np.int64), len(codes[scale]))
-        return cls(material, key, readings, code.astype(np.int32), scale)
+    def of(cls, material: str, key: bytes, packed: Arrays, stages: Stages, codes: Codes) -> Exemplar:
+        """The exemplar of a stream; stages: those that it reached. codes: its rows by scale, its own first."""
+        scale = max(stages[-1])
+        return cls(material, key, packed, codes[scale][sum(scale in stage for stage in stages) - 1], scale)
+
+    @property
+    def readings(self) -> Readings:
+        """Float32 of shape (T, n), for a camera (T, height, width, 3), in the sensor's unit."""
+        readings = unpack_readings(self.packed)
+        assert readings is not None
+        return readings
 
 
-class ExemplarSample:
+Source = int | Exemplar
+"""Where a candidate's readings lie: in this row of the journal, or in the base that stands for it; 0: in the base.
+
+Without a journal it is the exemplar itself.
+"""
+
+
+class ExemplarSample(Sample[Source]):
     """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
 
-    capacity: streams in the buffer; `ratio` times as many candidates are kept.
+    exemplars: streams in the buffer; `ratio` times as many candidates are kept.
     ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
 
-    Raises InputError for a capacity or ratio below 1.
+    Raises InputError for a number of exemplars or a ratio below 1.
     """
 
-    def __init__(self, capacity: int, *, ratio: int = CANDIDATES) -> None:
-        if min(capacity, ratio) < 1:
+    def __init__(self, exemplars: int, *, ratio: int = CANDIDATES) -> None:
+        if min(exemplars, ratio) < 1:
             raise InputError(
-                f"expected a capacity and a ratio of candidates to exemplars of 1 or more; came {capacity} and {ratio}"
+                f"expected exemplars and a ratio of candidates to them of 1 or more; came {exemplars} and {ratio}"
             )
-        self.capacity = capacity
-        self.ratio = ratio
-        self._sample: Sample[Exemplar] = Sample(ratio * capacity)
-
-    def __len__(self) -> int:
-        return len(self._sample)
-
-    def __iter__(self) -> Iterator[Exemplar]:
-        """The candidates, by material and key."""
-        for *_, exemplar in self._sample:
-            yield exemplar
-
-    def holds(self, material: str, key: bytes) -> bool:
-        """Whether a stream is a candidate; if not, it can be retracted without a change here."""
-        return self._sample.holds(material, key)
-
-    def wants(self, material: str, key: bytes) -> bool:
-        """Whether `add` would keep a stream."""
-        return self._sample.wants(material, key)
-
-    def add(self, exemplar: Exemplar) -> None:
-        """Add a stream where it belongs in, and drop what falls out."""
-        self._sample.add(exemplar.material, exemplar.key, exemplar)
-
-    def refill(self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], Exemplar]) -> None:
-        """Add all streams; see `Sample.refill`."""
-        self._sample.refill(streams, make)
-
-    def update(self, other: ExemplarSample) -> None:
-        """Add all candidates of another sample: this one is then as if it had observed what both did.
-
-        Raises MismatchError where their capacities differ.
-        """
-        if (self.capacity, self.ratio) != (other.capacity, other.ratio):
-            raise MismatchError(
-                f"expected candidates for {self.capacity} exemplars at ratio {self.ratio}; came those for "
-                f"{other.capacity} at {other.ratio}. Open both with one capacity"
-            )
-        self._sample.update(other._sample)
+        super().__init__(ratio * exemplars)
+        self.exemplars = exemplars
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """What a store keeps: arrays by name, and JSON beside them.
-
-        The readings lie one behind another on the time axis, exemplar-lengths many of each.
-        """
-        exemplars = list(self)
-        codes, readings = [exemplar.code for exemplar in exemplars], [exemplar.readings for exemplar in exemplars]
-        arrays: dict[str, npt.NDArray[Any]] = {
-            "exemplar-keys": np.array([list(exemplar.key) for exemplar in exemplars] or [[]], np.uint8)[: len(self)],
-            "exemplar-lengths": np.array([len(stream) for stream in readings], np.int64),
-            "exemplar-scales": np.array([int(exemplar.scale) for exemplar in exemplars], np.int64),
-            "exemplar-codes": np.stack(codes) if codes else np.zeros((0, 0), np.int32),
-            "exemplar-readings": np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
-        }
-        # Version 0.1 expects "felt": what a limit in bytes had dropped.
-        return arrays, {"materials": [exemplar.material for exemplar in exemplars], "felt": {}}
+        """What a store keeps beside its journal: arrays by name, and JSON; all sources are rows."""
+        arrays = {"exemplar-keys": _keys([key for _, key, _ in self])}
+        arrays["exemplar-sources"] = np.array([source for *_, source in self], np.int64)
+        return arrays, {"materials": [material for material, *_ in self]}
 
     @classmethod
-    def from_arrays(
-        cls,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        attributes: Mapping[str, Any],
-        capacity: int,
-        *,
-        ratio: int = CANDIDATES,
-    ) -> ExemplarSample:
-        """The sample that `to_arrays` gave, or one of less capacity; one of more lacks what was dropped before."""
-        sample = cls(capacity, ratio=ratio)
-        readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
-        rows = zip(arrays["exemplar-keys"], arrays["exemplar-codes"], arrays["exemplar-scales"], strict=True)
-        for i, (material, (key, code, scale)) in enumerate(zip(attributes["materials"], rows, strict=True)):
-            sample.add(Exemplar(material, key.tobytes(), readings[i].copy(), code, Scale.numbered(int(scale))))
+    def from_arrays(cls, arrays: Arrays, about: Mapping[str, Any], exemplars: int, source: int | None) -> Self:
+        """The sample that `to_arrays` gave, or that of the exemplars that `exemplars_to_arrays` gave.
+
+        exemplars: may be fewer than when it was made; a sample of more lacks what was dropped before. source: of those
+        for which the arrays name none; None where the journal is left behind.
+        """
+        sample = cls(exemplars)
+        if source is None:
+            sample.update((held.material, held.key, held) for held in exemplars_from_arrays(arrays, about))
+            return sample
+        keys = [key.tobytes() for key in arrays["exemplar-keys"]]
+        sources = arrays["exemplar-sources"].tolist() if "exemplar-sources" in arrays else [source] * len(keys)
+        sample.update(zip(about["materials"], keys, sources, strict=True))
         return sample
 
 
-def rank(sample: ExemplarSample, means: Callable[[str, Scale], IntArray]) -> dict[str, list[Exemplar]]:
+def exemplars_to_arrays(exemplars: Sequence[Exemplar]) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """What a base keeps: the readings lie one behind another on the time axis, exemplar-lengths many of each."""
+    readings = [exemplar.readings for exemplar in exemplars]
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "exemplar-keys": _keys([exemplar.key for exemplar in exemplars]),
+        "exemplar-lengths": np.array([len(stream) for stream in readings], np.int64),
+        "exemplar-scales": np.array([int(exemplar.scale) for exemplar in exemplars], np.int64),
+        "exemplar-codes": np.stack([one.code for one in exemplars]) if readings else np.zeros((0, 0), np.int32),
+        "exemplar-readings": np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
+    }
+    return arrays, {"materials": [exemplar.material for exemplar in exemplars]}
+
+
+def exemplars_from_arrays(arrays: Arrays, about: Mapping[str, Any]) -> list[Exemplar]:
+    """The exemplars that `exemplars_to_arrays` gave; none where the arrays hold no readings."""
+    if "exemplar-readings" not in arrays:
+        return []
+    readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
+    rows = zip(arrays["exemplar-keys"], readings, arrays["exemplar-codes"], arrays["exemplar-scales"], strict=False)
+    return [
+        Exemplar(material, key.tobytes(), {"readings": stream}, code, Scale.numbered(int(scale)))
+        for material, (key, stream, code, scale) in zip(about["materials"], rows, strict=True)
+    ]
+
+
+def _keys(keys: Sequence[bytes]) -> npt.NDArray[np.uint8]:
+    return np.array([list(key) for key in keys] or [[]], np.uint8)[: len(keys)]
+
+
+def rank(
+    candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale], IntArray]
+) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
-    means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,); see `mean_code`.
-    The candidates of the material's widest scale are herded; briefer ones come after them, by scale and key. A smaller
-    buffer is the beginning of a larger one.
+    count: exemplars in the buffer. means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,);
+    see `mean_code`. The candidates of the material's widest scale are herded; briefer ones come after them, by scale
+    and key. A smaller buffer is the beginning of a larger one.
     """
-    candidates: dict[str, list[Exemplar]] = {}
-    for exemplar in sample:
-        candidates.setdefault(exemplar.material, []).append(exemplar)
-    places = quotas({material: len(exemplars) for material, exemplars in candidates.items()}, sample.capacity)
-    return {material: _herded(candidates[material], means, count) for material, count in places.items() if count}
+    by_material: dict[str, list[Exemplar]] = {}
+    for exemplar in candidates:
+        by_material.setdefault(exemplar.material, []).append(exemplar)
+    places = quotas({material: len(exemplars) for material, exemplars in by_material.items()}, count)
+    return {material: _herded(by_material[material], means, share) for material, share in places.items() if share}
 
 
 def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray], count: int) -> list[Exemplar]:
@@ -246,12 +245,3 @@ def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray],
     codes, keys = np.stack([exemplar.code for exemplar in wide]), [exemplar.key for exemplar in wide]
     order = herd(codes, keys, means(candidates[0].material, widest), count)
     return ([wide[place] for place in order] + brief)[:count]
-
-
-def ranked_exemplars(sample: ExemplarSample, statistics: Statistics) -> dict[str, list[Exemplar]]:
-    """The buffer, as `rank`, against the exact means of all that was observed."""
-
-    def mean(material: str, scale: Scale) -> IntArray:
-        return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
-
-    return rank(sample, mean)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self, cast
 
@@ -11,7 +13,14 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scroll_tactile.embeddings.kernels import Kernels
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, require_rest, window_plan
+from scroll_tactile.embeddings.protocol import (
+    Capabilities,
+    Embedding,
+    NoiseEmbedding,
+    embed_windows,
+    require_rest,
+    window_plan,
+)
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
 from scroll_tactile.sensors import Sensor
@@ -31,6 +40,7 @@ __all__ = [
 
 USUAL_EXEMPLARS = 400  # streams
 ROBUST = "robust kernels"
+LIKELY_EXACT = ("kernels", ROBUST)  # in memories made before configurations were kept
 
 
 class _Kept(BaseModel):
@@ -212,25 +222,57 @@ class Identity(_Kept):
 
 
 class AbsentEmbedding:
-    """Takes the place of a memory's embedding where nothing is embedded."""
+    """Takes the place of a memory's embedding where hardly anything is embedded; made when something is, if it can be.
 
-    def __init__(self, identity: Identity) -> None:
+    path: of the memory.
+    """
+
+    def __init__(self, identity: Identity, path: Path) -> None:
         made = identity.embedding
         self.name, self.dimension, self.bound = made.name, made.dimension, made.bound
         self.fingerprint = made.fingerprint
+        self._identity, self._path = identity, path
         partial, judged = identity.reading or (True, "all")
-        self.capabilities = Capabilities(partial_windows=partial, judged_scales=judged)
-        if made.name == ROBUST:  # the only embedding with scales beside its windows
-            from scroll_tactile.embeddings.robust import Robust
+        robust = made.name == ROBUST  # the only embedding with scales beside its windows
+        self.capabilities = Capabilities(
+            partial_windows=partial,
+            judged_scales=judged,
+            reads_beginnings=robust,
+            fills_channels=robust,
+            embeds_windows=True,
+            embeds_noise=robust,
+            exact=made.name in LIKELY_EXACT if made.configuration is None else _is_exact(made.configuration),
+        )
 
-            self.capabilities = Robust(Kernels(dimension=made.dimension)).capabilities
+    @cached_property
+    def _made(self) -> Embedding:
+        made = self._identity.own_embedding(self._path)
+        self._identity.require_embedding(self._path, made)
+        return made
 
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
-        """Raise MismatchError: nothing can be embedded."""
-        raise MismatchError(
-            f"the memory was opened without its embedding {self.name!r}, to look after it only: open it with "
-            "TactileLearner.open(path, embedding=...)"
-        )
+        """As the embedding does. Raises EmbeddingMismatchError where only its user can make it."""
+        return self._made.embed(image)
+
+    def embed_windows(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
+    ) -> Mapping[int, npt.NDArray[np.floating]]:
+        """As `embed`."""
+        return embed_windows(self._made, image, windows)
+
+    def is_noisy(self, image: npt.NDArray[np.float32]) -> bool:
+        """As `embed`."""
+        return cast(NoiseEmbedding, self._made).is_noisy(image)
+
+    def embed_noisy(self, images: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.floating]:
+        """As `embed`."""
+        return cast(NoiseEmbedding, self._made).embed_noisy(images)
+
+
+def _is_exact(configuration: Mapping[str, Any]) -> bool:
+    """Whether the embedding of a configuration declares `Capabilities.exact`; it is not made for that."""
+    inside = [configuration["inner"]] if "inner" in configuration else configuration.get("parts")
+    return all(map(_is_exact, inside)) if isinstance(inside, list) else configuration.get("kind") == "kernels"
 
 
 def usual_embedding(sensor: Sensor) -> Embedding:

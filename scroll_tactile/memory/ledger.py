@@ -7,41 +7,44 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal, cast
 
-import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
+from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
-from scroll_tactile.memory.rows import Added, Codes, pack_codes, spans
-from scroll_tactile.memory.state import DESCRIBE, OBSERVE, READINGS, RETRACT, Memory, give_back_scratch
+from scroll_tactile.memory.rows import Added, Codes, pack_codes, pack_readings, spans, unspanned
+from scroll_tactile.memory.state import DESCRIBE, OBSERVE, RETRACT, Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
-from store import ReadOnlyError, Record, Store, StoreClosedError, StoreError
+from store import CompactedError, ReadOnlyError, Record, Store, StoreClosedError, StoreError
 
 __all__ = ["Ledger"]
 
 logger = logging.getLogger(__name__)
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
-SNAPSHOT_EVERY = 1024  # rows between generations: opening replays so many in about a second
+SNAPSHOT_EVERY = 256  # rows between generations: opening replays so many in about a second
 
 
 class Ledger:
     """The memory of one learner and the store that keeps it.
 
-    load: reads the memory from the store, or makes an empty one without a store.
+    load: reads the memory from the store, or makes an empty one without a store. bare: whether rows of observations
+    hold readings alone, to be embedded again when they are read.
 
     lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
-    described: grows with each change of a description. added: where `follow` is set, the observations since it was last
-    cleared; None where they are too many, or anything else has changed.
+    described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
+    since it was last cleared; None where that is too much, or more has changed.
     """
 
-    def __init__(self, load: Callable[[], Memory], store: Store | None = None) -> None:
+    def __init__(self, load: Callable[[], Memory], store: Store | None = None, bare: bool = False) -> None:
         self.store = store
+        self._bare = bare
         self.lock = threading.RLock()
         self.version = 0
         self.described = 0
@@ -87,12 +90,12 @@ class Ledger:
             raise
         self._whole = True
 
-    def _changed(self, added: Added | None = None) -> None:
+    def _changed(self, added: list[Added] | None = None) -> None:
         self.version += 1
-        if added is None or (self.added is not None and len(self.added) >= MOST_ADDED):
+        if added is None or (self.added is not None and len(self.added) + len(added) > MOST_ADDED):
             self.added = None
         elif self.follow and self.added is not None:
-            self.added.append(added)
+            self.added += added
 
     def require_open(self) -> None:
         """Raise StoreClosedError after `close`."""
@@ -133,25 +136,28 @@ class Ledger:
             self.require_open()
             # Before the journal has it: every row there must fit at the next opening.
             self.memory.statistics.require_room(codes)
-            readings = stream.readings if self._memory.exemplars is not None else None
             with self._mutation(_nothing):
-                sequence = self._append(material, stream.key, columns, codes, readings)
-                self._memory.add(material, stream.key, columns, codes, sequence, readings)
-                self._changed((material, codes, 1))
+                sequence = self._append(material, stream, columns, codes)
+                self._changed([(material, codes, 1)])
             self._snapshot_if_due()
             durable = self.store is not None and not self._batching
         return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable)
 
-    def _append(
-        self, material: str, key: bytes, columns: int, codes: Codes, readings: npt.NDArray[np.float32] | None
-    ) -> int:
+    def _append(self, material: str, stream: Stream, columns: int, codes: Codes) -> int:
+        memory = self._memory
+        # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
+        kept = self._bare or memory.exemplars is not None
+        packed = pack_readings(stream.readings) if kept else {}
         if self.store is None:
-            return self._memory.sequence + 1
-        attributes, arrays = {"columns": columns}, pack_codes(codes)
-        if readings is not None:
-            # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
-            attributes["nbytes"], arrays[READINGS] = readings.nbytes, readings
-        return self.store.append(OBSERVE, material, key, attributes=attributes, arrays=arrays).sequence
+            sequence, stages = memory.sequence + 1, memory.plan.scored_stages(columns)
+            held = Exemplar.of(material, stream.key, packed, stages, codes) if kept else None
+            memory.add(material, stream.key, columns, codes, sequence, held)
+            return sequence
+        attributes = {"columns": columns, "nbytes": stream.readings.nbytes} if kept else {"columns": columns}
+        arrays = packed if self._bare else packed | pack_codes(codes)
+        sequence = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays).sequence
+        memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None)
+        return sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
         """As `TactileLearner.describe`, of what was checked."""
@@ -195,12 +201,11 @@ class Ledger:
             memory.sample, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
-            for record in records:
-                memory.retract(record)
+            retracted = [memory.retract(record) for record in records]
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
-            self._changed()
+            self._changed(retracted)
         self._snapshot_if_due()
 
     @contextmanager
@@ -257,8 +262,9 @@ class Ledger:
             self.require_writing()
             if upto > memory.base:
                 self._snapshot()
+                store.base()  # a damaged one has what the new one needs
                 base = memory.until(store, upto) if upto < memory.sequence else memory
-                arrays, attributes = base.to_arrays(base_at=upto)
+                arrays, attributes = base.to_arrays(upto, candidates_of(base, store))
                 with self._mutation():
                     store.compact(arrays, upto=upto, attributes=attributes)
                     memory.base = upto
@@ -275,11 +281,40 @@ class Ledger:
                 return False
             if (store.newest, store.last) == (memory.generation, memory.sequence):
                 return False
-            # As a whole, not only the rows since: f* is in no row, and a compaction may have removed what a retraction
-            # needs.
-            self._memory = self._load()
+            try:
+                if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
+                    records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
+                    with self._mutation():
+                        self._changed(self._take_in(memory, store, records))
+                    return True
+            except CompactedError:  # just now, and a retraction needs what is gone
+                pass
+            self._memory, self._whole = self._load(), True
             self._changed()
             return True
+
+    def _take_in(self, memory: Memory, store: Store, records: list[Record]) -> list[Added] | None:
+        """Apply the rows that a writer appended, and take an f* that it made; what changed, see `Memory.replay`."""
+        changed = [memory.replay(record, store) for record in records]
+        memory.refill(store)
+        newest = store.latest() if store.newest != memory.generation else None
+        if newest is not None and newest.upto <= memory.sequence:
+            memory.generation = newest.number
+            retractions = (head for head in store.heads(newest.upto, kind=RETRACT) if head.sequence <= memory.sequence)
+            gone = min((row for head in retractions for row in unspanned(head.attributes["sequences"])), default=None)
+            if gone is None or gone > cast(int, newest.attributes["tuned_upto"]):
+                memory.take_tuned(newest)
+        return None if None in changed else [each for added in changed for each in added or ()]
+
+    def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
+        """As `TactileLearner.ranked_exemplars`."""
+        with self.lock:
+            return ranked_exemplars(self.memory, self.store)
+
+    def snapshot(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """The memory as arrays and attributes that need no journal: `Memory.filled` takes them."""
+        with self.lock:
+            return self.memory.to_arrays(candidates=candidates_of(self.memory, self.store))
 
     def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
         """Keep f*, durably. Raises FineTuneError where something was retracted since its training began.

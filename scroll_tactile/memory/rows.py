@@ -1,71 +1,143 @@
-"""What a journal row holds of a touch, and how it is packed."""
+"""What a journal row holds of a touch, and how it is packed: exactly, and small."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.errors import MismatchError
+from scroll_tactile.signals.windows import BEGINNING, Scale, WindowPlan
+from scroll_tactile.statistics.sample import stage_rows
 
-__all__ = ["Added", "Codes", "pack_codes", "spans", "unpack_codes", "unspanned"]
+__all__ = [
+    "Added",
+    "Arrays",
+    "Codes",
+    "Encode",
+    "Readings",
+    "only_readings",
+    "pack_codes",
+    "pack_readings",
+    "row_codes",
+    "spans",
+    "unpack_codes",
+    "unpack_readings",
+    "unpack_windows",
+    "unspanned",
+]
 
+Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]
+Readings = npt.NDArray[np.float32]
+Encode = Callable[[Readings], Codes]
+"""Embeds the readings of a touch: its rows of codes by scale."""
+
 Added = tuple[str, Codes, int]
-"""A material, the codes of a touch of it by scale, and 1 where it came or -1 where it was retracted."""
+"""A material, the rows of codes of a touch of it by scale, and 1 where they came or −1 where they were retracted."""
 
-LARGE, BLOCK = 2**13, 2**10  # codes
+CODES = "stages-"  # and a scale
+WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
+SHAPE, ZERO, REST = "readings-shape", "readings-zero", "readings-rest"
+MANTISSA, LARGEST = 24, 128  # bits of a float32's mantissa, and its largest exponent
 
 
-def pack_codes(codes: Mapping[Scale, npt.NDArray[np.int32]]) -> dict[str, npt.NDArray[Any]]:
-    """Codes by scale as the arrays of a journal row: their distinct values, and places among them.
+def pack_readings(readings: Readings) -> dict[str, npt.NDArray[Any]]:
+    """Readings as the arrays of a journal row, which give the same bits back: float32 of shape (T, ...).
 
-    Windows hold few distinct values (a proportion of 22 positions has 23), so a place is a byte and packs well.
-    A network's features hardly repeat: they are kept as they are.
+    Most sensors count: values that are multiples of one power of two are kept as small integers, channel by channel,
+    for neighbours in time are alike (BioTac: 3.7 KB a touch in place of 9). Others are kept as they are but for zeros,
+    which are half of what a skin reads (RoboSkin: 9.3 KB in place of 13).
     """
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    for scale, rows in codes.items():
-        first = rows.min(initial=2**BITS)
-        # Feature by feature: one feature's values in neighbouring windows are alike.
-        above = np.subtract(rows.T, first, order="C")
-        values = _distinct(above)
-        if 4 * len(values) > rows.size and rows.size > 2**8:
-            arrays[f"codes-{scale}"] = rows
-            continue
-        kind = np.uint8 if len(values) <= 2**8 else np.uint16 if len(values) <= 2**16 else np.uint32
-        # A table of all the codes there can be, of which only the pages with one of these are ever made.
-        table = np.empty(int(values.max(initial=0)) + 1, dtype=kind)
-        table[values] = np.arange(len(values), dtype=kind)
-        arrays[f"values-{scale}"] = (values + first).astype(np.int32)
-        arrays[f"places-{scale}"] = table[above]
-    return arrays
+    if (counts := _counts(readings)) is None:
+        zero = readings.view(np.uint32) == 0  # of the bits: −0 is none
+        return {SHAPE: np.array(readings.shape), ZERO: np.packbits(zero), REST: readings[~zero]}
+    power, whole = counts
+    return {f"{WHOLE}{power}": np.ascontiguousarray(np.moveaxis(whole, 0, -1))}
 
 
-def _distinct(numbers: npt.NDArray[np.int32]) -> npt.NDArray[np.integer]:
-    """The distinct ones of numbers from 0 up, ascending."""
-    if numbers.size < LARGE:
-        return np.unique(numbers)
-    # Marked in a table and in one of its blocks, and not by sorting: half of the time for a touch of BioTac.
-    marked = np.zeros((int(numbers.max()) // BLOCK + 1) * BLOCK, dtype=bool)
-    filled = np.zeros(len(marked) // BLOCK, dtype=bool)
-    marked[numbers] = filled[numbers // BLOCK] = True
-    blocks = np.flatnonzero(filled)
-    block, within = np.divmod(np.flatnonzero(marked.reshape(-1, BLOCK)[blocks]), BLOCK)
-    return np.asarray(blocks[block] * BLOCK + within)
+def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
+    """A power, and the readings in units of two to it as integers of at most 16 bits; None where they are none."""
+    some = readings[readings != 0]
+    if not np.isfinite(some).all() or np.signbit(readings[readings == 0]).any():
+        return None
+    mantissas, exponents = np.frexp(some)
+    digits = np.ldexp(mantissas, MANTISSA).astype(np.int32)
+    trailing = np.frexp((digits & -digits).astype(np.float32))[1] - 1
+    power = int((exponents - MANTISSA + trailing).min(initial=LARGEST)) if len(some) else 0
+    whole = np.ldexp(readings.astype(np.float64), -power)
+    for kind in (np.uint8, np.int8, np.int16):
+        if np.iinfo(kind).min <= whole.min(initial=0) and whole.max(initial=0) <= np.iinfo(kind).max:
+            return power, whole.astype(kind)
+    return None
 
 
-def unpack_codes(arrays: Mapping[str, npt.NDArray[Any]]) -> Codes:
-    """The codes that `pack_codes` packed."""
+def unpack_readings(arrays: Arrays) -> Readings | None:
+    """The readings that `pack_readings` packed, or that an earlier version kept as they are; None without any."""
+    if "readings" in arrays:
+        return arrays["readings"]
+    if REST in arrays:
+        readings: Readings = np.zeros(arrays[SHAPE], np.float32)
+        readings.reshape(-1)[np.unpackbits(arrays[ZERO], count=readings.size) == 0] = arrays[REST]
+        return readings
+    for name, whole in arrays.items():
+        if name.startswith(WHOLE):
+            power = int(name.removeprefix(WHOLE))
+            return np.ldexp(np.ascontiguousarray(np.moveaxis(whole, -1, 0)).astype(np.float32), power)
+    return None
+
+
+def only_readings(arrays: Arrays) -> dict[str, npt.NDArray[Any]]:
+    """Of the arrays of a row, those that hold its readings."""
+    return {name: array for name, array in arrays.items() if name.startswith("readings")}
+
+
+def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:
+    """Codes by scale as the arrays of a journal row."""
+    return {f"{CODES}{scale}": rows for scale, rows in codes.items()}
+
+
+def unpack_codes(arrays: Arrays) -> Codes:
+    """The codes that `pack_codes` packed; none where the row has readings alone, or is an earlier version's."""
+    return {_scale(name): rows for name, rows in arrays.items() if name.startswith(CODES)}
+
+
+def unpack_windows(arrays: Arrays) -> Codes:
+    """The codes of all windows by scale, which rows of earlier versions hold: as they are, or places among values."""
     plain = {_scale(name): rows for name, rows in arrays.items() if name.startswith("codes-")}
-    scales = [_scale(name) for name in arrays if name.startswith("values-")]
-    packed = {
-        scale: np.ascontiguousarray(arrays[f"values-{scale}"][arrays[f"places-{scale}"].T]).astype(np.int32, copy=False)
-        for scale in scales
+    placed = {
+        _scale(name): np.ascontiguousarray(values[arrays[name.replace("values", "places")].T]).astype(np.int32)
+        for name, values in arrays.items()
+        if name.startswith("values-")
     }
-    return dict(sorted((plain | packed).items()))
+    return dict(sorted((plain | placed).items()))
+
+
+def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | None) -> Codes:
+    """The rows of codes that a touch of so many columns added, by scale, from the arrays of its journal row.
+
+    encode: embeds readings where the row has nothing else. Where it holds the windows of an earlier version, with
+    copies, the readings are embedded again; where that cannot be, the touch counts without its copies.
+
+    Raises MismatchError where the row cannot be read without its embedding.
+    """
+    if codes := unpack_codes(arrays):
+        return codes
+    windows, readings = unpack_windows(arrays), unpack_readings(arrays)
+    own = {Scale("window", width): len(starts) for width, starts in plan.extent(columns).items()}
+    own |= {BEGINNING: 1} if plan.beginning else {}
+    alone = all(len(windows[scale]) == count for scale, count in own.items() if scale in windows)
+    if readings is not None and encode is not None and not (windows and alone):
+        return encode(readings)
+    if not windows:
+        raise MismatchError(
+            "a row of the journal holds readings alone, and they can be embedded only by the embedding that made the "
+            "memory: open it with TactileLearner.open(path, embedding=...)"
+        )
+    judging = {scale: windows[scale][:count] for scale, count in own.items()}
+    return {**windows, **stage_rows(plan.scored_stages(columns), judging)}
 
 
 def _scale(name: str) -> Scale:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
-from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -13,20 +12,19 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample
-from scroll_tactile.memory.rows import Codes, unpack_codes, unspanned
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
+from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, only_readings, row_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
-from store import CompactedError, DamageError, Head, Record, Store
+from store import CompactedError, DamageError, Generation, Head, Record, Store
 
 __all__ = [
     "DESCRIBE",
     "MEMBER",
     "MERGE",
     "OBSERVE",
-    "READINGS",
     "RETRACT",
     "Memory",
     "apply_description",
@@ -36,13 +34,12 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 # The kinds of journal rows.
-OBSERVE = "observe"  # a stream was observed; its codes and, where exemplars are kept, its readings are the arrays
+OBSERVE = "observe"  # a stream was observed; see `rows`
 RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
 MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
 MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
-READINGS = "readings"  # the array of a row that holds the raw stream
 ATTEMPTS = 20  # of a reader, while a writer changes the store
 
 
@@ -50,13 +47,14 @@ class Memory:
     """Everything that was learned, as far as a number of rows of the journal.
 
     dimension: d, of the features. plan: which windows of a touch are read. exemplars: streams in the buffer, or 0;
-    kept as `capacity`.
+    kept as `capacity`. encode: readings → the rows of codes that the touch adds, by scale, for rows of the journal that
+    have readings alone; None where all rows have codes.
 
     What was learned:
 
     - statistics: exact sums by scale.
     - sample: the touches that readouts are calibrated on.
-    - exemplars: the candidates for the buffer, which keep their readings; None with a capacity of 0.
+    - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
     - descriptions: material → what it is made of; the material need not have been observed.
     - tuned: f*; None before a fine-tune, or after one of the observations behind it was retracted.
     - tuned_upto: the last sequence that f* was trained on.
@@ -64,16 +62,17 @@ class Memory:
     Where it stands in the journal:
 
     - sequence: the last row that it holds.
-    - base: the last row whose codes were compacted; 0 before any compaction.
+    - base: the last row whose arrays were compacted; 0 before any compaction.
     - retracted: the retracted sequences after `base`.
     - excluded: the retracted sequences up to `base`, which the base was made without.
     - retractions: how many observations were retracted since the memory was loaded.
     - generation, saved: the generation that it was loaded from, and the last row in that; None and 0 without one.
     """
 
-    def __init__(self, dimension: int, plan: WindowPlan, exemplars: int = 0) -> None:
+    def __init__(self, dimension: int, plan: WindowPlan, exemplars: int = 0, encode: Encode | None = None) -> None:
         self.plan = plan
         self.capacity = exemplars
+        self.encode = encode
         self.statistics = Statistics(dimension, plan.scales)
         self.sample = TouchSample()
         self.exemplars = ExemplarSample(exemplars) if exemplars else None
@@ -90,122 +89,117 @@ class Memory:
         self._stale = False
 
     def add(
-        self,
-        material: str,
-        key: bytes,
-        columns: int,
-        codes: Codes,
-        sequence: int,
-        readings: npt.NDArray[np.float32] | None = None,
+        self, material: str, key: bytes, columns: int, codes: Codes, sequence: int, source: Source | None = None
     ) -> None:
-        """Add an observation: a touch of so many columns, its codes by scale, and its readings for the exemplars.
+        """Add an observation: a touch of so many columns, its rows of codes by scale, and the row that it is.
 
-        Raises CapacityError before anything is added.
+        source: of its readings, for the exemplars; None where they are not kept. Raises CapacityError before anything
+        is added.
         """
         self.statistics.add(material, codes, columns)
         if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes))
-        if self.exemplars is not None and readings is not None and self.exemplars.wants(material, key):
-            self.exemplars.add(Exemplar.of(material, key, readings, codes))
+        if self.exemplars is not None and source is not None:
+            self.exemplars.add(material, key, source)
         self.sequence = sequence
 
-    def replay(self, record: Record, store: Store) -> None:
-        """Apply a journal row; nothing is embedded again.
+    def replay(self, record: Record, store: Store) -> list[Added] | None:
+        """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
 
         Call `refill` after the last row. Raises MismatchError for a row of a kind that this version does not know.
         """
-        apply_description(self.descriptions, record)
+        changed: list[Added] | None = []
         if record.kind == OBSERVE:
-            codes, readings = unpack_codes(record.arrays), record.arrays.get(READINGS)
-            self.add(record.label, record.key, _columns(record), codes, record.sequence, readings)
+            columns, codes = self.codes(record)
+            source = record.sequence if only_readings(record.arrays) else None
+            self.add(record.label, record.key, columns, codes, record.sequence, source)
+            changed = [(record.label, codes, 1)]
         elif record.kind == RETRACT:
-            for sequence in unspanned(record.attributes["sequences"]):
-                if sequence > self.base:
-                    self.retract(store.record(sequence))
-                elif sequence not in self.excluded:  # a repair made the base: `compact` would have left it out
-                    logger.warning(
-                        "%s: observation %d was retracted by row %d, but still counts: its features were lost to "
-                        "damage. Only a copy from before the damage can leave it out",
-                        store.path,
-                        sequence,
-                        record.sequence,
-                    )
+            gone = unspanned(record.attributes["sequences"])
+            records = [store.record(sequence) for sequence in gone if sequence > self.base]
+            changed = [self.retract(observed) for observed in records]
+            for sequence in sorted({*gone} - {observed.sequence for observed in records} - self.excluded):
+                logger.warning(  # a repair made the base: `compact` would have left it out
+                    "%s: observation %d was retracted by row %d, but still counts: its features were lost to "
+                    "damage. Only a copy from before the damage can leave it out",
+                    store.path,
+                    sequence,
+                    record.sequence,
+                )
         elif record.kind == MERGE:
-            self._join(record.arrays, record.attributes)
+            self._join(record)
+            changed = None
         elif record.kind not in (MEMBER, DESCRIBE):
             raise MismatchError(
                 f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
                 f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
             )
+        apply_description(self.descriptions, record)
         self.sequence = record.sequence
+        return changed
 
     def describe(self, material: str, constituents: Any) -> None:
         """Keep what a material is made of, in place of its description before; None removes the description."""
         _describe(self.descriptions, material, constituents)
 
-    def retract(self, record: Record) -> None:
+    def retract(self, record: Record) -> Added:
         """Subtract an observation from the sums; call `refill` afterwards for the sample and the exemplars."""
         material, key = record.label, record.key
-        self.statistics.remove(material, unpack_codes(record.arrays), _columns(record))
+        columns, codes = self.codes(record)
+        self.statistics.remove(material, codes, columns)
         self.retracted.add(record.sequence)
         self.retractions += 1
         if self.sample.holds(material, key) or (self.exemplars and self.exemplars.holds(material, key)):
             self._stale = True
         if record.sequence <= self.tuned_upto:
             self.tuned = None
+        return material, codes, -1
 
     def retractable(self, store: Store, material: str | None = None) -> list[Head]:
-        """The observations whose codes the journal still holds, of one material or all, in order."""
+        """The observations whose arrays the journal still holds, of one material or all, in order."""
         rows = store.heads(self.base, kind=OBSERVE, label=material)
         return [head for head in rows if head.sequence not in self.retracted]
 
     def put_back(self, record: Record) -> None:
         """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and f*."""
-        self.statistics.add(record.label, unpack_codes(record.arrays), _columns(record))
+        columns, codes = self.codes(record)
+        self.statistics.add(record.label, codes, columns)
         self.retracted.discard(record.sequence)
         self._stale = False
 
     def refill(self, store: Store) -> None:
         """Choose sample and exemplars again without what was retracted; does nothing where they held none of it."""
-        if not self._stale:
-            return
+        if self._stale:
+            # Rows that a writer appended since this memory was read are left for the next `load`.
+            chosen = self._chosen(store, self.sequence)
+            self.sample, self.exemplars, self._stale = chosen.sample, chosen.exemplars, False
+
+    def _chosen(self, store: Store, upto: int) -> Memory:
+        """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
         touches = {(material, key): touch for material, key, touch in self.sample}
-        kept = {(exemplar.material, exemplar.key): exemplar for exemplar in self.exemplars or ()}
         fresh = self._base_samples(store)
-        # Rows that a writer appended since this memory was read are left for the next `load`.
         for head in store.heads(self.base, kind=MERGE):
-            if head.sequence <= self.sequence:
-                record = store.record(head.sequence)
-                fresh._join(record.arrays, record.attributes)
-        heads = [head for head in self.retractable(store) if head.sequence <= self.sequence]
-        streams = [(head.label, head.key, head.sequence) for head in heads]
+            if head.sequence <= upto:
+                fresh._join(store.record(head.sequence))
+        heads = [head for head in self.retractable(store) if head.sequence <= upto]
 
         def touch(material: str, key: bytes, sequence: int) -> SampledTouch:
-            if (found := touches.get((material, key))) is not None:
-                return found
-            record = store.record(sequence)
-            return self._touch(_columns(record), unpack_codes(record.arrays))
+            return touches.get((material, key)) or self._touch(*self.codes(store.record(sequence)))
 
-        def exemplar(material: str, key: bytes, sequence: int) -> Exemplar:
-            return kept.get((material, key)) or _exemplar(store.record(sequence))
-
-        fresh.sample.refill(streams, touch)
-        self.sample = fresh.sample
+        fresh.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
         if fresh.exemplars is not None:
-            raw = [(head.label, head.key, head.sequence) for head in heads if head.attributes.get("nbytes")]
-            fresh.exemplars.refill(raw, exemplar)
-            self.exemplars = fresh.exemplars
-        self._stale = False
+            kept = ((head.label, head.key, head.sequence) for head in heads if head.attributes.get("nbytes"))
+            fresh.exemplars.update(kept)
+        return fresh
 
     def _empty(self) -> Memory:
         """Another memory of the same making."""
-        return Memory(self.statistics.dimension, self.plan, self.capacity)
+        return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode)
 
     def _base_samples(self, store: Store) -> Memory:
-        """A memory with the sample and the exemplars of the base; empty ones without a base."""
+        """A memory with what the base holds; an empty one without a base."""
         fresh = self._empty()
-        if store.compacted != self.base:
-            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+        self.require_base(store)
         try:
             base = store.base()
         except DamageError as damage:
@@ -217,15 +211,23 @@ class Memory:
             )
             heads = (head for head in store.heads() if head.sequence <= self.base and head.kind in (OBSERVE, MEMBER))
             compacted = {(head.label, head.key) for head in heads}
-            fresh.sample.update((name, key, touch) for name, key, touch in self.sample if (name, key) in compacted)
-            if fresh.exemplars is not None:
-                for exemplar in self.exemplars or ():
-                    if (exemplar.material, exemplar.key) in compacted:
-                        fresh.exemplars.add(exemplar)
+            fresh.sample.update(item for item in self.sample if item[:2] in compacted)
+            if fresh.exemplars is not None and self.exemplars is not None:
+                fresh.exemplars.update(item for item in self.exemplars if item[:2] in compacted)
             return fresh
         if base is not None:
-            fresh._take(base.arrays, base.attributes)
+            fresh._take(base.arrays, base.attributes, 0)
         return fresh
+
+    def require_base(self, store: Store) -> None:
+        """Raise CompactedError where the store was compacted since this memory was read."""
+        if store.compacted != self.base:
+            raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+
+    def codes(self, record: Record) -> tuple[int, Codes]:
+        """The columns of an observation, and its rows of codes by scale."""
+        columns = cast(int, record.attributes["columns"])
+        return columns, row_codes(record.arrays, columns, self.plan, self.encode)
 
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         stages = self.plan.scored_stages(columns)
@@ -234,19 +236,23 @@ class Memory:
             stages += [*unreached, {scale: [0] for scale in NOISE}]
         return SampledTouch.of(stages, codes)
 
-    def _join(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any) -> None:
-        """Add another memory of the same making: the arrays and attributes of one of its generations."""
+    def _join(self, record: Record) -> None:
+        """Add another memory of the same making: a row that holds the arrays and attributes of its base."""
         other = self._empty()
-        other._take(arrays, attributes)
+        other._take(record.arrays, record.attributes, record.sequence)
         self.statistics = self.statistics + other.statistics
         self.sample.update(other.sample)
-        if self.exemplars is not None and other.exemplars is not None:
+        if self.exemplars is not None and other.exemplars is not None and "exemplar-readings" in record.arrays:
             self.exemplars.update(other.exemplars)
 
-    def to_arrays(self, base_at: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a generation; base_at: of a base, whose rows can no longer be retracted.
+    def to_arrays(
+        self, base_at: int | None = None, candidates: list[Exemplar] | None = None
+    ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+        """Arrays and attributes of a generation.
 
-        "pool" (the sample) and "withdrawn" (`retracted`) are the names that memories on disk have always had.
+        base_at: of a base, whose rows can no longer be retracted. candidates: those for exemplars, with their readings,
+        for a base and for what leaves the journal behind. "pool" (the sample) and "withdrawn" (`retracted`) are the
+        names that memories on disk have always had.
         """
         arrays, names = self.statistics.to_arrays()
         sampled, materials = self.sample.to_arrays()
@@ -264,82 +270,93 @@ class Memory:
         retracted = sorted(self.retracted if base_at is None else ())
         excluded = sorted(row for row in self.retracted | self.excluded if base_at is not None and row <= base_at)
         arrays["withdrawn"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
-        for name, part in (("exemplars", self.exemplars), ("tuned", self.tuned)):
-            if part is not None:
-                own, attributes[name] = part.to_arrays()
-                arrays |= own
+        if self.exemplars is not None:
+            own, attributes["exemplars"] = (
+                self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
+            )
+            arrays |= own
+        if self.tuned is not None:
+            own, attributes["tuned"] = self.tuned.to_arrays()
+            arrays |= own
         return arrays, attributes
 
     @classmethod
-    def load(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int = 0) -> Memory:
+    def load(
+        cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int = 0, encode: Encode | None = None
+    ) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
             try:
-                memory = cls._loaded(store, dimension, plan, exemplars)
+                memory = cls(dimension, plan, exemplars, encode)._loaded(store)
             except CompactedError:  # a writer compacted it between two reads
                 continue
             # A generation that came between the reads may hold an f* from before the rows that were read.
             if store.newest == newest:
                 return memory
-        return cls._loaded(store, dimension, plan, exemplars)
+        return cls(dimension, plan, exemplars, encode)._loaded(store)
 
-    @classmethod
-    def _loaded(cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int) -> Memory:
-        memory = cls(dimension, plan, exemplars)
-        memory.base = store.compacted
+    def _loaded(self, store: Store) -> Memory:
+        self.base = store.compacted
         # Without a sound generation the base raises what is lost; without a base the journal has every row.
-        generation = store.latest() or store.base()
-        if generation is not None:
-            memory._take(generation.arrays, generation.attributes)
-            memory.sequence = memory.saved = generation.upto
-            memory.generation = generation.number
-        replayed = 0
-        for record in store.records(after=memory.sequence):
-            memory.replay(record, store)
-            replayed += 1
-        memory.refill(store)
-        logger.info(
-            "%s: generation %s, %d rows of the journal replayed, %d compacted",
-            store.path,
-            memory.generation,
-            replayed,
-            memory.base,
-        )
-        return memory
+        newest = store.latest()
+        # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count.
+        earlier = newest if newest is not None and "pool-sums" in newest.arrays else None
+        start = store.base() if newest is None or earlier is not None else newest
+        if start is not None:
+            self._take(start.arrays, start.attributes, 0)
+            self.sequence = start.upto
+        self.generation = None if newest is None else newest.number
+        self.saved = self.sequence if earlier is None else 0
+        for record in store.records(after=self.sequence):
+            if earlier is not None and record.sequence > earlier.upto:
+                self.take_tuned(earlier)
+                earlier = None
+            self.replay(record, store)
+        if earlier is not None:
+            self.take_tuned(earlier)
+        self.refill(store)
+        logger.info("%s: generation %s, and rows up to %d", store.path, self.generation, self.sequence)
+        return self
 
     def until(self, store: Store, upto: int) -> Memory:
         """The memory of the observations up to `upto` that are not retracted: what a base at `upto` holds."""
-        memory = self._empty()
-        memory.base, memory.sequence = self.base, self.base
-        if (base := store.base()) is not None:
-            memory._take(base.arrays, base.attributes)
-        for record in store.records(after=self.base):
-            if record.sequence > upto:
-                break
-            if record.kind == RETRACT:
-                apply_description(memory.descriptions, record)
-            elif record.sequence not in self.retracted:
-                memory.replay(record, store)
-        memory.sequence, memory.retracted = upto, set(self.retracted)
+        memory, later = self._chosen(store, upto), self._empty()
+        for head in store.heads(self.base):  # whoever compacts has read all
+            if head.sequence <= upto:
+                apply_description(memory.descriptions, head)
+            elif head.kind in (OBSERVE, MERGE) and head.sequence not in self.retracted:
+                later.replay(store.record(head.sequence), store)
+        memory.statistics = self.statistics - later.statistics
+        memory.base, memory.sequence, memory.tuned = self.base, upto, None
+        memory.retracted = set(self.retracted)
         return memory
 
-    def filled(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any, sequence: int) -> Memory:
-        """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over."""
-        self._take(arrays, attributes)
+    def filled(self, arrays: Arrays, attributes: Any, sequence: int) -> Memory:
+        """This memory, empty before, filled with what `to_arrays` gave with readings; the arrays are taken over."""
+        self._take(arrays, attributes, None)
         self.sequence = sequence
         return self
 
-    def _take(self, arrays: Mapping[str, npt.NDArray[Any]], attributes: Any) -> None:
+    def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         self.sample = TouchSample.from_arrays(arrays, attributes["pool"])
         if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity)
+            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
         self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
+        self._take_tuned(arrays, attributes)
+
+    def take_tuned(self, generation: Generation) -> None:
+        """Take f* from a generation, if it has another one."""
+        self._take_tuned(generation.arrays, generation.attributes)
+
+    def _take_tuned(self, arrays: Arrays, attributes: Any) -> None:
         if "tuned" in attributes:
-            self.tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+            tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+            if self.tuned is None or self.tuned.digest() != tuned.digest():
+                self.tuned = tuned
 
 
 def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:
@@ -353,14 +370,6 @@ def _describe(descriptions: dict[str, Description], material: str, constituents:
         descriptions.pop(material, None)
     else:
         descriptions[material] = dict(constituents)
-
-
-def _columns(record: Record) -> int:
-    return cast(int, record.attributes["columns"])
-
-
-def _exemplar(record: Record) -> Exemplar:
-    return Exemplar.of(record.label, record.key, record.arrays[READINGS], unpack_codes(record.arrays))
 
 
 def give_back_scratch() -> None:

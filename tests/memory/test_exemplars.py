@@ -12,9 +12,20 @@ from hypothesis import strategies as st
 from examples.benchmarks.buffers import compare
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarSample, herd, mean_code, quotas, rank
+from scroll_tactile.memory.exemplars import (
+    CANDIDATES,
+    Exemplar,
+    ExemplarSample,
+    exemplars_from_arrays,
+    exemplars_to_arrays,
+    herd,
+    quotas,
+    rank,
+)
 from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import mean_code
 from store import Store
 
 few = settings(max_examples=60, deadline=None)
@@ -164,30 +175,32 @@ def test_negative_numbers_are_refused(available, capacity):
 def exemplar(material, number, scale=1):
     """A stream of two readings of four bytes; number gives its key."""
     code = np.random.default_rng([number, ord(material[0])]).integers(-LARGEST, LARGEST, 3).astype(np.int32)
-    return Exemplar(material, bytes([number]), np.full((2, 1), number, np.float32), code, Scale("window", scale))
+    packed = pack_readings(np.full((2, 1), number, np.float32))
+    return Exemplar(material, bytes([number]), packed, code, Scale("window", scale))
 
 
-def sample_of(streams, capacity=3, ratio=CANDIDATES):
-    sample = ExemplarSample(capacity, ratio=ratio)
+def sample_of(streams, exemplars=3, ratio=CANDIDATES):
+    """A sample in which row 1000 + number has a stream's readings."""
+    sample = ExemplarSample(exemplars, ratio=ratio)
     for material, number in streams:
-        candidate = exemplar(material, number)
-        before, wanted = state(sample), sample.wants(material, candidate.key)
-        sample.add(candidate)
+        key, before = bytes([number]), state(sample)
+        wanted = sample.wants(material, key)
+        sample.add(material, key, 1000 + number)
         assert wanted == (state(sample) != before)
     return sample
 
 
 def state(sample):
-    arrays, attributes = sample.to_arrays()
-    return {name: (array.shape, array.tobytes()) for name, array in arrays.items()}, attributes
+    arrays, about = sample.to_arrays()
+    return {name: (array.shape, array.tobytes()) for name, array in arrays.items()}, about
 
 
 def held(sample):
-    return [(candidate.material, candidate.key[0]) for candidate in sample]
+    return [(material, key[0]) for material, key, _ in sample]
 
 
 streams = st.lists(st.tuples(st.sampled_from("abcdef"), st.integers(0, 25)), max_size=40)
-limits = st.fixed_dictionaries({"capacity": st.integers(1, 8), "ratio": st.integers(1, 3)})
+limits = st.fixed_dictionaries({"exemplars": st.integers(1, 8), "ratio": st.integers(1, 3)})
 
 
 @few
@@ -196,7 +209,7 @@ def test_any_order_split_merge_or_restart_keeps_what_the_definition_says(ours, t
     """The definition: by rank of the key in its material, key, material, the first that fit."""
     observed = {name: sorted({number for other, number in ours + theirs if other == name}) for name, _ in ours + theirs}
     order = sorted((i, number, name) for name, numbers in observed.items() for i, number in enumerate(numbers))
-    expected = sorted((name, number) for _, number, name in order[: limits["capacity"] * limits["ratio"]])
+    expected = sorted((name, number) for _, number, name in order[: limits["exemplars"] * limits["ratio"]])
     together = sample_of(ours + theirs, **limits)
     assert held(together) == expected
     shuffled = ours + theirs
@@ -205,25 +218,34 @@ def test_any_order_split_merge_or_restart_keeps_what_the_definition_says(ours, t
     merged = sample_of(ours, **limits)
     merged.update(sample_of(theirs, **limits))
     assert state(merged) == state(together)
-    restarted = ExemplarSample.from_arrays(*sample_of(ours, **limits).to_arrays(), **limits)
-    for stream in theirs:
-        restarted.add(exemplar(*stream))
-    assert state(restarted) == state(together)
 
 
 @few
-@given(streams, st.integers(1, 6))
-def test_a_sample_of_less_capacity_is_the_beginning_of_it(observed, capacity):
-    large = sample_of(observed, capacity=6)
-    assert held(ExemplarSample.from_arrays(*large.to_arrays(), capacity)) == held(sample_of(observed, capacity))
+@given(streams, streams, st.integers(1, 6), st.integers(1, 6))
+def test_a_restarted_sample_goes_on_and_one_of_fewer_is_the_beginning_of_it(ours, theirs, before, after):
+    restarted = ExemplarSample.from_arrays(*sample_of(ours, before).to_arrays(), min(before, after), 0)
+    for material, number in theirs:
+        restarted.add(material, bytes([number]), 1000 + number)
+    assert state(restarted) == state(sample_of(ours + theirs, min(before, after)))
 
 
-def test_samples_of_other_capacities_are_not_merged():
-    with pytest.raises(MismatchError, match="2 exemplars at ratio 3; came those for 3 at 3"):
-        ExemplarSample(2).update(ExemplarSample(3))
+@few
+@given(streams)
+def test_a_base_gives_exemplars_back_and_says_that_it_has_them(observed):
+    kept = [exemplar(*stream) for stream in sorted(set(observed))]
+    arrays, about = exemplars_to_arrays(kept)
+    again = exemplars_from_arrays(arrays, about)
+    assert [(e.material, e.key, e.readings.tobytes(), e.readings.shape, e.code.tolist(), e.scale) for e in again] == [
+        (e.material, e.key, e.readings.tobytes(), e.readings.shape, e.code.tolist(), e.scale) for e in kept
+    ]
+    assert all(source == 0 for *_, source in ExemplarSample.from_arrays(arrays, about, 99, 0))
+    alone = ExemplarSample.from_arrays(arrays, about, 99, None)
+    assert [(material, key, source.key) for material, key, source in alone] == [
+        (e.material, e.key, e.key) for e in kept
+    ]
 
 
-@pytest.mark.parametrize("wrong", [{"capacity": 0}, {"capacity": -1}, {"capacity": 1, "ratio": 0}])
+@pytest.mark.parametrize("wrong", [{"exemplars": 0}, {"exemplars": -1}, {"exemplars": 1, "ratio": 0}])
 def test_a_sample_that_could_hold_nothing_is_refused(wrong):
     with pytest.raises(InputError, match="1 or more"):
         ExemplarSample(**wrong)
@@ -243,19 +265,17 @@ def test_a_memory_that_0_1_made_with_a_limit_in_bytes_opens_with_its_count_or_th
 
 
 def test_what_0_1_noted_of_streams_dropped_for_their_bytes_is_passed_over():
-    arrays, attributes = sample_of([("a", 1), ("a", 2), ("b", 9)]).to_arrays()
-    again = ExemplarSample.from_arrays(arrays, attributes | {"felt": {"a": [8, "02"], "b": [4000, None]}}, 3)
+    arrays, about = sample_of([("a", 1), ("a", 2), ("b", 9)]).to_arrays()
+    again = ExemplarSample.from_arrays(arrays, about | {"felt": {"a": [8, "02"], "b": [4000, None]}}, 3, 0)
     assert held(again) == [("a", 1), ("a", 2), ("b", 9)]
 
 
-def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
-    codes = {
-        5: np.zeros((9, 2), np.int32),
-        20: np.array([[1, 2**20], [2, 2**20]], np.int32),
-        50: np.zeros((0, 2), np.int32),
-    }
-    one = Exemplar.of("wool", b"k", np.zeros((30, 4), np.float32), codes)
-    assert (one.scale, one.code.tolist(), one.code.dtype) == (20, [2, 2**20], np.int32)
+def test_an_exemplars_code_is_the_last_of_its_own_at_its_widest_scale():
+    narrow, wide = Scale("window", 5), Scale("window", 20)
+    codes = {narrow: np.arange(8, dtype=np.int32).reshape(4, 2), wide: np.array([[1, 2], [3, 4], [8, 9]], np.int32)}
+    stages = [{narrow: [0]}, {narrow: [0], wide: [0]}, {narrow: [0], wide: [0, 1]}]  # the last row is of a copy
+    one = Exemplar.of("wool", b"k", pack_readings(np.zeros((30, 4), np.float32)), stages, codes)
+    assert (one.scale, one.code.tolist(), one.code.dtype) == (wide, [3, 4], np.int32)
 
 
 # --- the buffer ---
@@ -265,7 +285,8 @@ def test_an_exemplars_code_is_the_mean_of_its_widest_windows():
 @given(streams, st.integers(1, 10), st.randoms(use_true_random=False))
 def test_the_buffer_depends_on_no_order_and_is_even(observed, capacity, random):
     def buffer(observed):
-        ranked = rank(sample_of(observed, capacity), lambda material, _: np.full(3, ord(material)))
+        candidates = [exemplar(material, key[0]) for material, key, _ in sample_of(observed, capacity)]
+        ranked = rank(candidates, capacity, lambda material, _: np.full(3, ord(material)))
         return {name: [exemplar.key for exemplar in exemplars] for name, exemplars in ranked.items()}
 
     found = buffer(observed)
@@ -281,24 +302,26 @@ def test_the_buffer_depends_on_no_order_and_is_even(observed, capacity, random):
 
 
 def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind():
-    sample = ExemplarSample(6)
     streams = {9: (20, [1, 0, 0]), 1: (20, [90, 0, 0]), 7: (5, [0, 0, 0]), 8: (5, [0, 0, 0])}
-    for number, (scale, code) in streams.items():
-        sample.add(replace(exemplar("a", number, scale), code=np.array(code, np.int32)))
+    candidates = [
+        replace(exemplar("a", number, scale), code=np.array(code, np.int32))
+        for number, (scale, code) in streams.items()
+    ]
     asked = []
 
     def means(material, scale):
         asked.append((material, scale))
         return np.zeros(3, np.int64)
 
-    assert [exemplar.key[0] for exemplar in rank(sample, means)["a"]] == [9, 1, 7, 8]
+    assert [exemplar.key[0] for exemplar in rank(candidates, 6, means)["a"]] == [9, 1, 7, 8]
     assert asked == [("a", Scale("window", 20))]
 
 
 def test_no_candidates_make_no_buffer():
     sample = ExemplarSample(3)
-    assert rank(sample, lambda *_: np.zeros(3, np.int64)) == {}
-    assert len(ExemplarSample.from_arrays(*sample.to_arrays(), 3)) == 0
+    assert rank([], 3, lambda *_: np.zeros(3, np.int64)) == {}
+    assert len(ExemplarSample.from_arrays(*sample.to_arrays(), 3, 0)) == 0
+    assert exemplars_from_arrays(*exemplars_to_arrays([])) == []
 
 
 def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():

@@ -6,55 +6,129 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from scroll_tactile.errors import CapacityError
-from scroll_tactile.memory.rows import pack_codes, unpack_codes
+from scroll_tactile.datasets import biotac_slide
+from scroll_tactile.errors import CapacityError, MismatchError
+from scroll_tactile.memory.rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.memory.state import OBSERVE, Memory
 from scroll_tactile.signals.windows import Scale, WindowPlan, extent
-from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
+from scroll_tactile.statistics.moments import MOST_ROWS
+from scroll_tactile.statistics.sample import stage_rows
 from store import Store
+from store.encoding import encode_payload
 
 DIMENSION, SCALES = 4, (6, 20)
 READING = WindowPlan(SCALES)
 NARROW = Scale("window", 6)
 
-codes_of_scale = arrays_of.arrays(
-    np.int32, st.tuples(st.integers(1, 9), st.integers(1, 5)), elements=st.integers(-(2**20), 2**20)
+SHAPES = st.one_of(
+    st.tuples(st.integers(1, 9), st.integers(1, 5)), st.tuples(st.integers(1, 3), st.just(2), st.just(3), st.just(3))
 )
+any_bits = arrays_of.arrays(np.uint32, SHAPES).map(lambda bits: bits.view(np.float32))
+counted = st.builds(
+    lambda counts, power: np.ldexp(counts.astype(np.float32), power),
+    arrays_of.arrays(np.int32, SHAPES, elements=st.integers(-(2**16), 2**16)),
+    st.integers(-140, 100),
+)
+mixed = arrays_of.arrays(np.float32, SHAPES, elements=st.sampled_from([0.0, -0.0, 1.0, 0.5, 1e-45, 3e38, 0.1, np.inf]))
 
 
 @settings(deadline=None)
-@given(
-    st.dictionaries(st.sampled_from([NARROW, Scale("window", 20), Scale("window", 400)]), codes_of_scale, min_size=1)
+@given(st.one_of(any_bits, counted, mixed))
+def test_packed_readings_unpack_to_the_same_bits(readings):
+    again = unpack_readings(pack_readings(readings))
+    assert (again.dtype, again.shape) == (np.float32, readings.shape)
+    assert again.tobytes() == readings.tobytes()
+    assert again.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    ("readings", "kind"),
+    [
+        (np.arange(256), np.uint8),
+        (np.arange(-128, 128), np.int8),
+        (np.arange(256) / 64, np.uint8),
+        (np.arange(4096) * 8, np.int16),
+        (np.arange(300) - 9.25, np.int16),
+        (np.zeros(5), np.uint8),
+    ],
 )
-def test_packed_codes_unpack_to_the_same(codes):
+def test_what_a_sensor_counts_takes_a_byte_or_two_a_value(readings, kind):
+    packed = pack_readings(readings.astype(np.float32)[:, None])
+    assert [array.dtype for array in packed.values()] == [kind]
+
+
+def test_real_touches_take_less_than_ten_kilobytes_on_average(real_data):
+    for sensor in ("biotac", "roboskin"):
+        streams = biotac_slide.load(real_data, sensor).streams[::10]
+        packed = [pack_readings(stream.readings) for stream in streams]
+        for stream, arrays in zip(streams, packed, strict=True):
+            assert unpack_readings(arrays).tobytes() == stream.readings.tobytes()
+        assert np.mean([len(encode_payload(arrays)) for arrays in packed]) < 10_000
+
+
+def test_codes_come_back():
+    codes = {NARROW: np.arange(8, dtype=np.int32).reshape(2, 4), Scale("beginning"): np.zeros((1, 4), np.int32)}
     again = unpack_codes(pack_codes(codes))
-    assert sorted(again) == sorted(codes)
-    for scale, rows in codes.items():
-        assert again[scale].dtype == np.int32
-        assert again[scale].shape == rows.shape
-        assert again[scale].tobytes() == np.ascontiguousarray(rows).tobytes()
-        assert again[scale].flags.c_contiguous
+    assert {scale: rows.tolist() for scale, rows in again.items()} == {
+        scale: rows.tolist() for scale, rows in codes.items()
+    }
 
 
-@pytest.mark.parametrize("values", [1, 2**8, 2**8 + 1, 2**16, 2**16 + 1])
-def test_any_number_of_distinct_values(values):
-    codes = {NARROW: np.arange(values, dtype=np.int32).reshape(1, -1) * 15}
-    assert unpack_codes(pack_codes(codes))[NARROW].tobytes() == codes[NARROW].tobytes()
+def earlier(windows, *, placed):
+    """The arrays of a row of version 0.2: the codes of all windows, as they are or as places among their values."""
+    if not placed:
+        return {f"codes-{scale}": rows for scale, rows in windows.items()}
+    arrays = {}
+    for scale, rows in windows.items():
+        arrays[f"values-{scale}"], places = np.unique(rows.T, return_inverse=True)
+        arrays[f"places-{scale}"] = places.reshape(rows.T.shape).astype(np.uint16)
+    return arrays
 
 
-def test_few_distinct_values_take_a_byte_each():
-    packed = pack_codes({NARROW: np.arange(4000, dtype=np.int32).reshape(40, 100) % 200})
-    assert packed["places-6"].dtype == np.uint8
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_windows_of_an_earlier_row_count_as_its_stages(seed, placed):
+    _, _, columns, codes = touch(seed)
+    arrays = earlier(windows_of(seed), placed=placed)
+    found = row_codes(arrays, columns, READING, None)
+    assert {scale: rows.tolist() for scale, rows in found.items()} == {
+        scale: rows.tolist() for scale, rows in codes.items()
+    }
 
 
-def touch(seed):
+def test_where_an_earlier_row_holds_copies_its_readings_are_embedded_again_or_it_counts_without_them():
+    _, _, columns, codes = touch(3)
+    doubled = {scale: np.concatenate([rows, rows + 1]) for scale, rows in windows_of(3).items()}
+    readings = {"readings": np.ones((columns, 2), np.float32)}
+    wanted = {NARROW: np.full((1, DIMENSION), 7, np.int32)}
+    assert row_codes(earlier(doubled, placed=True) | readings, columns, READING, lambda _: wanted) is wanted
+    for arrays in (earlier(doubled, placed=True), earlier(doubled, placed=True) | readings):
+        found = row_codes(arrays, columns, READING, None)
+        assert {scale: rows.tolist() for scale, rows in found.items()} == {
+            scale: rows.tolist() for scale, rows in codes.items()
+        }
+
+
+def test_readings_alone_need_their_embedding():
+    arrays = pack_readings(np.ones((20, 2), np.float32))
+    with pytest.raises(MismatchError, match="by the embedding that made the memory"):
+        row_codes(arrays, 20, READING, None)
+
+
+def windows_of(seed):
+    """The codes of all windows of `touch(seed)`."""
     rng = np.random.default_rng(seed)
     columns = int(rng.integers(3, 60))
-    codes = {
+    return {
         Scale("window", scale): rng.integers(0, 2**20, size=(len(begin), DIMENSION), dtype=np.int32)
         for scale, begin in extent(columns, SCALES).items()
     }
-    return "abcd"[seed % 4], rng.bytes(32), columns, codes
+
+
+def touch(seed):
+    columns = int(np.random.default_rng(seed).integers(3, 60))
+    codes = dict(stage_rows(READING.scored_stages(columns), windows_of(seed)))
+    return "abcd"[seed % 4], np.random.default_rng([seed, 1]).bytes(32), columns, codes
 
 
 def filled(seeds):
@@ -65,7 +139,7 @@ def filled(seeds):
 
 
 def content(memory):
-    pool = [(m, k, t.sums.tobytes(), t.pairs.tobytes()) for m, k, t in memory.sample]
+    pool = [(m, k, t.rows.tobytes(), t.pairs.tobytes()) for m, k, t in memory.sample]
     return memory.statistics.digest(), pool, memory.sequence
 
 
@@ -104,15 +178,13 @@ def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, up
 
 def test_a_full_memory_refuses_and_stays_as_it_was():
     memory = filled(range(5))
-    held = memory.statistics.second(NARROW, 0).rows
-    memory.statistics._seconds[NARROW][0] = SecondMoment.of(
-        memory.statistics.second(NARROW, 0).packed(), MOST_ROWS, DIMENSION
-    )
+    moment = memory.statistics.second(NARROW)
+    held, moment.rows = moment.rows, MOST_ROWS
     before = content(memory)
     with pytest.raises(CapacityError):
         memory.add(*touch(9), 6)
     assert content(memory) == before
-    memory.statistics._seconds[NARROW][0].rows = held
+    moment.rows = held
     assert content(memory) == content(filled(range(5)))
 
 

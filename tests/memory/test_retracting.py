@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_same, spoil, stream, without
 
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Capabilities, Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import (
     FineTuneError,
     InputError,
@@ -87,6 +87,12 @@ class TestRetract:
                 with pytest.raises(ReadOnlyError):
                     call()
             require_same(reader, OBSERVED)
+
+
+class OwnKernels(Kernels):
+    """An embedding of a user's own: the rows of its memories keep codes, and readings for exemplars alone."""
+
+    capabilities = Capabilities(embeds_windows=True)
 
 
 def in_a_batch(learner):
@@ -259,8 +265,9 @@ class TestMerge:
             require_same(ours, OBSERVED)
 
     def test_without_readings_its_exemplars_cannot_be_had(self, path, tmp_path):
-        ours, _ = filled(path)
-        theirs, _ = filled(tmp_path / "other", OBSERVED[:3], exemplars=0)
+        own = OwnKernels(seed=0, dimension=64)
+        ours, _ = filled(path, embedding=own)
+        theirs, _ = filled(tmp_path / "other", OBSERVED[:3], embedding=own, exemplars=0)
         with ours, theirs:
             with pytest.raises(MismatchError, match="kept no readings"):
                 ours.merge(theirs, shared="twice")
@@ -269,6 +276,13 @@ class TestMerge:
             theirs.compact()
             with pytest.raises(MismatchError, match="was compacted and keeps exemplars"):
                 ours.merge(theirs, shared="twice")
+            require_same(ours, OBSERVED)
+
+    def test_where_rows_are_readings_it_does_not_matter_who_keeps_exemplars(self, path, tmp_path):
+        ours, _ = filled(path, OBSERVED[:5])
+        theirs, _ = filled(tmp_path / "other", OBSERVED[3:], exemplars=0)
+        with ours, theirs:
+            ours.merge(theirs, shared="once")
             require_same(ours, OBSERVED)
 
     def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
@@ -370,7 +384,11 @@ class TestRefresh:
         with learner, reader:
             learner.retract(receipts[0])
             learner.compact()
-            require_same(reader, OBSERVED)
+            require_same(reader, OBSERVED, exemplars=False)
+            with pytest.raises(CompactedError, match="was compacted since it was read"):  # their readings are gone
+                reader.exemplars  # noqa: B018
+            reader.refresh()
+            require_same(reader, without(0))
 
 
 def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
@@ -386,7 +404,7 @@ def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
     with Store.open(path) as store:
         newest, base = store.newest, store.base().number
     assert newest != base
-    (path / "generations" / f"{newest:08d}" / "observations" / "c" / "0" / "0").unlink()
+    spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
         assert learner.memory.generation == base
         require_same(learner, expected)
@@ -409,7 +427,11 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     repaired = repair_store(path)
     assert repaired.kept == 13
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, OBSERVED)
+        require_same(again, OBSERVED, exemplars=False)
+        assert again.exemplars == {}  # the repair gave up the rows that held their readings
+        assert "the readings of 12 candidates for exemplars were lost to damage" in caplog.text
+        again.compact()
+        assert again.exemplars == {}
     assert "observation 1 was retracted by row 13, but still counts" in caplog.text
 
 
@@ -422,7 +444,7 @@ def test_a_base_of_a_base_still_knows_what_both_left_out(path, caplog):
     with Store.open(path) as store:
         newest, base = store.newest, store.base().number
     if newest != base:
-        (path / "generations" / f"{newest:08d}" / "observations" / "c" / "0" / "0").unlink()
+        spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
         assert learner.memory.generation == base
         require_same(learner, without(0))
@@ -481,10 +503,12 @@ def test_with_a_damaged_base_nothing_is_retracted(path):
         for call in (lambda: learner.retract(receipts[-1]), lambda: learner.forget("a")):
             with pytest.raises((DamageError, ObservationError)):
                 call()
-        require_same(learner, OBSERVED)
+        require_same(learner, OBSERVED, exemplars=False)
+        with pytest.raises(DamageError):  # it has the readings of some
+            learner.exemplars  # noqa: B018
         learner.observe("a", stream((9, 60)))
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, [*OBSERVED, ("a", (9, 60))])
+        require_same(again, [*OBSERVED, ("a", (9, 60))], exemplars=False)
 
 
 def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
@@ -501,7 +525,7 @@ def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
         assert again.materials == whole.materials
         for i in (11, 8):
             gone = OBSERVED[i][0], learner_key(OBSERVED[i])
-            assert gone not in {(one.material, one.key) for one in again.memory.exemplars}
+            assert gone not in {(material, key) for material, key, _ in again.memory.exemplars}
             assert gone not in {(name, key) for name, key, _ in again.memory.sample}
     assert "no other touch can take the place of a retracted one" in caplog.text
     assert repair_store(path).lost
@@ -543,6 +567,8 @@ def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, i, mo
             left = felt[:i] + felt[i + 1 :]
         except DamageError as damage:
             assert "fail their checksum" in str(damage)
-        require_same(learner, left)
+        require_same(learner, left, exemplars=False)
     with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, left)
+        require_same(again, left, exemplars=False)
+        with pytest.raises(DamageError, match="fail their checksum"):
+            again.exemplars  # noqa: B018

@@ -20,6 +20,7 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
+from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
@@ -33,11 +34,12 @@ from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
+from store import Store
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
 
-__all__ = ["TactileLearner"]
+__all__ = ["TactileLearner", "reembed_memory"]
 
 logger = logging.getLogger(__name__)
 
@@ -126,6 +128,7 @@ class TactileLearner:
         damaged, not a store, a newer version …).
         """
         chosen = Settings(**settings)
+        finish_interrupted(Path(path))
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
         store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, mode)
@@ -142,9 +145,8 @@ class TactileLearner:
             learner = cls.__new__(cls)
             learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
             learner._unverified = (identity, store.path) if embedding is None else None
-            # An embedding of its user's own may not be there when a row is read: such rows have codes of their own.
-            plan, encode = learner._plan, learner._codes_of if capabilities_of(found).exact else None
-            bare = encode is not None and identity.embedding.configuration is not None
+            bare = identity.embedding.bare
+            plan, encode = learner._plan, learner._codes_of if bare or capabilities_of(found).exact else None
             learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, exemplars, encode), store, bare)
         except BaseException:
             store.close()
@@ -327,6 +329,39 @@ class TactileLearner:
         """
         return self._ledger.compact(keep)
 
+    def reembed(
+        self, embedding: Embedding | None = None, *, progress: Callable[[str, int, int], object] | None = None
+    ) -> Path:
+        """Carry the memory over to another embedding, from the readings in its journal; durable when this returns.
+
+        embedding: None for its own as it is now, with the packages and on the machine at hand. progress: called with
+        (what is being done, rows done, rows in all).
+
+        The memory is whole and can be used until the new one takes its place; returns the folder in which it lies from
+        then on, to be removed once nobody needs it. A call that was cut short is resumed by the next. Observations
+        keep their receipts, retractions and descriptions stay; an f* is gone. Other calls that wait meanwhile raise
+        StoreClosedError. `reembed_memory` does this with a memory that does not open.
+
+        Raises MismatchError where readings are missing, as in a compacted memory; InputError in a memory without a
+        path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.
+        """
+        store = self._ledger.require_store("be embedded again")
+        self._ledger.require_writing()
+        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
+        carried = _reembedding(store, chosen)
+        try:
+            carried.copy(progress or _silent)
+            with self._ledger.lock:
+                self._ledger.require_writing()
+                carried.copy(progress or _silent)
+                self.close()
+                before = carried.put_in_place()
+                own: dict[str, Any] = self._settings.model_dump(exclude={"exemplars"})
+                self.__dict__.update(type(self).open(store.path, embedding=chosen, **own).__dict__)
+        finally:
+            carried.close()
+        return before
+
     def refresh(self) -> bool:
         """In a memory opened to read, take in what was committed since; whether there was anything.
 
@@ -447,7 +482,7 @@ class TactileLearner:
             self._current.settle(self._ledger)
 
     def model(self) -> Model:
-        """The readouts and calibrations of the memory as it is now, as after `settle`; what comes later is not in them."""
+        """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in them."""
         with self._ledger.lock:
             return Draft.of(self._ledger.memory, self._settings.readout).fit()
 
@@ -547,6 +582,42 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def reembed_memory(
+    path: str | os.PathLike[str],
+    embedding: Embedding | None = None,
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Path:
+    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone."""
+    finish_interrupted(Path(path))
+    with Store.open(path) as store:
+        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
+        carried = _reembedding(store, chosen)
+        try:
+            carried.copy(progress or _silent)
+            return carried.put_in_place()
+        finally:
+            carried.close()
+
+
+def _reembedding(store: Store, embedding: Embedding) -> Reembedding:
+    made = Identity.read(store)
+    exemplars = made.exemplar_count(store, None)
+    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation)
+    plan = window_plan(made.sensor, embedding)
+    extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
+
+    def encode(readings: npt.NDArray[np.float32]) -> tuple[int, Codes]:
+        touch = Stream(made.sensor, readings)
+        image = extractor.image(touch)
+        return image.shape[1], extractor.codes(image, touch.key)
+
+    def load(draft: Store) -> Memory:
+        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1])
+
+    return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)
 
 
 def _silent(what: str, done: int, of: int) -> None:

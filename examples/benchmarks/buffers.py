@@ -23,6 +23,7 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.memory.buffer import candidates_of
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
 from scroll_tactile.pipelines.classification import hold_out
 from scroll_tactile.signals.image import tactile_image
@@ -196,7 +197,7 @@ def run_buffers(
     for touch in train:
         learner.observe(*touch)
     assert learner.memory.exemplars is not None
-    kept = list(learner.memory.exemplars)
+    kept = candidates_of(learner.memory, None)
     codes, keys = np.stack([exemplar.code for exemplar in kept]), [exemplar.key for exemplar in kept]
     f = float(np.mean([learner.predict(stream).material == name for name, stream in test]))
     records = []

@@ -29,6 +29,24 @@ class Shared(StrEnum):
 
 
 @memory.command()
+def reembed(
+    folder: MemoryFolder,
+    default: Annotated[bool, typer.Option("--default", help="With the default embedding of its sensor.")] = False,
+) -> None:
+    """Embed all readings again, with the memory's own embedding as it is now; interrupted, start it again to go on."""
+    from scroll_tactile.learner import reembed_memory
+    from scroll_tactile.memory.identity import Identity, usual_embedding
+    from scroll_tactile.memory.reembed import finish_interrupted
+
+    finish_interrupted(folder)
+    with Store.open(folder, mode="read") as store:
+        chosen = usual_embedding(Identity.read(store).sensor) if default else None
+    with progress_bar() as progress:
+        before = reembed_memory(folder, chosen, progress=progress)
+    say(f"the memory before is in {escape(str(before))}: remove it once the new one is as you want it")
+
+
+@memory.command()
 def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Verify every checksum; change nothing. The exit code is 1 where something is damaged."""
     with progress_bar() as progress:

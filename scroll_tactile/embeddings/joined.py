@@ -49,11 +49,9 @@ class Joined:
         # Judged by all scales, kernels with vision are not better (BioTac 99.4 against 99.5 %, RoboSkin 98.4 to 98.6),
         # at the price of a pass for each narrow window.
         widest = any(part.judged_scales == "widest" for part in declared)
-        penalties = [part.penalties for part in declared]
         self.capabilities = Capabilities(
             partial_windows=all(part.partial_windows for part in declared),
             judged_scales="widest" if widest else "all",
-            penalties=tuple(sorted(set().union(*penalties))) if all(penalties) else (),
             reads_frames=bool(framed),
             rest=rest,
             embeds_windows=True,

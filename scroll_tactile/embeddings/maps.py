@@ -32,7 +32,6 @@ PRESSED = 0.5  # of the square root of the range: a quarter of it is a taxel tha
 MARGIN = 4  # taxels that a map may be moved by without losing an edge
 STEPS = 2**12  # of a random feature: coarse enough for a machine's cosine not to matter
 STEEPEST = 2.0**10  # of a cosine's weights, of which one in 1600 would be steeper: more turns say no more
-PENALTIES = (0.03, 0.1, 0.3, 1.0)  # as shares of a feature's variance
 
 
 class Maps:
@@ -91,8 +90,7 @@ class Maps:
         self._seen = math.prod(layout) * (parts if len(layout) == 1 else parts + SUMMARIES)  # by each view
         self._read = 1 if len(layout) == 1 else len(self.views)
         self.dimension = cosines or self._read * self._seen
-        # As many cosines as touches know each by heart: with the λ of other features letters fall by three points.
-        self.capabilities = Capabilities(judged_scales="widest", penalties=PENALTIES if cosines else ())
+        self.capabilities = Capabilities(judged_scales="widest")
 
     def __repr__(self) -> str:
         return (

@@ -85,7 +85,6 @@ class Robust:
             judged_scales=inside.judged_scales,
             reads_beginnings=True,
             fills_channels=True,
-            penalties=inside.penalties,
             embeds_windows=True,
             embeds_noise=True,
             exact=inside.exact,

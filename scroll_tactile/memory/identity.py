@@ -69,6 +69,11 @@ class EmbeddingIdentity(_Kept):
             configuration=configuration_of(embedding),
         )
 
+    @property
+    def bare(self) -> bool:
+        """Whether rows of observations hold readings alone: the memory can make the embedding again, to the bit."""
+        return self.configuration is not None and _is_exact(self.configuration)
+
     def __str__(self) -> str:
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
@@ -204,7 +209,8 @@ class Identity(_Kept):
         if any(getattr(mine, field) != getattr(made, field) for field in fields):
             raise EmbeddingMismatchError(
                 f"{path} was made with embedding {made}; it was opened with {mine}. Features of one mean nothing to "
-                "the other: open it with the embedding that made it, or take another path"
+                "the other: open it with the embedding that made it, take another path, or carry the memory over to "
+                f"this one: scroll-tactile memory reembed {path}, or learner.reembed(embedding)"
             )
         self.require_plan(path, embedding)
 
@@ -241,7 +247,7 @@ class AbsentEmbedding:
             fills_channels=robust,
             embeds_windows=True,
             embeds_noise=robust,
-            exact=made.name in LIKELY_EXACT if made.configuration is None else _is_exact(made.configuration),
+            exact=made.bare or (made.configuration is None and made.name in LIKELY_EXACT),
         )
 
     @cached_property

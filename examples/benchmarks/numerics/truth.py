@@ -1,50 +1,44 @@
-"""The true weights of a ridge regression on given doubles, by ways that share nothing with the solvers measured.
+"""The truth, in FLINT's fractions and balls, from the rows themselves and by the textbook's dense formulas.
 
-Small cases: the normal equations in whole numbers, solved in fractions by FLINT: exact, and not in ball arithmetic.
-Larger ones: Householder's QR of the rows in float64 (LAPACK), then corrections from what
-the equations R + XW = Y and XᵀR = λW leave over, formed exactly in Python's integers, until they are below 2⁻⁷⁰ of the
-weights. That they shrink, each to a small share of the one before, verifies the answer; else TruthError is raised.
+`exact_weights` solves a ridge regression of doubles; `TrueReadout` answers as a readout does that has no rounding. They
+share no formula with what is measured: sums are formed at once from all rows, and every matrix is solved by itself.
+The tests hold both against mpmath.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from flint import fmpq_mat, fmpz_mat
-from scipy.linalg import solve_triangular
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat, fmpz, fmpz_mat
 
-__all__ = ["TruthError", "exact_weights", "refined_weights"]
+__all__ = ["Answers", "TrueReadout", "exact_weights", "true_share", "whole"]
 
 FloatArray = npt.NDArray[np.float64]
 LongArray = npt.NDArray[np.longdouble]
 Integers = npt.NDArray[np.object_]
 
 VANISHING = 300  # bits: with λ so far below the matrix, a singular system's solution is its smallest to a long double
-SMALL = 2.0**-70
-STEPS = 40
-WORST = 1e12  # condition of the rows: corrections shrink by 10⁻⁴ at least
-BITS = 200  # of the weights as integers, below their largest
+FIRST_BITS, ENOUGH_BITS = 256, 80
 
 
-class TruthError(ArithmeticError):
-    """The corrections did not shrink: no truth was found for this case."""
-
-
-def _integers(values: FloatArray) -> tuple[Integers, int]:
-    """Doubles as integers times 2^exponent, exactly, with one exponent for all."""
+def whole(values: npt.NDArray[Any]) -> tuple[Integers, int]:
+    """Doubles or integers as integers times 2^exponent, exactly, with one exponent for all."""
+    if values.dtype.kind == "i":
+        return values.astype(object), 0
     mantissa, exponent = np.frexp(values)
-    whole = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
+    digits = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     places = np.where(mantissa == 0, 0, exponent - 53)
     least = int(places.min(initial=0))
-    return whole << (places - least).astype(object), least
+    return digits << (places - least).astype(object), least
 
 
 def _by_column(values: FloatArray) -> tuple[Integers, list[int]]:
     """Doubles as integers, with one exponent for each column."""
-    parts = [_integers(column) for column in values.T]
+    parts = [whole(column) for column in values.T]
     return np.stack([part for part, _ in parts], axis=1), [exponent for _, exponent in parts]
 
 
@@ -58,94 +52,182 @@ def exact_weights(rows: FloatArray, targets: FloatArray, penalty: float, repeats
     gram, right = repeats * (x.T @ x), repeats * (x.T @ y)
     # In units: A_ij = 2^(p_i + p_j) gram_ij, so λ counts 2^(−2 p_i) λ on the diagonal; all brought to whole numbers.
     ridge = [Fraction(penalty) / Fraction(2) ** (2 * place) for place in places]
-    solution = _rational(gram, right, ridge)
+    solution = _solved(gram, right, ridge)
     if solution is None:
         size = max((Fraction(2) ** (2 * p) * int(gram[j, j]) for j, p in enumerate(places)), default=Fraction(1))
         least = (size or Fraction(1)) / 2**VANISHING
-        solution = _rational(gram, right, [least / Fraction(2) ** (2 * place) for place in places])
+        solution = _solved(gram, right, [least / Fraction(2) ** (2 * place) for place in places])
     assert solution is not None
     weights = np.zeros((len(places), len(above)), dtype=np.longdouble)
     for row, column in np.ndindex(weights.shape):
-        found = solution[row, column]
-        value = Fraction(int(found.p), int(found.q)) * Fraction(2) ** (above[column] - places[row])
-        weights[row, column] = _long(value)
+        weights[row, column] = _long(solution[row, column], above[column] - places[row])
     return weights
 
 
-def _long(value: Fraction) -> Any:
-    """A fraction as a long double, whatever its exponent."""
-    if not value:
-        return np.longdouble(0)
-    shift = 64 - (abs(value.numerator).bit_length() - value.denominator.bit_length())
-    whole = round(value * Fraction(2) ** shift)
-    high, low = divmod(whole, 2**32)
-    return np.ldexp(np.longdouble(high) * np.longdouble(2**32) + np.longdouble(low), -shift)
-
-
-def _rational(gram: Integers, right: Integers, ridge: list[Fraction]) -> fmpq_mat | None:
-    """The solution of (gram + ridge) X = right in fractions; None where the matrix is singular."""
+def _solved(gram: Integers, right: Integers, ridge: list[Fraction]) -> arb_mat | fmpq_mat | None:
+    """The solution of (gram + ridge) X = right; None where the matrix is singular."""
     common = max((value.denominator for value in ridge), default=1)  # powers of two: the largest is a multiple of all
     system = gram * common
     system[np.diag_indices(len(gram))] += np.array([int(value * common) for value in ridge], dtype=object)
+    matrix, wanted = fmpz_mat(system.tolist()), fmpz_mat((right * common).tolist())
+    if any(ridge):
+        return certain(arb_mat(matrix), arb_mat(wanted))
     try:
-        return fmpq_mat(fmpz_mat(system.tolist())).solve(fmpq_mat(fmpz_mat((right * common).tolist())))
+        return fmpq_mat(matrix).solve(fmpq_mat(wanted))
     except ZeroDivisionError:
         return None
 
 
-def refined_weights(rows: FloatArray, targets: FloatArray, penalty: float) -> LongArray:
-    """W of shape (d, C), right to about 2⁻⁷⁰ of its largest entry; λ > 0, entries of moderate size.
+def certain(matrix: arb_mat, right: arb_mat) -> arb_mat:
+    """The solution of a system that is not singular, in balls of which the middle is right to 80 bits."""
+    bits = FIRST_BITS
+    while True:
+        with ctx.workprec(bits):
+            try:
+                found = matrix.solve(right)
+            except ZeroDivisionError:  # balls too wide to tell it from a singular one
+                bits *= 2
+                continue
+            largest = [max(abs(value.mid()) for value in column) for column in found.transpose().tolist()]
+            small = arb((1, -ENOUGH_BITS))
+            if all(
+                value.rad() <= small * max(abs(value.mid()), top * small)
+                for row in found.tolist()
+                for value, top in zip(row, largest, strict=True)
+            ):
+                return found
+        bits *= 2
 
-    With residuals R as unknowns of their own, R + X W = Y and Xᵀ R − λ W = 0, corrections shrink at a rate of the
-    rows' condition times 2⁻⁵³ (Björck 1967, BIT 7); from the gradient alone it would be the condition's square.
+
+def _long(value: arb | fmpq, exponent: int) -> Any:
+    """value · 2^exponent as a long double, whatever its exponent."""
+    with ctx.workprec(128):
+        middle = arb(value).mid()
+        if not middle:
+            return np.longdouble(0)
+        mantissa, place = middle.man_exp()
+    digits = int(mantissa)
+    cut = max(0, digits.bit_length() - 64)
+    high, low = divmod(digits >> cut if digits > 0 else -(-digits >> cut), 2**32)
+    return np.ldexp(np.longdouble(high) * np.longdouble(2**32) + np.longdouble(low), int(place) + cut + exponent)
+
+
+def true_share(scatter: Integers, touches: int, least: float, largest: float) -> Fraction:
+    """ρ of a scatter in fractions, shape (d, d), by equation 23 of Chen et al. 2010, within its limits."""
+    dimension = len(scatter)
+    squares, trace = Fraction(np.square(scatter).sum()), Fraction(np.trace(scatter))
+    spread = squares - trace**2 / dimension
+    if not spread:
+        return Fraction(largest)
+    part = 1 - Fraction(2, dimension)
+    ratio = (part * squares + trace**2) / ((touches + part) * spread)
+    return min(max(ratio, Fraction(least)), Fraction(largest))
+
+
+@dataclass(frozen=True)
+class Answers:
+    """True answers for m rows and C materials, each rounded once.
+
+    lda: about their mean over the materials, (m, C); ridge: (m, C); distances: relative Mahalanobis distances if that
+    material were the nearest, (m, C); novelty: their least, (m,).
     """
-    d = rows.shape[1]
-    orthogonal, triangle = np.linalg.qr(np.concatenate([rows, np.sqrt(penalty) * np.eye(d)]))
-    # Beyond this the factors could be so far off in some direction that corrections would not see an error in it.
-    if not np.linalg.cond(triangle) < WORST:
-        raise TruthError("the rows are too ill conditioned for QR in float64")
-    (x, px), (y, py), (ridge, pr) = _integers(rows), _integers(targets), _integers(np.array([penalty]))
-    first = solve_triangular(triangle, orthogonal[: len(rows)].T @ targets)
-    of_w = int(np.frexp(np.abs(first).max())[1]) - BITS
-    of_r = int(np.frexp(np.abs(targets).max())[1]) - BITS
-    weights, residual = np.zeros(first.shape, dtype=object), np.zeros(targets.shape, dtype=object)
-    step = np.inf
-    for _ in range(STEPS):
-        gap = _sum((y, py), (-residual, of_r), (-(x @ weights), px + of_w))
-        slope = _sum((ridge[0] * weights, pr + of_w), (-(x.T @ residual), px + of_r))
-        inner = solve_triangular(triangle, _floats(*slope), trans="T")
-        wanted = np.concatenate([_floats(*gap), np.zeros_like(inner)])
-        along = orthogonal.T @ wanted
-        correction = solve_triangular(triangle, along - inner)
-        weights = weights + _whole(correction, of_w)
-        residual = residual + _whole((wanted - orthogonal @ (along - inner))[: len(rows)], of_r)
-        before, step = step, float(np.abs(correction).max())
-        if step <= SMALL * float(np.abs(_floats(weights, of_w)).max()):
-            high = _floats(weights, of_w)
-            return high.astype(np.longdouble) + _floats(weights - _whole(high, of_w), of_w)
-        if step > 0.5 * before:
-            break
-    raise TruthError(f"corrections of {before:.1e} and then {step:.1e}: the rows are too ill conditioned for QR")
+
+    lda: FloatArray
+    ridge: FloatArray
+    distances: FloatArray
+    novelty: FloatArray
 
 
-def _sum(*parts: tuple[Integers, int]) -> tuple[Integers, int]:
-    """Integers with the exponents of their units, added exactly."""
-    least = min(place for _, place in parts)
-    whole, place = parts[0]
-    found = whole << (place - least)
-    for whole, place in parts[1:]:
-        found = found + (whole << (place - least))
-    return found, least
+class TrueReadout:
+    """Discriminants of rows (n, d), doubles or integers, with places of their materials, P and γ.
+
+    K = S_w + P I and T = S_w + Σ n_y (m_y − μ)(m_y − μ)ᵀ + P I, with μ the mean of all rows.
+    """
+
+    def __init__(self, rows: npt.NDArray[Any], places: npt.NDArray[np.intp], penalty: float, gamma: float) -> None:
+        table, self._unit = whole(rows)
+        counts = np.bincount(places).tolist()
+        sums = fmpz_mat([[int(v) for v in table[places == y].sum(axis=0)] for y in range(len(counts))])
+        digits = fmpz_mat(table.tolist())
+        self._of_sums(digits.transpose() * digits, sums, counts, penalty, gamma)
+
+    @classmethod
+    def of_sums(cls, second: Integers, sums: Integers, counts: list[int], penalty: float, gamma: float) -> TrueReadout:
+        """The readout of rows of integers with Σ x xᵀ (d, d), and Σ x of each material, (C, d)."""
+        found = cls.__new__(cls)
+        found._unit = 0
+        found._of_sums(fmpz_mat(second.tolist()), fmpz_mat(sums.tolist()), counts, penalty, gamma)
+        return found
+
+    def _of_sums(self, second: fmpz_mat, sums: fmpz_mat, counts: list[int], penalty: float, gamma: float) -> None:
+        self.counts, self._gamma = counts, gamma
+        total = sum(counts)
+        self._mean = [fmpq(sum(column, start=fmpz(0)), total) for column in sums.transpose().tolist()]
+        with ctx.workprec(4 * FIRST_BITS):
+            self._means = arb_mat([
+                [arb(fmpq(v, n) - m) for v, m in zip(row, self._mean, strict=True)]
+                for row, n in zip(sums.tolist(), counts, strict=True)
+            ])  # fmt: skip
+            shares = [[arb(v) / n for v in row] for row, n in zip(sums.tolist(), counts, strict=True)]
+            scatter = arb_mat(second) - arb_mat(shares).transpose() * arb_mat(sums)
+            ridge = arb(penalty) * arb((1, -2 * self._unit))
+            self._within = scatter + _diagonal([ridge] * sums.ncols())
+            weighed = _diagonal([arb(n) for n in counts]) * self._means
+            self._whole = self._within + self._means.transpose() * weighed
+            self._pull = weighed.transpose()
+            self._solved = certain(self._within, self._means.transpose())
+            self._sizes = [_dot(m, s) for m, s in zip(self._means.tolist(), self._solved.transpose().tolist(), strict=True)]
+
+    def weights(self) -> FloatArray:
+        """γ K⁻¹ mᵀ about their mean over the materials, (d, C), in the rows' own unit."""
+        with ctx.workprec(2 * FIRST_BITS):
+            scale = arb(self._gamma) * arb((1, -self._unit))
+            return _floats([[scale * v for v in _centred(row)] for row in self._solved.tolist()])
+
+    def answers(self, rows: npt.NDArray[Any]) -> Answers:
+        """The answers for rows of shape (m, d)."""
+        table, unit = whole(rows)
+        shift = arb((1, unit - self._unit))
+        total, gamma = sum(self.counts), arb(self._gamma)
+        with ctx.workprec(4 * FIRST_BITS):
+            away = arb_mat([[shift * int(v) - m for v, m in zip(row, self._mean, strict=True)] for row in table.tolist()])
+            down = away.transpose()
+            z = (away * self._solved).tolist()
+            within = _dots(away, certain(self._within, down))
+            behind = certain(self._whole, _beside(self._pull, down))
+            pulled = arb_mat([row[: len(self.counts)] for row in behind.tolist()])
+            beyond = arb_mat([row[len(self.counts) :] for row in behind.tolist()])
+            whole_length = _dots(away, beyond)
+            lda = [_centred([gamma * (v - g / 2) for v, g in zip(row, self._sizes, strict=True)]) for row in z]
+            ridge = [[v + arb(n) / total for v, n in zip(row, self.counts, strict=True)] for row in (away * pulled).tolist()]
+            distances = [
+                [gamma * (near - 2 * v + g - far) for v, g in zip(row, self._sizes, strict=True)]
+                for row, near, far in zip(z, within, whole_length, strict=True)
+            ]
+            found = _floats(distances)
+            return Answers(_floats(lda), _floats(ridge), found, found.min(axis=1))
 
 
-def _whole(values: FloatArray, place: int) -> Integers:
-    """Doubles in units of 2^place, bits below it cut off."""
-    whole, own = _integers(values)
-    shifted: Integers = whole << (own - place) if own >= place else whole >> (place - own)
-    return shifted
+def _diagonal(values: list[arb]) -> arb_mat:
+    return arb_mat([[value if i == j else arb(0) for j in range(len(values))] for i, value in enumerate(values)])
 
 
-def _floats(whole: Integers, place: int) -> FloatArray:
-    """Integers times 2^place as doubles, each rounded once."""
-    floats: FloatArray = ((whole << max(place, 0)) / (1 << max(-place, 0))).astype(np.float64)
-    return floats
+def _beside(left: arb_mat, right: arb_mat) -> arb_mat:
+    return arb_mat([[*a, *b] for a, b in zip(left.tolist(), right.tolist(), strict=True)])
+
+
+def _dot(left: list[arb], right: list[arb]) -> arb:
+    return sum((a * b for a, b in zip(left, right, strict=True)), start=arb(0))
+
+
+def _dots(rows: arb_mat, columns: arb_mat) -> list[arb]:
+    return [_dot(row, column) for row, column in zip(rows.tolist(), columns.transpose().tolist(), strict=True)]
+
+
+def _centred(row: list[arb]) -> list[arb]:
+    middle = sum(row, start=arb(0)) / len(row)
+    return [value - middle for value in row]
+
+
+def _floats(table: list[list[arb]]) -> FloatArray:
+    return np.array([[float(value.mid()) for value in row] for row in table], dtype=np.float64)

@@ -23,7 +23,7 @@ __all__ = ["Diagnosis", "IntegerSystem", "OnSingular", "Solution", "float_of", "
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 OnSingular = Literal["raise", "diagnose"]
-Verdict = Literal["sound", "rounded", "ill conditioned", "singular", "out of range"]
+Verdict = Literal["sound", "ill conditioned", "singular", "out of range"]
 
 ILL = 2.0**53  # condition: from here on the last bit of a row can change the first digit of the weights
 PART = 0.1  # of the largest entry of a direction: columns with less are not named
@@ -80,8 +80,7 @@ class IntegerSystem:
 class Diagnosis:
     """What is to be said of exact weights.
 
-    verdict: "sound"; "rounded": the rows were rounded to a grid; "ill conditioned": right for these rows, but
-        their last bits decide; "singular": other weights fit as well; "out of range": some are too large for a
+    verdict: "sound"; "ill conditioned": right for these rows, but their last bits decide; "singular": other weights fit as well; "out of range": some are too large for a
         double.
     rank: of d columns, as decided exactly; d where λ > 0.
     condition: of A + λ I with columns brought to one size, an estimate; where singular, of independent columns.
@@ -89,7 +88,6 @@ class Diagnosis:
         where there are none, the one that is determined least, shape (d, 1).
     columns: those that have a part in them. relation: a singular system's first dependence, in words.
     bits: of the arithmetic that was enough. error_bound: of each weight's relative error, its rounding included.
-    rounding: the relative error that the grid is expected to have made, 0 without one.
     """
 
     verdict: Verdict
@@ -101,7 +99,6 @@ class Diagnosis:
     relation: str
     bits: int
     error_bound: float
-    rounding: float = 0.0
 
     def __str__(self) -> str:
         if self.verdict == "singular":
@@ -111,21 +108,16 @@ class Diagnosis:
             return "out of range: some weights exceed what a double can hold"
         if self.verdict == "ill conditioned":
             named = ", ".join(map(str, self.columns[:6])) + (" …" if len(self.columns) > 6 else "")
-            said = f"ill conditioned: {self.condition:.1e}, least determined in columns {named}"
-            return said + (f"; rounded: expect {self.rounding:.1e}" if self.rounding else "")
-        if self.verdict == "rounded":
-            return f"rounded: expect an error of {self.rounding:.1e} from the grid"
+            return f"ill conditioned: {self.condition:.1e}, least determined in columns {named}"
         return f"sound: condition {self.condition:.1e}"
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """W of shape (d, C), its diagnosis, M⁻¹ and q of `IntegerSystem.scaled`; no inverse where it is singular."""
+    """W of shape (d, C), and what is to be said of it."""
 
     weights: FloatArray
     diagnosis: Diagnosis
-    inverse: arb_mat | None
-    q: IntArray
 
 
 def solve_exact(system: IntegerSystem, on_singular: OnSingular = "raise") -> Solution:
@@ -229,7 +221,7 @@ def _determined(system: IntegerSystem, matrix: fmpz_mat, right: fmpz_mat, q: Int
         bits=bits,
         error_bound=2.0**-53 + 2.0**-accuracy,
     )
-    return Solution(weights, diagnosis, inverse, q)
+    return Solution(weights, diagnosis)
 
 
 def _smallest(system: IntegerSystem) -> Solution:
@@ -269,7 +261,7 @@ def _smallest(system: IntegerSystem) -> Solution:
         bits=bits,
         error_bound=2.0**-53 + 2.0**-accuracy,
     )
-    return Solution(weights, diagnosis, None, q)
+    return Solution(weights, diagnosis)
 
 
 def _condition_of(system: IntegerSystem, kept: list[int]) -> float:

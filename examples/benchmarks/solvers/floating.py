@@ -3,29 +3,27 @@
 All find W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² of rows that come in batches, through one interface (`Solver`). With A =
 Σ x xᵀ and B = Σ x yᵀ:
 
-====================== ======================================================================================
-covariance             P ← P − P Xᵀ (I + X P Xᵀ)⁻¹ X P,  W ← W + P Xᵀ (Y − X W): the conventional recursive form
-covariance-symmetric   the same, with P ← (P + Pᵀ) / 2 after each update
-qr                     R'R = A + λ I by orthogonal updates of R, Q'Y carried along:  W = R⁻¹ Q'Y
-gram64, gram32         A and B in float64 or float32, then Cholesky:  W = (A + λ I)⁻¹ B
-====================== ======================================================================================
+================= ==================================================================================
+recursion         P ← P − P Xᵀ (I + X P Xᵀ)⁻¹ X P,  W ← W + P Xᵀ (Y − X W): the paper's
+square root       R'R = A + λ I by orthogonal updates of R, Q'Y carried along:  W = R⁻¹ Q'Y
+plain sums        A and B in float64, then Cholesky:  W = (A + λ I)⁻¹ B
+pseudo-inverse    the same sums:  W = (A + λ I)⁺ B
+================= ==================================================================================
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
-
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dgemm, dger, dsyrk, ssyrk
-from scipy.linalg.lapack import dpotrf, dpotrs, dtpqrt, spotrf, spotrs
+from scipy.linalg import pinvh, solve_triangular
+from scipy.linalg.blas import dgemm, dger, dsyrk
+from scipy.linalg.lapack import dpotrf, dpotrs, dtpqrt
 
 from examples.benchmarks.solvers.solver_protocol import RidgeBase, SingularError
 from scroll_tactile.errors import InputError
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["Covariance", "CovarianceSymmetric", "Gram32", "Gram64", "SquareRoot"]
+__all__ = ["Gram64", "PseudoInverseGram", "RecursiveLeastSquares", "SquareRoot"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,13 +31,11 @@ WAITING = 512  # rows that a plain sum lets wait, as the exact one does: a fair 
 BLOCK = 32  # columns that dtpqrt works on at once
 
 
-class Covariance(RidgeBase):
-    """Recursive least squares carrying P = (A + λ I)⁻¹, by Sherman & Morrison 1950 and Woodbury 1950; λ > 0.
+class RecursiveLeastSquares(RidgeBase):
+    """The paper's recursive least squares, carrying P = (A + λ I)⁻¹, by Sherman & Morrison 1950 and Woodbury 1950; λ > 0.
 
     K = P Xᵀ (I + X P Xᵀ)⁻¹,  W ← W + K (Y − X W),  P ← P − K X P, from P = I / λ and W = 0.
     """
-
-    symmetric: ClassVar[bool] = False
 
     def _begin(self) -> None:
         if not self.penalty:
@@ -58,8 +54,6 @@ class Covariance(RidgeBase):
                 self._covariance = dger(-1.0, gain[:, 0], projected[0], a=self._covariance, overwrite_a=1)
             else:
                 self._covariance = dgemm(-1.0, gain, projected, beta=1.0, c=self._covariance, overwrite_c=1)
-            if self.symmetric:
-                self._covariance = (self._covariance + self._covariance.T) / 2
 
     def weights(self) -> FloatArray:
         """W of shape (d, C), as the recursion left it."""
@@ -78,12 +72,6 @@ def _gain(x: FloatArray, projected: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(inner, projected).T, dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.full(projected.T.shape, np.nan)
-
-
-class CovarianceSymmetric(Covariance):
-    """`Covariance` whose P is made symmetric after each update."""
-
-    symmetric = True
 
 
 def _definiteness(matrix: FloatArray) -> str:
@@ -132,17 +120,14 @@ class SquareRoot(RidgeBase):
 class Gram64(RidgeBase):
     """Sums A and B in floating point, then Cholesky: the normal equations, as they are usually solved."""
 
-    kind: ClassVar[type[np.floating[Any]]] = np.float64
-
     def _begin(self) -> None:
         width = self.dimension + self.outputs
-        self._sums = np.zeros((width, width), dtype=self.kind, order="F")
-        self._waiting = np.empty((WAITING, width), dtype=self.kind)
+        self._sums = np.zeros((width, width), order="F")
+        self._waiting = np.empty((WAITING, width))
         self._count = 0
 
     def _take(self, x: FloatArray, y: FloatArray) -> None:
-        with np.errstate(over="ignore", under="ignore"):
-            rows = np.concatenate([x, y], axis=1).astype(self.kind)
+        rows = np.concatenate([x, y], axis=1)
         for first in range(0, len(rows), WAITING):
             part = rows[first : first + WAITING]
             if self._count + len(part) > WAITING:
@@ -153,10 +138,9 @@ class Gram64(RidgeBase):
     def settle(self) -> None:
         """Bring rows that wait into the sums."""
         if self._count:
-            syrk = dsyrk if self.kind is np.float64 else ssyrk
             block = self._waiting[: self._count].T
             with np.errstate(all="ignore"):
-                self._sums = syrk(1.0, block, beta=1.0, c=self._sums, lower=0, overwrite_c=1)
+                self._sums = dsyrk(1.0, block, beta=1.0, c=self._sums, lower=0, overwrite_c=1)
             self._count = 0
 
     def weights(self) -> FloatArray:
@@ -164,22 +148,30 @@ class Gram64(RidgeBase):
         self._require_start()
         self.settle()
         d = self.dimension
-        factorise, solve = (dpotrf, dpotrs) if self.kind is np.float64 else (spotrf, spotrs)
         system = np.array(self._sums[:d, :d], order="F")
-        with np.errstate(over="ignore", under="ignore"), one_thread():
-            system[np.diag_indices(d)] += self.kind(self.penalty)
-            factor, failed = factorise(system, lower=0, overwrite_a=1)
-            if failed or not np.isfinite(np.diagonal(factor)).all():
-                raise SingularError(
-                    f"expected A + λ I to be positive definite in {np.dtype(self.kind)}; with λ = {self.penalty:g} "
-                    f"it is not at column {max(failed - 1, 0)}. Give a larger λ, or take the exact or the QR form"
-                )
-            found = solve(factor, self._sums[:d, d:], lower=0)[0]
+        system[np.diag_indices(d)] += self.penalty
         self.diagnosis = ""
-        return np.asarray(found, dtype=np.float64)
+        with np.errstate(all="ignore"), one_thread():
+            return self._solved(system, self._sums[:d, d:])
+
+    def _solved(self, system: FloatArray, right: FloatArray) -> FloatArray:
+        """The solution of a system of which the upper triangle is given."""
+        factor, failed = dpotrf(system, lower=0, overwrite_a=1)
+        if failed or not np.isfinite(np.diagonal(factor)).all():
+            raise SingularError(
+                f"expected A + λ I to be positive definite in float64; with λ = {self.penalty:g} it is not at column "
+                f"{max(failed - 1, 0)}. Give a larger λ, or take the exact or the QR form"
+            )
+        return np.asarray(dpotrs(factor, right, lower=0)[0], dtype=np.float64)
 
 
-class Gram32(Gram64):
-    """`Gram64` in float32."""
+class PseudoInverseGram(Gram64):
+    """The same sums, solved by a pseudo-inverse, as streaming discriminant analysis does (Hayes & Kanan 2020)."""
 
-    kind = np.float32
+    def _solved(self, system: FloatArray, right: FloatArray) -> FloatArray:
+        if not np.isfinite(system).all():
+            raise SingularError("expected finite sums: rows of this size overflow float64. Give them in another unit")
+        inverse, rank = pinvh(system, lower=False, check_finite=False, return_rank=True)
+        if rank < len(system):
+            self.diagnosis = f"taken for singular: rank {rank} of {len(system)}"
+        return np.asarray(inverse @ right, dtype=np.float64)

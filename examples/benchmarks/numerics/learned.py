@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +18,21 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["AGREED", "Learned", "answers_error", "flips", "followed_error", "left_out_error", "measure_learned", "share_error"]
+__all__ = [
+    "AGREED",
+    "SCALE",
+    "answers_error",
+    "asked",
+    "compared",
+    "flips",
+    "follow",
+    "measure_learned",
+    "name_of",
+    "solved",
+]
 
 FloatArray = npt.NDArray[np.float64]
+Scores = npt.NDArray[np.floating[Any]]
 Record = dict[str, Any]
 
 SCALE = Scale("window", 1)
@@ -30,7 +41,7 @@ LEFT_OUT = 20  # touches that are really left out
 MOST_DENSE = 64  # features: up to here touches are left out, and distances compared, in balls too
 
 
-def answers_error(found: FloatArray, true: FloatArray) -> float:
+def answers_error(found: Scores, true: Scores) -> float:
     """The largest error of a row of scores, (m, C), about their mean over the materials, relative to its largest score."""
     difference = (found - found.mean(axis=1, keepdims=True)) - (true - true.mean(axis=1, keepdims=True))
     sizes = np.abs(true - true.mean(axis=1, keepdims=True)).max(axis=1)
@@ -38,7 +49,7 @@ def answers_error(found: FloatArray, true: FloatArray) -> float:
     return float(error.max()) if np.isfinite(error).all() else float("inf")
 
 
-def flips(found: FloatArray, true: FloatArray) -> int:
+def flips(found: Scores, true: Scores) -> int:
     """How many rows of scores, (m, C), name another material."""
     return int(np.count_nonzero(found.argmax(axis=1) != true.argmax(axis=1)))
 
@@ -114,9 +125,13 @@ def measure_learned(memory: Memory) -> list[Record]:
     readout, evaluated = learned.readout, np.rint(memory.evaluated * 2**20).astype(np.int64)
     truth = learned.truth(readout)
     true = truth.answers(evaluated)
-    base = {"case": memory.name, "family": "below the grid" if memory.below else "within the bound"} | {
-        "rows": learned.memory.row_places.size, "dimension": memory.features.shape[2], "penalty": readout.penalty,
-    }  # fmt: skip
+    base = {
+        "case": memory.name,
+        "family": memory.family,
+        "rows": memory.row_places.size,
+        "dimension": memory.features.shape[2],
+        "penalty": readout.penalty,
+    }
     weights = _centred(readout.gamma * readout.means_of(readout.held(readout.reference))[1].T)
     fresh = base | {
         "method": "learner",
@@ -147,7 +162,10 @@ def _norm_error(found: FloatArray, true: FloatArray) -> float:
 
 def share_error(learned: Learned) -> float:
     """The relative error of ρ, of the scatter's fractions; 0 where there is no scatter and the readout has none."""
-    rows, places = learned.memory.codes.reshape(-1, learned.memory.codes.shape[2]).astype(object), learned.memory.row_places
+    rows, places = (
+        learned.memory.codes.reshape(-1, learned.memory.codes.shape[2]).astype(object),
+        learned.memory.row_places,
+    )
     scatter = rows.T @ rows
     counts = np.bincount(places).tolist()
     common = int(np.lcm.reduce(np.array(counts, dtype=object)))
@@ -162,51 +180,56 @@ def share_error(learned: Learned) -> float:
 
 
 def followed_error(learned: Learned, evaluated: npt.NDArray[np.int64]) -> Record:
-    """The readout of the first touches, followed to all of them; then one more comes, is answered for, and goes again."""
+    """The readout of the first touches, followed to all of them: its worst errors then, when one more has come, was
+    answered for and is retracted, and when the first touch is retracted.
+    """
     memory = learned.memory
     touches = [(name_of(place), rows, 1) for place, rows in zip(memory.places.tolist(), memory.codes, strict=True)]
     rows, dimension = memory.codes.shape[1:]
-    # As many touches as a readout follows, less four changes behind them.
-    later = min(len(touches) // 2, max(32, dimension // 4) // rows - 4)
-    early, late = touches[: len(touches) - later], touches[len(touches) - later :]
+    # As many touches as a readout follows, less three changes behind them.
+    later = min(len(touches) // 2, max(32, dimension // 4) // rows - 3)
     statistics = Statistics(dimension, [SCALE])
-    for name, codes, _ in early:
+    for name, codes, _ in touches[: len(touches) - later]:
         statistics.add(name, {SCALE: codes}, 1)
     _, readout = solved(statistics)
+    worst: Record = {"solved_again": 0}
+    spent = changed = 0.0
+
+    def change(touch: Change) -> None:
+        nonlocal readout, spent, changed
+        begun = time.process_time()
+        followed = follow(statistics, readout, touch)
+        followed.scores(touch[1][0].astype(np.float64), range(len(followed.names)), "lda")
+        spent += time.process_time() - begun
+        worst["solved_again"] += followed is not readout
+        readout, changed = followed, changed + 1
+
+    def compare(kept: slice) -> None:
+        true = TrueReadout(
+            memory.codes[kept].reshape(-1, dimension), np.repeat(memory.places[kept], rows), readout.penalty, readout.gamma
+        )  # fmt: skip
+        for name, error in compared(asked(readout, evaluated), true.answers(evaluated)).items():
+            worst[name] = max(error, worst.get(name, 0))
+
+    for touch in touches[len(touches) - later :]:
+        change(touch)
+    compare(slice(None))
     extra = np.repeat(evaluated[:1], rows, axis=0).astype(np.int32)
-    first = touches[0]
-    changes: list[list[Change]] = [[touch] for touch in late]
-    changes += [[(name_of(0), extra, 1)], [(name_of(0), extra, -1)]]
-    changes += [[(*first[:2], sign)] for sign in (-1, 1)] if _others(statistics, first) else []
-    begun = time.process_time()
-    again = 0
-    for change in changes:
-        followed = follow(statistics, readout, change)
-        again += followed is not readout
-        readout = followed
-        readout.scores(extra[0].astype(np.float64), range(len(readout.names)), "lda")
-    spent = time.process_time() - begun
-    answers = asked(readout, evaluated)
-    true = learned.truth(readout).answers(evaluated)
-    return {
-        "method": "learner, followed",
-        **compared(answers, true),
-        "seconds_per_row": spent / len(changes),
-        "solve_seconds": 0.0,
-        "changes": len(changes),
-        "solved_again": again,
-    }
+    for sign in (1, -1):
+        change((name_of(0), extra, sign))
+    compare(slice(None))
+    name, codes, _ = touches[0]
+    if statistics.counts(SCALE, [name])[0] > rows:
+        change((name, codes, -1))
+        compare(slice(1, None))
+    return {"method": "learner, followed", **worst, "seconds_per_row": spent / changed, "solve_seconds": 0.0}
 
 
-def _others(statistics: Statistics, touch: Change) -> bool:
-    return bool(statistics.counts(SCALE, [touch[0]])[0] > len(touch[1]))
-
-
-def follow(statistics: Statistics, readout: Readout, changes: Sequence[Change]) -> Readout:
-    """Bring changes into the statistics and the readout; one solved again where it cannot follow."""
-    for name, rows, sign in changes:
-        (statistics.add if sign > 0 else statistics.remove)(name, {SCALE: rows}, 1)
-    return readout if readout.follow(changes) else solved(statistics)[1]
+def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
+    """Bring a change into the statistics and the readout; one solved again where it cannot follow."""
+    name, rows, sign = change
+    (statistics.add if sign > 0 else statistics.remove)(name, {SCALE: rows}, 1)
+    return readout if readout.follow([change]) else solved(statistics)[1]
 
 
 def left_out_error(learned: Learned) -> float | None:
@@ -219,7 +242,7 @@ def left_out_error(learned: Learned) -> float | None:
     pairs = np.array([(stage, 0, rows) for stage in range(rows)])
     for i, (place, codes) in enumerate(zip(memory.places.tolist(), memory.codes, strict=True)):
         sample.add(name_of(place), i.to_bytes(4, "big"), SampledTouch(codes, pairs))
-    apart = {kind: left_out(readout, learned.task, sample, stages, kind) for kind in ("lda", "ridge")}  # type: ignore[arg-type]
+    apart = {kind: left_out(readout, learned.task, sample, stages, kind) for kind in ("lda", "ridge")}
     worst = 0.0
     for number, (_, key, _) in list(enumerate(sample))[:LEFT_OUT]:
         if (number, 0) not in apart["lda"].rows:

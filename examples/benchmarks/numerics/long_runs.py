@@ -1,42 +1,95 @@
-"""What `benchmarks numerics` measures beside weights of a case: long streams, schedules, and the scatter of classes."""
+"""What `benchmarks numerics` measures beside single cases: a million observations, and a thousand schedules in bytes."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.numerics.cases import Case, updates
-from examples.benchmarks.numerics.measures import Record, error_of, new_solver, record, solved
-from examples.benchmarks.numerics.truth import refined_weights
+from examples.benchmarks.numerics.learned import SCALE, asked, compared, follow, name_of, solved
+from examples.benchmarks.numerics.peers import Record, decided, error_of, new_solver, record
+from examples.benchmarks.numerics.peers import solved as weights_of
+from examples.benchmarks.numerics.regressions import updates
+from examples.benchmarks.numerics.truth import TrueReadout, exact_weights
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
+from scroll_tactile.readouts.readout import Change
 from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["run_scatter", "run_schedules", "run_updates"]
+__all__ = ["run_drift", "run_schedules", "run_updates"]
 
 FloatArray = npt.NDArray[np.float64]
 Note = Callable[[str], None]
 SCHEDULED = 256  # rows
 DISTINCT = 1000  # rows of a long stream, which it repeats
+JUDGED = 20
 
 
-def run_updates(seed: int, dimension: int, most: dict[str, int], note: Note) -> Iterator[Record]:
-    """Updates of one row each, and the error after every power of ten from 10³ to as many as each method is given."""
+def run_drift(seed: int, dimension: int, count: int, note: Note) -> Iterator[Record]:
+    """Observations of one row each, all followed by the learner's readout, and a prediction after each thousandth.
+
+    The last observation is retracted right after it, predicted without, and observed again. The first thousand are
+    learned at once. Errors are the worst of
+    all predictions so far, against the truth with the same P; they are given at each power of ten.
+    """
+    rng = np.random.default_rng([seed, dimension, 3])
+    rows, targets, _ = updates(rng, dimension, DISTINCT)
+    codes, places = np.rint(rows * 2.0**20).astype(np.int32), targets.argmax(axis=1)
+    touches: list[Change] = [(name_of(y), code[None], 1) for y, code in zip(places.tolist(), codes, strict=True)]
+    exact = codes.astype(object)
+    second, sums = exact.T @ exact, targets.astype(int).T.astype(object) @ exact
+    statistics = Statistics(dimension, [SCALE])
+    for name, row, _ in touches:
+        statistics.add(name, {SCALE: row}, 1)
+    _, readout = solved(statistics)
+    worst: Record = {"solved_again": 0}
+    spent, evaluated = 0.0, codes[:JUDGED].astype(np.int64)
+
+    def compare(rounds: int, without: int) -> None:
+        last, own = exact[-without:] if without else exact[:0], targets[-without:] if without else targets[:0]
+        a, c = rounds * second - last.T @ last, rounds * sums - own.astype(int).T.astype(object) @ last
+        counts = (rounds * targets.sum(axis=0) - own.sum(axis=0)).astype(int).tolist()
+        true = TrueReadout.of_sums(a, c, counts, readout.penalty, readout.gamma).answers(evaluated)
+        for name, error in compared(asked(readout, evaluated), true).items():
+            worst[name] = max(error, worst.get(name, 0))
+
+    for rounds in range(1, count // DISTINCT + 1):
+        fed = rounds * DISTINCT
+        note(f"{fed} observations, {dimension} features: the learner")
+        begun = time.process_time()
+        for touch in touches if rounds > 1 else ():
+            followed = follow(statistics, readout, touch)
+            worst["solved_again"] += followed is not readout
+            readout = followed
+        spent += time.process_time() - begun
+        compare(rounds, 0)
+        name, row, _ = touches[-1]
+        for sign, without in ((-1, 1), (1, 0)):
+            readout = follow(statistics, readout, (name, row, sign))
+            compare(rounds, without)
+        if fed in (10**power for power in range(4, 10)):
+            found = record(
+                _updates_name(fed, dimension), "updates", "learner, followed", fed, dimension, readout.penalty
+            )
+            yield found | worst | {"seconds_per_row": spent / (fed - DISTINCT), "solve_seconds": 0.0}
+
+
+def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], note: Note) -> Iterator[Record]:
+    """The same observations as updates of the solvers of doubles, and their errors after every power of ten."""
     rng = np.random.default_rng([seed, dimension, 3])
     rows, targets, penalty = updates(rng, dimension, DISTINCT)
     truths: dict[int, npt.NDArray[np.longdouble]] = {}
     single_rows = [(rows[i : i + 1], targets[i : i + 1]) for i in range(len(rows))]
-    sizes = np.ones(dimension)
-    for method, last in most.items():
-        solver = new_solver(method, sizes)
+    for method in methods:
+        solver = new_solver(method)
         with one_thread():
             solver.start(dimension, targets.shape[1], penalty)
             fed, spent = 0, 0.0
-            while fed < last:
+            while fed < most:
                 upto = max(DISTINCT, 10 * fed)
                 note(f"{upto} one-row updates, {dimension} features: {method}")
                 begin = time.process_time()
@@ -46,27 +99,20 @@ def run_updates(seed: int, dimension: int, most: dict[str, int], note: Note) -> 
                 solver.settle()
                 spent += time.process_time() - begin
                 fed = upto
-                rounds = fed // DISTINCT
-                if rounds not in truths:
-                    truths[rounds] = refined_weights(rows, targets, penalty / rounds)
+                if fed not in truths:
+                    truths[fed] = exact_weights(rows, targets, penalty, fed // DISTINCT)
                 begin = time.process_time()
-                weights, diagnosis = solved(solver)
-                yield record(_updates_name(fed, dimension), "updates", method, fed, dimension, penalty) | {
-                    "relative_error": None if weights is None else error_of(weights, truths[rounds], sizes),
-                    "flipped": None if weights is None else _flips(rows, weights, truths[rounds]),
-                    "seconds_per_row": spent / fed,
-                    "solve_seconds": time.process_time() - begin,
-                    "diagnosis": diagnosis,
-                }
+                weights, diagnosis = weights_of(solver)
+                found = record(_updates_name(fed, dimension), "updates", method, fed, dimension, penalty)
+                found |= {"seconds_per_row": spent / fed, "solve_seconds": time.process_time() - begin}
+                if weights is not None:
+                    found["weights_error"] = error_of(weights, truths[fed], np.ones(dimension))
+                    found |= decided(rows[:JUDGED], weights, truths[fed])
+                yield found | {"diagnosis": diagnosis}
 
 
 def _updates_name(count: int, dimension: int) -> str:
-    return f"{count:.0e} one-row updates, d={dimension}".replace("e+0", "e")
-
-
-def _flips(rows: FloatArray, weights: FloatArray, truth: npt.NDArray[np.longdouble]) -> int:
-    wide = rows.astype(np.longdouble)
-    return int(np.count_nonzero((wide @ weights).argmax(axis=1) != (wide @ truth).argmax(axis=1)))
+    return f"{count:.0e} observations, {dimension} features".replace("e+0", "e")
 
 
 def run_schedules(seed: int, methods: tuple[str, ...], count: int, dimension: int, note: Note) -> Iterator[Record]:
@@ -82,16 +128,12 @@ def run_schedules(seed: int, methods: tuple[str, ...], count: int, dimension: in
         begin = time.process_time()
         for _ in range(count):
             order = orders.permutation(len(rows))
-            cuts = np.sort(orders.integers(0, len(rows), size=orders.integers(1, 40)))
+            parts = np.split(order, np.sort(orders.integers(0, len(rows), size=orders.integers(1, 40))))
             for threads in (1, 2):
-                solver = new_solver(method, np.ones(dimension))
-                solver.start(dimension, targets.shape[1], 1e-6)
                 with threadpool_limits(threads, user_api="blas"):
-                    for some in np.split(order, cuts):
-                        solver.update(rows[some], targets[some])
-                    solver.settle()
-                said = _bytes(solver)
-                seen[said] = seen.get(said, 0) + 1
+                    said = _learned_bytes if method == "learner" else _solver_bytes
+                    found = said(method, [(rows[part], targets[part]) for part in parts])
+                seen[found] = seen.get(found, 0) + 1
         spent = time.process_time() - begin
         other = 2 * count - next(iter(seen.values()))
         yield record(f"{count} schedules × 1 and 2 threads", "schedules", method, len(rows), dimension, 1e-6) | {
@@ -101,37 +143,27 @@ def run_schedules(seed: int, methods: tuple[str, ...], count: int, dimension: in
         }
 
 
-def _bytes(solver: RidgeBase) -> bytes:
+def _learned_bytes(method: str, parts: list[tuple[FloatArray, FloatArray]]) -> bytes:
+    """The digest of statistics that were learned part by part and joined."""
+    dimension = parts[0][0].shape[1]
+    whole = Statistics(dimension, [SCALE])
+    for rows, targets in parts:
+        part = Statistics(dimension, [SCALE])
+        for row, target in zip(np.rint(rows * 2.0**20).astype(np.int32), targets, strict=True):
+            part.add(name_of(int(target.argmax())), {SCALE: row[None]}, 1)
+        if len(rows):
+            whole = whole + part
+    return whole.digest().encode()
+
+
+def _solver_bytes(method: str, parts: list[tuple[FloatArray, FloatArray]]) -> bytes:
     """What is compared: the exact form's sums, and of the others, which keep none that are comparable, the weights."""
+    solver: RidgeBase = new_solver(method)
+    solver.start(parts[0][0].shape[1], parts[0][1].shape[1], 1e-6)
+    for rows, targets in parts:
+        solver.update(rows, targets)
+    solver.settle()
     if isinstance(solver, Exact):
         return solver.digest().encode()
-    weights, _ = solved(solver)
+    weights, _ = weights_of(solver)
     return b"" if weights is None else weights.tobytes()
-
-
-def run_scatter(case: Case, note: Note) -> Iterator[Record]:
-    """The scatter within classes of a case, whose first column is constant: exact, and A − Σ c cᵀ / n in float64."""
-    note("scatter within classes")
-    rows, targets = case.rows[:, 1:], case.targets
-    wide = rows.astype(np.longdouble)
-    truth = np.zeros((rows.shape[1], rows.shape[1]), dtype=np.longdouble)
-    for chosen in targets.T.astype(bool):
-        about = wide[chosen] - wide[chosen].mean(axis=0)
-        truth += about.T @ about
-    begin = time.process_time()
-    exact = Exact()
-    exact.start(rows.shape[1], targets.shape[1], 0.0)
-    exact.update(rows, targets)
-    ours = exact.scatter(within=True)
-    between = time.process_time()
-    sums, counts = rows.T @ targets, targets.sum(axis=0)
-    plain = rows.T @ rows - (sums / counts) @ sums.T
-    end = time.process_time()
-    sizes = np.ones(rows.shape[1])
-    for method, found, spent in (("exact", ours, between - begin), ("gram64", plain, end - between)):
-        least = float(np.linalg.eigvalsh(found)[0])
-        yield record(f"scatter within classes, {case.name}", case.family, method, len(rows), len(truth), 0.0) | {
-            "relative_error": error_of(found, truth, sizes),
-            "seconds_per_row": spent / len(rows),
-            "diagnosis": "sound" if least > 0 else f"not positive definite: eigenvalue {least:.1e}",
-        }

@@ -37,6 +37,11 @@ class Memory:
     evaluated: FloatArray
     below: bool = False
 
+    @property
+    def family(self) -> str:
+        """In words, whether the grid is too coarse for it."""
+        return "below the grid" if self.below else "within the bound"
+
     @cached_property
     def codes(self) -> npt.NDArray[np.int32]:
         """Of the features, as a learner has them."""
@@ -55,7 +60,7 @@ class Memory:
 
 def _within(features: FloatArray) -> FloatArray:
     """All of some features, brought within the bound."""
-    return features / np.abs(features).max()
+    return np.asarray(features / np.abs(features).max())
 
 
 def _drawn(
@@ -150,6 +155,13 @@ def _memories(rng: Rng, size: float) -> Iterator[Callable[[], Memory]]:
 
     yield louder
 
+    def outlier() -> Memory:
+        features, places = _drawn(rng, 5, 20)
+        features[1:] *= 1e-3
+        return _parted("one touch a thousand times as loud", features, places)
+
+    yield outlier
+
     def rectified() -> Memory:
         # Inputs far from zero, as what a layer before gave: a fifth of the features are never on, a fifth always.
         inputs = count(40)
@@ -160,7 +172,7 @@ def _memories(rng: Rng, size: float) -> Iterator[Callable[[], Memory]]:
 
     def far() -> Memory:
         features, places = _drawn(rng, 4, 15)
-        return _parted("mean a million times the spread", 0.9 + 0.09 / 0.1e6 * features, places, below=True)
+        return _parted("mean a million times the spread", 0.9 + 9e-7 * features, places, below=True)
 
     yield far
 

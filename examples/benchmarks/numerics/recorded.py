@@ -10,17 +10,16 @@ from typing import Literal
 
 import numpy as np
 
-from examples.benchmarks.numerics.cases import Case
+from examples.benchmarks.numerics.memories import Memory
+from examples.benchmarks.numerics.regressions import Case
 from scroll_tactile import Kernels
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError
 from scroll_tactile.signals.image import tactile_image
-from scroll_tactile.statistics.grid import BITS, to_codes
 
-__all__ = ["NIST", "digits", "nist_cases", "real_case"]
+__all__ = ["NIST", "digits", "nist_cases", "real_memory"]
 
 NIST = "nist_strd.json"
-REAL_PENALTY = 1e-3
 
 
 def nist_cases(path: Path) -> Iterator[Case]:
@@ -43,9 +42,7 @@ def nist_cases(path: Path) -> Iterator[Case]:
         else:
             rows = [[1.0, *map(float, row)] for row in published["X"]]
         targets = np.array([[float(y)] for y in published["y"]])
-        yield Case(
-            name, "nist", np.array(rows), targets, 0.0, None, np.array([float(w) for w in published["certified"]])
-        )
+        yield Case(name, np.array(rows), targets, 0.0, None, np.array([float(w) for w in published["certified"]]))
 
 
 def digits(weights: np.ndarray, certified: np.ndarray) -> float:
@@ -56,21 +53,18 @@ def digits(weights: np.ndarray, certified: np.ndarray) -> float:
     return float(np.clip(-np.log10(max(worst, 1e-300)), 0.0, 15.0))
 
 
-def real_case(
+def real_memory(
     name: Literal["biotac", "roboskin"], data: Path, seed: int, dimension: int, most: int | None = None
-) -> Case:
-    """Codes of whole touches of "biotac" or "roboskin", as a memory has them; one fold is evaluated.
+) -> Memory:
+    """Features of whole touches of "biotac" or "roboskin", one row a touch; one fold is evaluated.
 
     Raises DatasetError for a folder that is not laid out as published.
     """
     recordings = load(data, name, seed)
     chosen = np.random.default_rng([seed, 7]).permutation(len(recordings))[:most]
     embedding = Kernels(dimension=dimension)
-    features = np.stack([embedding.embed(tactile_image(recordings.streams[i])) for i in chosen])
-    rows = to_codes(features, embedding.bound) * 2.0**-BITS
-    names = sorted(set(recordings.materials))
-    targets = np.eye(len(names))[[names.index(recordings.materials[i]) for i in chosen]]
+    features = np.stack([embedding.embed(tactile_image(recordings.streams[i])) for i in chosen]) / embedding.bound
     train = recordings.fold[chosen] != 0
-    return Case(
-        f"{recordings.name}, {dimension} features", "real", rows[train], targets[train], REAL_PENALTY, rows[~train]
-    )
+    names = sorted({recordings.materials[i] for i in chosen[train]})
+    places = np.array([names.index(recordings.materials[i]) for i in chosen[train]])
+    return Memory(f"{recordings.name}, {dimension} features", features[train][:, None], places, features[~train])

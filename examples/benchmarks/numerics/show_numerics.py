@@ -1,4 +1,4 @@
-"""How `benchmarks numerics` is shown: a table of cases and methods, the bar, and what was not measured."""
+"""How `benchmarks numerics` is shown: the learner first, then the grid, its peers, and what was not measured."""
 
 from __future__ import annotations
 
@@ -17,20 +17,17 @@ WIDE = 140  # characters that the table takes
 
 
 def show_numerics(result: Mapping[str, Any]) -> None:
-    """Show relative errors, case by method, the best in bold, and in brackets how many decisions flipped."""
-    records, judged = result["records"], result["bars"]
-    best = {record["case"]: record["best"] for record in judged}
+    """Show relative errors of answers, or of weights where a case has none, case by method; in brackets those flipped."""
+    records, claimed = result["records"], result["claims"]
     methods = list(dict.fromkeys(record["method"] for record in records))
-    table = Table(title="relative error of the weights; in brackets decisions flipped", box=SIMPLE_HEAD)
+    table = Table(
+        title="relative error of the answers; in brackets answers flipped; w: of the weights", box=SIMPLE_HEAD
+    )
     for name in ("case", *methods):
-        table.add_column(name.replace("covariance", "cov").replace("symmetric", "sym"), no_wrap=True)
-    for case in dict.fromkeys(record["case"] for record in records):
-        mine = {
-            record["method"]: record for record in records if record["case"] == case and record["family"] != "schedules"
-        }
-        cells = [_cell(mine.get(method), bold=best.get(case) == method) for method in methods]
-        if mine:
-            table.add_row(escape(case), *cells)
+        table.add_column(name, no_wrap=True)
+    for case in dict.fromkeys(record["case"] for record in records if record["family"] != "schedules"):
+        mine = {record["method"]: record for record in records if record["case"] == case}
+        table.add_row(escape(case), *[_cell(mine.get(method)) for method in methods])
     # Cut off at 80 columns, as for want of a terminal's width, it would show nothing.
     screen = console()
     screen.width = max(WIDE, screen.width)
@@ -42,16 +39,24 @@ def show_numerics(result: Mapping[str, Any]) -> None:
             say(f"{escape(record['case'])}: {record['digits']:.1f} digits of the certified coefficients, exact")
     for what, why in result["not_measured"].items():
         say(f"[yellow]not measured:[/] {escape(what)}: {escape(why)}")
-    missed = [record["case"] for record in judged if not record["met"]]
-    say(f"exact within 10 × of the best method, or named why not: {len(judged) - len(missed)} of {len(judged)} cases")
-    for case in missed:
-        say(f"[red]missed:[/] {escape(case)}")
+    for name, found in claimed.items():
+        if isinstance(found, Mapping):
+            said = ", ".join(
+                f"{key} {value:.0e}" if isinstance(value, float) else f"{key} {value}" for key, value in found.items()
+            )
+            say(f"the learner's worst {name.replace('_', ' ')}: {escape(said)}")
+    verdict = "stay below" if claimed["agreed"] else "[red]exceed[/]"
+    say(
+        f"scores, novelty and ρ of what the learner runs {verdict} {claimed['limit']:.0e}; answers flipped: {claimed['flipped']}"
+    )
 
 
-def _cell(record: Mapping[str, Any] | None, *, bold: bool) -> str:
+def _cell(record: Mapping[str, Any] | None) -> str:
     if record is None:
         return ""
-    if record["relative_error"] is None:
+    error, of = record.get("answers_error"), ""
+    if error is None:
+        error, of = record.get("weights_error"), "w"
+    if error is None:
         return "–"
-    said = f"{record['relative_error']:.0e}" + (f" [{record['flipped']}]" if record["flipped"] else "")
-    return f"[bold]{said}[/]" if bold else said
+    return f"{of}{error:.0e}" + (f" [{record['flipped']}]" if record.get("flipped") else "")

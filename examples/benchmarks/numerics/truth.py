@@ -176,7 +176,9 @@ class TrueReadout:
             self._whole = self._within + self._means.transpose() * weighed
             self._pull = weighed.transpose()
             self._solved = certain(self._within, self._means.transpose())
-            self._sizes = [_dot(m, s) for m, s in zip(self._means.tolist(), self._solved.transpose().tolist(), strict=True)]
+            self._sizes = [
+                _dot(m, s) for m, s in zip(self._means.tolist(), self._solved.transpose().tolist(), strict=True)
+            ]
 
     def weights(self) -> FloatArray:
         """γ K⁻¹ mᵀ about their mean over the materials, (d, C), in the rows' own unit."""
@@ -190,7 +192,9 @@ class TrueReadout:
         shift = arb((1, unit - self._unit))
         total, gamma = sum(self.counts), arb(self._gamma)
         with ctx.workprec(4 * FIRST_BITS):
-            away = arb_mat([[shift * int(v) - m for v, m in zip(row, self._mean, strict=True)] for row in table.tolist()])
+            away = arb_mat(
+                [[shift * int(v) - m for v, m in zip(row, self._mean, strict=True)] for row in table.tolist()]
+            )
             down = away.transpose()
             z = (away * self._solved).tolist()
             within = _dots(away, certain(self._within, down))
@@ -199,7 +203,9 @@ class TrueReadout:
             beyond = arb_mat([row[len(self.counts) :] for row in behind.tolist()])
             whole_length = _dots(away, beyond)
             lda = [_centred([gamma * (v - g / 2) for v, g in zip(row, self._sizes, strict=True)]) for row in z]
-            ridge = [[v + arb(n) / total for v, n in zip(row, self.counts, strict=True)] for row in (away * pulled).tolist()]
+            ridge = [
+                [v + arb(n) / total for v, n in zip(row, self.counts, strict=True)] for row in (away * pulled).tolist()
+            ]
             distances = [
                 [gamma * (near - 2 * v + g - far) for v, g in zip(row, self._sizes, strict=True)]
                 for row, near, far in zip(z, within, whole_length, strict=True)

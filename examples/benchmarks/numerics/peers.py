@@ -1,39 +1,50 @@
-"""How `benchmarks numerics` measures one solver on one case, and what it writes down."""
+"""Solvers of any doubles, measured on a regression, or on a memory as the regression that its readout stands for."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from examples.benchmarks.numerics.cases import Case
+from examples.benchmarks.numerics.learned import answers_error, flips
+from examples.benchmarks.numerics.memories import Memory
 from examples.benchmarks.numerics.recorded import digits
+from examples.benchmarks.numerics.regressions import Case
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.methods import SOLVERS
 from examples.benchmarks.solvers.solver_protocol import RidgeBase, SingularError
 from scroll_tactile.errors import InputError
+from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["DEFAULT", "bars", "error_of", "measure", "new_solver", "record", "solved"]
+__all__ = ["as_case", "decided", "error_of", "measure", "new_solver", "record", "solved"]
 
 FloatArray = npt.NDArray[np.float64]
 Record = dict[str, Any]
 
-DEFAULT = "exact"
-MARGIN = 10.0  # the default's error may be so many times the best one's
-ROUNDING = 2.0**-53  # errors below it are no better than this: weights are doubles
 MOST_IN_A_BATCH = 32
+EDGE = 2.0**BITS
 
 
-def new_solver(method: str, sizes: FloatArray) -> RidgeBase:
-    """A solver by name; those with a grid are given the columns' largest magnitudes as bounds."""
-    kind = SOLVERS[method]
-    solver = kind(sizes) if issubclass(kind, Exact) and kind.bits is not None else kind()
+def new_solver(method: str) -> RidgeBase:
+    """A solver by name."""
+    solver = SOLVERS[method]()
     assert isinstance(solver, RidgeBase)
     return solver
+
+
+def as_case(memory: Memory, penalty: float) -> Case:
+    """The ridge regression on 0/1 targets that a readout with P stands for: of the codes, and of a feature that is
+    always at the bound, for the intercept.
+    """
+    rows = memory.codes.reshape(-1, memory.codes.shape[2])
+    evaluated = np.rint(memory.evaluated * EDGE)
+    wide = [np.c_[np.full(len(part), EDGE), part.astype(np.float64)] for part in (rows, evaluated)]
+    return Case(
+        memory.name, wide[0], np.eye(memory.places.max() + 1)[memory.row_places], penalty, wide[1], None, memory.family
+    )
 
 
 def measure(case: Case, method: str, seed: int) -> Record:
@@ -42,7 +53,7 @@ def measure(case: Case, method: str, seed: int) -> Record:
     Times are of the processor, not of the clock: other programs do not count.
     """
     base = record(case.name, case.family, method, len(case.rows), case.rows.shape[1], case.penalty)
-    solver = new_solver(method, case.sizes)
+    solver = new_solver(method)
     sizes = np.random.default_rng([seed, len(case.rows)]).integers(1, MOST_IN_A_BATCH + 1, size=len(case.rows))
     cuts = np.cumsum(sizes)
     cuts = cuts[cuts < len(case.rows)]
@@ -50,7 +61,7 @@ def measure(case: Case, method: str, seed: int) -> Record:
     with one_thread():
         try:
             solver.start(case.rows.shape[1], case.targets.shape[1], case.penalty)
-        except InputError:  # the covariance form, which begins with 1 / λ
+        except InputError:  # the recursion, which begins with 1 / λ
             return base | {"diagnosis": "needs λ > 0"}
         begin = time.process_time()
         for rows, targets in batches:
@@ -66,11 +77,19 @@ def measure(case: Case, method: str, seed: int) -> Record:
     }
     if weights is None:
         return base
-    error = error_of(weights, case.truth, case.sizes)
-    base |= {"relative_error": error, "flipped": _flipped(case, weights)}
+    base |= {"weights_error": error_of(weights, case.truth, case.sizes), **decided(case.evaluated, weights, case.truth)}
     if case.certified is not None:
         base["digits"] = digits(weights, case.certified)
     return base
+
+
+def decided(evaluated: FloatArray | None, weights: FloatArray, truth: npt.NDArray[np.longdouble]) -> Record:
+    """The error of the scores of rows, and how many of them are given to another class than by the true weights."""
+    if evaluated is None:
+        return {}
+    rows = evaluated.astype(np.longdouble)
+    found, true = rows @ weights.astype(np.longdouble), rows @ truth
+    return {"answers_error": answers_error(found, true), "flipped": flips(found, true)}
 
 
 def record(case: str, family: str, method: str, rows: int, dimension: int, penalty: float) -> Record:
@@ -79,7 +98,8 @@ def record(case: str, family: str, method: str, rows: int, dimension: int, penal
         "case": case,
         "family": family,
         "method": method,
-        "relative_error": None,
+        "weights_error": None,
+        "answers_error": None,
         "flipped": None,
         "seconds_per_row": None,
         "diagnosis": "",
@@ -114,32 +134,3 @@ def error_of(weights: FloatArray, truth: npt.NDArray[np.longdouble], sizes: Floa
     whole = np.sqrt(np.square(truth * sizes[:, None]).sum())
     error = np.sqrt(np.square(difference).sum()) / whole if whole else np.sqrt(np.square(difference).sum())
     return float(error) if np.isfinite(error) and error < 1e300 else None
-
-
-def _flipped(case: Case, weights: FloatArray) -> int | None:
-    """How many of the rows evaluated are given to another class than by the true weights."""
-    if case.evaluated is None or case.targets.shape[1] < 2:
-        return None
-    evaluated = case.evaluated.astype(np.longdouble)
-    said = (evaluated @ weights.astype(np.longdouble)).argmax(axis=1)
-    return int(np.count_nonzero(said != (evaluated @ case.truth).argmax(axis=1)))
-
-
-def bars(records: list[Record]) -> list[Record]:
-    """For each case: the best method, the default's error, and whether that is within ten times, or was named."""
-    found = []
-    for case in dict.fromkeys(entry["case"] for entry in records):
-        mine = {entry["method"]: entry for entry in records if entry["case"] == case}
-        errors = {name: entry["relative_error"] for name, entry in mine.items() if entry["relative_error"] is not None}
-        if DEFAULT not in mine or not errors:
-            continue
-        best = min(errors, key=errors.__getitem__)
-        found.append({"case": case, "best": best, "best_error": errors[best], **_verdict(mine[DEFAULT], errors[best])})
-    return found
-
-
-def _verdict(ours: Mapping[str, Any], best: float) -> Record:
-    error = ours["relative_error"]
-    near = error is not None and error <= MARGIN * max(best, ROUNDING)
-    named = not ours["diagnosis"].startswith("sound")
-    return {"error": error, "diagnosis": ours["diagnosis"], "within_ten": near, "met": near or named}

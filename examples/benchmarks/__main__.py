@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,10 +13,9 @@ import typer
 from rich.table import Table
 
 from examples.benchmarks.buffers import run_buffers
-from examples.benchmarks.frontier import draw_frontier, measure_frontier
 from examples.benchmarks.interleaved import run_interleaved
-from examples.benchmarks.show_speed import show_frontier, show_interleaved, show_speed, show_vision
-from examples.benchmarks.speed import run_speed
+from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
+from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
 from examples.paper.commands.sets import Dataset, read, require_folders, write_result
 from scroll_tactile import Kernels
@@ -57,52 +57,32 @@ def _command(context: typer.Context) -> str:
 @app.command()
 def speed(
     context: typer.Context,
-    observations: Annotated[int, typer.Option(min=1000, help="Size of the large memory.")] = 100_000,
-    rounds: Annotated[int, typer.Option(min=5, help="In each of them each call is timed five times.")] = 50,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in; else simulated touches.")
+    ] = None,
     before: Annotated[
         Path | None, typer.Option(help="An older checkout of the project: the same calls, in turns, and their ratios.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
+    touches: Annotated[int, typer.Option(min=40, help="Of the everyday memory.")] = Sizes.touches,
+    pairs: Annotated[int, typer.Option(min=2, help="Of an observation and a prediction.")] = Sizes.pairs,
+    materials: Annotated[int, typer.Option(min=20, help="Of the large memory.")] = Sizes.materials,
+    opening: Annotated[
+        int, typer.Option(min=100, help="Touches of the largest memory opened: 1000000 take an hour.")
+    ] = 100_000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of simulated touches and of the order of recorded ones.")] = 0,
     json: Json = None,
 ) -> None:
-    """Time a user's calls, an update, λ and a large memory beside what they are to be compared with.
+    """Time a user's calls and measure what a memory takes, by the public interface alone.
 
-    Filling the large memory takes a few minutes; 10000 observations take twenty seconds.
+    The whole takes half an hour or so, and with an older checkout more.
     """
     require_folders(json)
+    opened = tuple(number for number in (10_000, 100_000) if number < opening)
+    sizes = Sizes(touches=touches, pairs=pairs, materials=materials, opening=(*opened, opening))
+    sizes = replace(sizes, before_materials=min(sizes.before_materials, materials))
     with progress_bar() as progress:
-        result = run_speed(
-            seed=seed,
-            observations=observations,
-            rounds=rounds,
-            before=before,
-            note=lambda what: progress(what, 0, 1),
-        )
+        result = run_speed(seed=seed, data=data, before=before, sizes=sizes, note=lambda what: progress(what, 0, 1))
     show_speed(result)
-    _written(context, json, result)
-
-
-@app.command()
-def frontier(
-    context: typer.Context,
-    data: Annotated[Path, typer.Option(help="Folder of BioTac_slide_20_50, or the one it lies in.")],
-    quick: Annotated[bool, typer.Option(help="One fold and two widths.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of BioTac's folds, and of the peers.")] = 0,
-    json: Json = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw error against time into this file.")] = None,
-) -> None:
-    """Measure error against time on both recorded sets: width, readout and length of a touch, and other learners.
-
-    The whole takes an hour or so.
-    """
-    require_folders(json, plot)
-    with progress_bar() as progress:
-        sets = [read(dataset, data, seed) for dataset in (Dataset.BIOTAC, Dataset.ROBOSKIN)]
-        result = measure_frontier(sets, seed=seed, quick=quick, note=lambda what: progress(what, 0, 1))
-    show_frontier(result)
-    if plot is not None:
-        draw_frontier(plot, result["frontier"], result["peers"], default=result["knee"]["default"])
-        say(f"drawn to {plot}")
     _written(context, json, result)
 
 
@@ -155,7 +135,6 @@ def interleaved(
     context: typer.Context,
     streams: Annotated[int, typer.Option(min=100, help="Learned before anything is timed.")] = 2000,
     pairs: Annotated[int, typer.Option(min=10, help="Of an observation and a prediction, timed.")] = 300,
-    interleavings: Annotated[int, typer.Option(min=100, help="Of the run that shows that nothing drifts.")] = 100_000,
     seed: Annotated[int, typer.Option(min=0, help="Draws the streams.")] = 0,
     json: Json = None,
 ) -> None:
@@ -165,7 +144,6 @@ def interleaved(
         result = run_interleaved(
             streams=streams,
             pairs=pairs,
-            interleavings=interleavings,
             seed=seed,
             note=lambda what: progress(what, 0, 1),
         )

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rich.table import Table
 
 from scroll_tactile.cli.terminal import console, percent, say
 
-__all__ = ["show_frontier", "show_interleaved", "show_speed", "show_vision"]
+__all__ = ["show_interleaved", "show_speed", "show_vision"]
 
 Record = Mapping[str, Any]
 WIDE = 160  # characters that the widest table takes
@@ -28,21 +28,13 @@ def _print(table: Table) -> None:
 
 
 def show_speed(result: Record) -> None:
-    """Print what each case takes, what it stands beside, and the ratio of the medians."""
-    table = Table("what", "clock", "ms, median / p99", "beside", "ms", "ratio", "bar", "error")
+    """Print what each case takes, before and after where there was a before, and of a bare forward pass."""
+    table = Table("memory", "case", "", "now", "p99", "before", "p99", "times", "of a ResNet-18", "to reach")
     for record in result["records"]:
-        ratio = f"{record['ratio']:.2f}"
-        times = _times(record), record["against"], _times(record, "against_"), ratio
-        table.add_row(record["case"], record["clock"], *times, record["bar"], record["error"])
+        values = (record.get(name) for name in ("median", "p99", "before_median", "before_p99", "times", "of_forward"))
+        cells = ["" if value is None else f"{value:.4g}" for value in values]
+        table.add_row(record["memory"], record["case"], record["unit"], *cells, record["to_reach"])
     _print(table)
-    if "before" in result:
-        head = ("what", "clock", "ms now", "ms before", "ratio", "of processor time")
-        table = Table(*head, title="this checkout beside the one before")
-        for record in result["before"]:
-            ratio = f"{record['ratio']:.2f}"
-            both = _times(record), _times(record, "before_")
-            table.add_row(record["case"], record["clock"], *both, ratio, f"{record['processor_ratio']:.2f}")
-        _print(table)
 
 
 def show_vision(result: Record) -> None:
@@ -59,66 +51,15 @@ def show_vision(result: Record) -> None:
 
 
 def show_interleaved(result: Record) -> None:
-    """Print what a pair of an observation and a prediction takes each learner, and whether anything drifted."""
+    """Print what a pair of an observation and a prediction takes each learner, and of ours how much that is."""
     title = f"{result['streams']} streams, {result['materials']} materials, {result['features']} features"
-    head = ("ms a pair, median / p99", "mean", "times ours", "observe", "predict", "wrong")
+    head = ("ms a pair, median / p99", "mean", "times ours", "… in memory", "observe", "predict", "wrong")
     table = Table("learner", *head, title=title)
     for record in result["records"]:
         if not record["measured"]:
             table.add_row(record["learner"], f"not measured: {record['why']}")
             continue
-        means = f"{record['mean_milliseconds']:.2f}", f"{record['times_ours']:.1f}"
+        means = (f"{record[name]:.2f}" for name in ("mean_milliseconds", "times_ours", "times_ours_in_memory"))
         parts = _times(record, "observe_"), _times(record, "predict_")
         table.add_row(record["learner"], _times(record), *means, *parts, percent(record["wrong"]))
     _print(table)
-    drift = result["drift"]
-    say(
-        f"after {drift['interleavings']} interleavings the weights differ from those solved anew by "
-        f"{drift['largest_relative_difference']:.0e} at most; by the paper's recursion {drift['of_the_recursion']:.0e}"
-    )
-
-
-def show_frontier(result: Record) -> None:
-    """Print the frontier, the peers and the knee."""
-    _show_widths(result["frontier"])
-    _show_peers(result["peers"])
-    _show_knee(result["knee"])
-
-
-def _show_widths(records: Sequence[Record]) -> None:
-    table = Table("set", "features", "readout", "evaluated on", "wrong", "ms observe", "ms predict", "ms first predict")
-    for record in records:
-        table.add_row(
-            record["dataset"],
-            str(record["width"]),
-            record["readout"],
-            "whole touches" if record["length"] == "all" else record["length"],
-            percent(record["wrong"]),
-            *(f"{record[name]:.2f}" for name in ("observe_ms", "predict_ms", "first_predict_ms")),
-        )
-    _print(table)
-
-
-def _show_peers(records: Sequence[Record]) -> None:
-    table = Table(
-        "set", "learner of the same features", "wrong", "ms observe", "ms predict", "ms predict after observe"
-    )
-    for record in records:
-        if record["measured"]:
-            times = (f"{record[name]:.3f}" for name in ("observe_ms", "predict_ms", "fresh_ms"))
-            table.add_row(record["dataset"], record["learner"], percent(record["wrong"]), *times)
-        else:
-            table.add_row(record["dataset"], record["learner"], f"not measured: {record['why']}")
-    _print(table)
-
-
-def _show_knee(knee: Record) -> None:
-    for step in knee["steps"]:
-        say(
-            f"{step['width']} features: {percent(step['wrong'])} wrong (± {percent(step['standard_error'])}), "
-            f"{step['predict_ms']:.2f} ms; wider ones take away {percent(step['gained_by_wider'])} at most"
-        )
-    say(
-        f"the knee is at {knee['width']} features, from where no wider embedding gains more than the standard error; "
-        f"the default has {knee['default']}"
-    )

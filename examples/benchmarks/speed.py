@@ -1,291 +1,409 @@
-"""`python -m examples.benchmarks speed`: what a user waits for, and what it stands beside, as ratios of one run.
+"""`python -m examples.benchmarks speed`: what a user waits for, and what a memory takes, by the public interface alone.
 
-Calls of a learner are timed by the clock on the wall, on a memory on disk, each of a touch of its own. Linear algebra
-is timed on one thread, in processor time. Touches are simulated: their content does not change the cost.
+Each learner has a process of its own and a memory on disk; each call has a touch of its own. An older checkout, where
+one is given, is called in turns with this one. All by the clock on the wall: nothing is subtracted, and importing torch
+stands apart. A bare forward pass of a ResNet-18 stands beside the milliseconds of the default learner.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
-from functools import partial
-from itertools import count
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.linalg.blas import dsyrk
 
-from examples.benchmarks.before import run_before
-from examples.benchmarks.timing import Clock, Timing, circumstances, take_turns, timed
+from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
+from examples.benchmarks.timing import Timing, circumstances, timed
 from examples.benchmarks.vision_speed import BareResNet
 from scroll_tactile import sensors
+from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import one_torch_thread
-from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.rows import pack_codes
-from scroll_tactile.memory.state import OBSERVE
-from scroll_tactile.readouts.readout import fit_readout
-from scroll_tactile.readouts.shrinkage import PENALTIES, fit_readouts, task_of
+from scroll_tactile.pipelines.classification import hold_out
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image, three_planes
-from scroll_tactile.signals.windows import Scale, extent, scales
-from scroll_tactile.statistics.grid import to_codes
-from scroll_tactile.statistics.moments import SecondMoment, one_thread
-from scroll_tactile.statistics.statistics import Statistics
-from store import Store
+from scroll_tactile.signals.stream import validate
 
-__all__ = ["run_speed"]
+__all__ = ["Sizes", "run_speed"]
 
 Record = dict[str, Any]
-Note = Callable[[str], None]
-WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
-BLOCK = 64  # rows in which the plain update is fed, and ours
-TRAIN_TOUCHES = 20  # touches of each of twenty materials, before a user's calls are timed
-FRESH = 20  # observations, each with a prediction after it: a second or more each
-PROCESSOR: Clock = "processor"
+Note = Callable[[str], object]
+Touches = Sequence[tuple[str, npt.NDArray[np.float32]]]
+Sides = dict[str, Path]
+
+MEGABYTE = 1e6
+SKIN = Sensor(name="skin", channels=8, rate=100.0, low=-1.0, high=1.0, unit="1", duration=1.0)
+SHORT = SKIN.model_copy(update={"name": "short-skin", "duration": 0.1})
+REPLAYED = 255  # observations that no close and no generation follows: one more, and a generation is written
+TOGETHER = 1000  # touches in a batch
+SCENE = 3  # materials
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    touches: of the everyday memory. pairs: of an observation and a prediction. starts: processes that open it anew.
+    materials: of the large memory, with so many touches `each`; before_materials: of the one that an older checkout is
+    given, too. opening: touches of the memories that are opened; before_opening: the largest for an older checkout.
+    """
+
+    touches: int = 800
+    pairs: int = 200
+    starts: int = 5
+    materials: int = 10_000
+    before_materials: int = 1_000
+    each: int = 5
+    opening: tuple[int, ...] = (10_000, 100_000)
+    before_opening: int = 10_000
+
+
+@dataclass
+class _Bench:
+    """The records of one run, and what it is done with."""
+
+    sides: Sides
+    folder: Path
+    sizes: Sizes
+    seed: int
+    note: Note
+    records: list[Record] = field(default_factory=list)
+
+    def only_now(self) -> Sides:
+        return {"now": self.sides["now"]}
+
+    def seconds(self, memory: str, case: str, taken: dict[str, list[float]], bar: str = "", **more: Any) -> None:
+        """A record of calls' seconds by side, in milliseconds."""
+        self._add(memory, case, "ms", {name: [1e3 * value for value in values] for name, values in taken.items()}, bar)
+        self.records[-1] |= more
+
+    def size(self, memory: str, case: str, unit: str, taken: dict[str, float], bar: str = "") -> None:
+        """A record of one value a side."""
+        self._add(memory, case, unit, {name: [value] for name, value in taken.items()}, bar)
+
+    def _add(self, memory: str, case: str, unit: str, taken: dict[str, list[float]], bar: str) -> None:
+        record: Record = {"memory": memory, "case": case, "unit": unit, "to_reach": bar}
+        for name, values in taken.items():
+            prefix = "" if name == "now" else f"{name}_"
+            record[f"{prefix}median"] = float(np.median(values))
+            record[f"{prefix}p99"] = float(np.percentile(values, 99)) if len(values) > 1 else None
+            record[f"{prefix}largest"] = max(values)
+            record[f"{prefix}calls"] = len(values)
+        if "before" in taken:
+            record["times"] = record["before_median"] / record["median"]
+        self.records.append(record)
 
 
 def run_speed(
     *,
     seed: int = 0,
-    observations: int = 100_000,
-    rounds: int = 50,
+    data: Path | None = None,
     before: Path | None = None,
+    sizes: Sizes | None = None,
     note: Note = lambda _: None,
 ) -> Record:
     """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
 
-    rounds: each call is timed five times in a round. before: a checkout of the project to be timed beside this one.
+    data: folder of BioTac_slide_20_50, of whose first fold's training part the everyday memory is made; simulated
+    touches where it is None. before: an older checkout of the project.
+
+    Raises InputError for a `before` that is no checkout, DatasetError for data that are not laid out as published.
     """
-    result = {"bench": "speed", **circumstances(seed), "threads": torch.get_num_threads()}
-    note(f"a memory of {TRAIN_TOUCHES} touches of each material: observe, predict, beside a ResNet-18")
-    records = _user_calls(seed, rounds)
-    note("a statistics update beside a plain dsyrk")
-    records.append(_update_and_dsyrk(seed, rounds))
-    note("one row beside half of A")
-    records.append(_row_and_memory(seed, rounds))
-    note("many λ from one factorisation beside one of each")
-    records += [_path_and_refits(seed, number, max(3, rounds // 10)) for number in (4, 16)]
-    note(f"a memory of {observations} observations beside one of 1000")
-    records += _large_and_small(seed, observations, rounds)
-    result["records"] = records
-    if before is not None:
-        note("this checkout beside the one before")
-        result["before"] = run_before(before, seed=seed, touches=TRAIN_TOUCHES, pairs=FRESH)
-    return result
+    sides = checkouts(before)
+    with tempfile.TemporaryDirectory() as folder:
+        bench = _Bench(sides, Path(folder), sizes or Sizes(), seed, note)
+        result = {"bench": "speed", **circumstances(seed), "touches": "simulated" if data is None else "BioTac-20"}
+        forward = _everyday(bench, data)
+        _many(bench, bench.only_now(), bench.sizes.materials)
+        if before is not None:
+            _many(bench, sides, bench.sizes.before_materials)
+        _opening(bench)
+    return result | {"resnet_forward": forward, "records": bench.records}
 
 
-def _record(case: str, ours: Timing, other: Timing, against: str, error: str, bar: str) -> Record:
-    return {
-        "case": case,
-        **ours.record(),
-        "calls": ours.calls,
-        "clock": ours.clock,
-        "against": against,
-        **other.record("against_"),
-        "ratio": ours.median / other.median,
-        "error": error,
-        "bar": bar,
-    }
+def _everyday(bench: _Bench, data: Path | None) -> Record:
+    """The default learner's memory of twenty materials; returns what a bare forward pass took."""
+    train, test = _biotac(bench, data)
+    touches = write_touches(bench.folder / "biotac", sensors.BIOTAC, [*train, *test], len(train[0][1]))
+    memory = f"{len(train)} touches of {len({name for name, _ in train})} materials, BioTac"
+    _fill_one_by_one(bench, memory, touches, len(train))
+    forward = _forward(bench.seed, test[0][1])
+    with ExitStack() as stack:
+        workers = _start(bench, memory, touches, len(train), stack)
+        passes = _predict_again(bench, memory, workers, len(train), test, forward)
+        asked = _pairs(bench, memory, workers, len(train), len(test))
+        _refresh(bench, memory, touches, workers, len(train), len(test))
+        for name in workers:
+            for i in range(asked + REFRESHES, REPLAYED):
+                workers[name].call("observe", touch=len(train) + i % len(test))
+    _open_killed(bench, memory, touches, len(train), REPLAYED)
+    for record in bench.records:
+        if record["unit"] == "ms":
+            record["of_forward"] = record["median"] / passes.median
+    return passes.record()
 
 
-def _touches(scene: Scene, first: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
-    """Touches of all materials in turn, without end, from a repetition on: (material, readings)."""
-    for repetition in count(first):
-        for name in scene.materials:
-            yield name, np.array(scene.touch(name, repetition).readings)
+REFRESHES = 20
 
 
-def _ready(scene: Scene, first: int, number: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
-    """So many touches made beforehand, again and again: making them must not be timed."""
-    touches = _touches(scene, first)
-    made = [next(touches) for _ in range(number)]
-    return (made[i % number] for i in count())
+def _biotac(bench: _Bench, data: Path | None) -> tuple[Touches, Touches]:
+    """Touches to learn, in a random order, and touches to predict, of BioTac or like it."""
+    number = bench.sizes.touches
+    if data is None:
+        scene = Scene(sensor=sensors.BIOTAC, seed=bench.seed)
+        repetitions = -(-number // len(scene.materials))
+        train = [(name, scene.touch(name, i)) for i in range(repetitions) for name in scene.materials][:number]
+        test = [(name, scene.touch(name, 1000 + i)) for i in range(10) for name in scene.materials]
+    else:
+        recordings = load(data, "biotac", bench.seed)
+        train, test = hold_out(recordings, recordings.fold == 0)
+    order = np.random.default_rng(bench.seed).permutation(len(train))[:number]
+    learned = [(train[i][0], np.array(train[i][1].readings)) for i in order]
+    return learned, [(name, np.array(stream.readings)) for name, stream in test]
 
 
-def _user_calls(seed: int, rounds: int) -> list[Record]:
-    """Observe, predict, and predict right after an observe, on a memory of the default learner on disk."""
-    scene = Scene(sensor=sensors.BIOTAC, seed=seed)
+def _fill_one_by_one(bench: _Bench, memory: str, touches: Path, number: int) -> None:
+    bench.note(f"{memory}: observing")
+    taken: dict[str, list[float]] = {name: [] for name in bench.sides}
+    with ExitStack() as stack:
+        workers = in_turns(stack, bench.sides, touches)
+        for name, worker in workers.items():
+            worker.call("open", path=str(bench.folder / name))
+        for i in range(number):
+            for name in _turn(workers, i):
+                taken[name].append(workers[name].wall("observe", touch=i))
+        for worker in workers.values():
+            worker.call("close")
+    bench.seconds(memory, "observe, durable", taken, "≤ 4")
+    _disk(bench, memory, bench.sides, number, "≤ 16", "≤ 10")
+
+
+def _disk(bench: _Bench, memory: str, sides: Sides, touches: int, whole: str, row: str = "") -> None:
+    paths = {name: bench.folder / name for name in sides}
+    taken = {name: disk_bytes(path) / MEGABYTE for name, path in paths.items()}
+    bench.size(memory, "disk after closing", "MB", taken, whole)
+    rows = {name: disk_bytes(path, "journal*") / touches / 1e3 for name, path in paths.items()}
+    bench.size(memory, "journal, a touch with its readings", "kB", rows, row)
+
+
+def _turn(workers: dict[str, Worker], i: int) -> list[str]:
+    """Each goes first in turn: the second finds its data pushed out of the processor's cache."""
+    return sorted(workers, reverse=i % 2 == 0)
+
+
+def _start(bench: _Bench, memory: str, touches: Path, test: int, stack: ExitStack) -> dict[str, Worker]:
+    """Open and predict in new processes; those that were started last go on."""
+    bench.note(f"{memory}: first predictions of {bench.sizes.starts} processes")
+    cases = ("import torch", "open", "first predict after opening", "open and first predict")
+    taken: dict[str, dict[str, list[float]]] = {case: {name: [] for name in bench.sides} for case in cases}
+    kept: dict[str, Worker] = {}
+    for i in range(bench.sizes.starts):
+        for name in bench.sides:
+            with ExitStack() as own:
+                worker = own.enter_context(Worker(bench.sides[name], touches))
+                opening = worker.wall("open", path=str(bench.folder / name))
+                first = worker.wall("predict", touch=test)
+                values = (worker.started["torch"], opening, first, opening + first)
+                for case, value in zip(cases, values, strict=True):
+                    taken[case][name].append(value)
+                if i + 1 == bench.sizes.starts:
+                    kept[name] = worker
+                    stack.push(own.pop_all())
+    for case, bar in zip(cases, ("", "", "≤ 300", ""), strict=True):
+        bench.seconds(memory, case, taken[case], bar)
+    bench.size(memory, "memory beyond torch, after it", "MB", {name: kept[name].memory() for name in kept})
+    return kept
+
+
+def _forward(seed: int, readings: npt.NDArray[np.float32]) -> Callable[[], object]:
+    """A bare forward pass of the touch that `readings` are, on one thread."""
     network = BareResNet(ResNet.random(seed)).eval()
-    image = torch.from_numpy(three_planes(tactile_image(scene.touch(scene.materials[0], 99)))[None])
-    evaluated, added = _ready(scene, 1000, 200), _ready(scene, 2000, FRESH)
+    image = torch.from_numpy(three_planes(tactile_image(validate(readings, sensors.BIOTAC)))[None])
 
     def forward() -> None:
-        # On two threads it waits for whatever else runs on the other core.
         with torch.inference_mode(), one_torch_thread():
             network(image)
 
-    with tempfile.TemporaryDirectory() as folder, TactileLearner.open(folder, sensor=scene.sensor) as learner:
-        observing = []
-        touches = _touches(scene, 0)
-        for _ in range(TRAIN_TOUCHES * len(scene.materials)):
-            observing.append(timed(partial(learner.observe, *next(touches))))
-        calls: dict[str, Callable[[], object]] = {
-            "predict": lambda: learner.predict(next(evaluated)[1]),
-            "resnet": forward,
-        }
-        turns = take_turns(calls, rounds)
-        fresh = []
-        for name, readings in (next(added) for _ in range(FRESH)):
-            observing.append(timed(partial(learner.observe, name, readings)))
-            fresh.append(timed(partial(learner.predict, next(evaluated)[1])))
-        tries = [next(evaluated) for _ in range(60)]
-        wrong = np.mean([learner.predict(readings).material != name for name, readings in tries])
-    predict = turns["predict"]
-    memory = f"memory of {TRAIN_TOUCHES * len(scene.materials)} touches on disk"
-    error = f"{100 * wrong:.1f} % of simulated touches wrong"
-    beside = "ResNet-18 forward of the same image, torch, one thread"
-    return [
-        _record(f"predict, 4 s of BioTac, {memory}", predict, turns["resnet"], beside, error, "ratio ≤ 0.2"),
-        _record(f"observe, {memory}", Timing.of(observing), predict, "predict", "exact", "no bar"),
-        _record(f"predict right after an observe, {memory}", Timing.of(fresh), predict, "predict", error, "no bar"),
-    ]
+    return forward
 
 
-def _update_and_dsyrk(seed: int, rounds: int) -> Record:
-    rng = np.random.default_rng(seed)
-    dimension, rows = 1008, 16 * BLOCK
-    features = rng.random((rows, dimension))
-    codes = to_codes(features, 1.0)
-    blocks = [codes[i : i + BLOCK] for i in range(0, rows, BLOCK)]
-    plain_blocks = [np.asfortranarray(features[i : i + BLOCK].T) for i in range(0, rows, BLOCK)]
+def _predict_again(
+    bench: _Bench, memory: str, workers: dict[str, Worker], first: int, test: Touches, forward: Callable[[], object]
+) -> Timing:
+    bench.note(f"{memory}: predictions beside a ResNet-18")
+    taken: dict[str, list[float]] = {name: [] for name in workers}
+    wrong = dict.fromkeys(workers, 0)
+    passes = []
+    for i, (material, _) in enumerate(test):
+        for name in _turn(workers, i):
+            answer = workers[name].call("predict", touch=first + i)
+            taken[name].append(answer["wall"])
+            wrong[name] += answer["said"] != material
+        passes.append(timed(forward))
+    shares = {f"{'' if name == 'now' else 'before_'}wrong": count / len(test) for name, count in wrong.items()}
+    bench.seconds(memory, "predict again", taken, "≤ 2.5", **shares)
+    return Timing.of(passes)
 
-    def ours() -> npt.NDArray[np.int64]:
-        moment = SecondMoment(dimension)
-        for block in blocks:
-            moment.add(block)
-        return moment.packed()
 
-    def plain(order: list[int] | None = None) -> npt.NDArray[np.float64]:
-        total = np.zeros((dimension, dimension), order="F")
-        for i in order or range(len(blocks)):
-            total = dsyrk(1.0, plain_blocks[i], beta=1.0, c=total, overwrite_c=1, lower=0)
-        return total
-
-    with one_thread():
-        calls: dict[str, Callable[[], object]] = {"ours": ours, "plain": plain}
-        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=PROCESSOR)
-    backwards = plain(list(range(len(blocks)))[::-1])
-    upper = np.triu_indices(dimension)
-    differing = float(np.mean(plain()[upper] != backwards[upper]))
-    return _record(
-        f"statistics update, {rows} rows of {dimension} in blocks of {BLOCK}",
-        timings["ours"],
-        timings["plain"],
-        "plain float64 dsyrk of the same rows",
-        f"exact; plain: {100 * differing:.0f} % of entries differ between two orders",
-        "ratio ≤ 1.25",
+def _pairs(bench: _Bench, memory: str, workers: dict[str, Worker], first: int, test: int) -> int:
+    """Observe and predict in turns; returns how often."""
+    bench.note(f"{memory}: {bench.sizes.pairs} observations, each with a prediction after it")
+    observing: dict[str, list[float]] = {name: [] for name in workers}
+    predicting: dict[str, list[float]] = {name: [] for name in workers}
+    for i in range(bench.sizes.pairs):
+        for name in _turn(workers, i):
+            observing[name].append(workers[name].wall("observe", touch=first + i % test))
+            predicting[name].append(workers[name].wall("predict", touch=first + (7 * i + 3) % test))
+    bench.seconds(memory, "predict right after an observe", predicting, "≤ 15 / ≤ 60")
+    bench.seconds(memory, "observe in these pairs", observing)
+    bench.size(
+        memory, "memory beyond torch, after them", "MB", {name: workers[name].memory() for name in workers}, "≤ 64"
     )
+    bench.size(memory, "the most it held until then", "MB", {name: workers[name].memory("peak") for name in workers})
+    return bench.sizes.pairs
 
 
-def _row_and_memory(seed: int, rounds: int) -> Record:
-    dimension, rows = 1008, 2048
-    codes = to_codes(np.random.default_rng(seed).random((rows, dimension)), 1.0)
-    half = np.zeros(dimension * (dimension + 1) // 2)
+def _refresh(bench: _Bench, memory: str, touches: Path, workers: dict[str, Worker], first: int, test: int) -> None:
+    """A reader in another process takes in what a writer observed."""
+    bench.note(f"{memory}: a reader beside it")
+    refreshing: dict[str, list[float]] = {name: [] for name in workers}
+    predicting: dict[str, list[float]] = {name: [] for name in workers}
+    with ExitStack() as stack:
+        readers = in_turns(stack, {name: bench.sides[name] for name in workers}, touches)
+        for name, reader in readers.items():
+            reader.call("open", path=str(bench.folder / name), mode="read")
+            reader.call("predict", touch=first)
+        for i in range(REFRESHES):
+            for name in _turn(workers, i):
+                workers[name].call("observe", touch=first + (bench.sizes.pairs + i) % test)
+                refreshing[name].append(readers[name].wall("refresh"))
+                predicting[name].append(readers[name].wall("predict", touch=first + i % test))
+    bench.seconds(memory, "a reader's refresh after one observation", refreshing, "≤ 20")
+    bench.seconds(memory, "its predict after that", predicting)
 
-    def ours() -> None:
-        moment = SecondMoment(dimension)
-        for row in range(rows):
-            moment.add(codes[row : row + 1])
-        moment.packed()
 
-    def memory() -> None:
-        for _ in range(16):
-            np.add(half, 1.0, out=half)
+def _open_killed(bench: _Bench, memory: str, touches: Path, touch: int, replayed: int) -> None:
+    """Open again what a process left that was ended without a close, and predict."""
+    bench.note(f"{memory}: opening after a process that ended without a close")
+    opening: dict[str, list[float]] = {name: [] for name in bench.sides}
+    predicting: dict[str, list[float]] = {name: [] for name in bench.sides}
+    for _ in range(bench.sizes.starts):
+        for name in bench.sides:
+            with Worker(bench.sides[name], touches) as worker:
+                opening[name].append(worker.wall("open", path=str(bench.folder / name)))
+                predicting[name].append(opening[name][-1] + worker.wall("predict", touch=touch))
+    bench.seconds(memory, f"open, {replayed} observations after the last close", opening, "≤ 1000")
+    bench.seconds(memory, "open so and first predict", predicting)
 
-    with one_thread():
-        calls: dict[str, Callable[[], object]] = {"ours": ours, "memory": memory}
-        timings = take_turns(calls, max(3, rounds // 10), warm_up=1, clock=PROCESSOR)
-    each = {
-        name: Timing(taken.median / of, taken.p99 / of, taken.mean / of, taken.calls, taken.clock)
-        for (name, taken), of in zip(timings.items(), (rows, 16), strict=True)
-    }
-    return _record(
-        f"statistics update, one row of {dimension}, mean of {rows}",
-        each["ours"],
-        each["memory"],
-        "half of A read and written once",
-        "exact",
-        "ratio ≤ 3",
+
+def _many(bench: _Bench, sides: Sides, materials: int) -> None:
+    """A memory of many materials, and a scene of three of them beside a memory of these three alone."""
+    sizes, memory = bench.sizes, f"{materials} materials × {bench.sizes.each} touches (8 channels, 1 s)"
+    total, scene = materials * sizes.each, [_named(place * materials // SCENE) for place in range(SCENE)]
+    asked = min(200, materials)
+    bench.note(f"{memory}: making the touches")
+    touches = write_touches(bench.folder / "skin", SKIN, _simulated(bench.seed, materials, sizes.each), SKIN.readings)
+    few = write_touches(
+        bench.folder / "few",
+        SKIN,
+        [(name, _skin_touch(bench.seed, int(name[1:]), i)) for i in range(sizes.each) for name in scene],
+        SKIN.readings,
     )
+    paths = {name: bench.folder / f"{name}-{materials}" for name in sides}
+    alone = {name: bench.folder / f"{name}-alone-{materials}" for name in sides}
+    for name, checkout in sides.items():
+        bench.note(f"{memory}: observing ({name})")
+        _filled(checkout, touches, paths[name], total)
+        _filled(checkout, few, alone[name], SCENE * sizes.each)
+    bars = ("≤ 3000", "≤ 8", "≤ 600") if materials == Sizes.materials else ("", "", "")
+    taken = {name: disk_bytes(path) / MEGABYTE for name, path in paths.items()}
+    bench.size(memory, "disk after closing", "MB", taken, bars[2])
+    bench.note(f"{memory}: predicting")
+    cases = ("open and first predict", "predict", "scene of 3", "these 3 alone", "first scene of 3")
+    times: dict[str, dict[str, list[float]]] = {case: {name: [] for name in sides} for case in cases}
+    held, peak = {}, {}
+    for name, checkout in sides.items():
+        with Worker(checkout, touches) as first:  # a scene is all that this one is ever asked about
+            seconds = first.wall("open", path=str(paths[name]))
+            times["first scene of 3"][name].append(seconds + first.wall("predict", touch=0, scene=scene))
+        with Worker(checkout, touches) as large, Worker(checkout, touches) as small:
+            small.call("open", path=str(alone[name]))
+            small.call("predict", touch=0)
+            seconds = large.wall("open", path=str(paths[name]))
+            times["open and first predict"][name].append(seconds + large.wall("predict", touch=total))
+            for i in range(asked):
+                times["predict"][name].append(large.wall("predict", touch=total + i))
+            for i in range(asked):
+                times["scene of 3"][name].append(large.wall("predict", touch=total + i, scene=scene))
+                times["these 3 alone"][name].append(small.wall("predict", touch=total + i))
+            held[name], peak[name] = large.memory(), large.memory("peak")
+    for case, bar in zip(cases[:2], bars, strict=False):
+        bench.seconds(memory, case, times[case], bar)
+    ratio = np.median(times["scene of 3"]["now"]) / np.median(times["these 3 alone"]["now"])
+    bench.seconds(memory, "predict, scene of 3", times["scene of 3"], "≤ 1.5 of the next", of_alone=float(ratio))
+    bench.seconds(memory, "… a memory of these 3 alone", times["these 3 alone"])
+    bench.seconds(memory, "open and first predict, scene of 3", times["first scene of 3"])
+    bench.size(memory, "memory beyond torch", "MB", held, bars[2])
+    bench.size(memory, "the most it held", "MB", peak)
 
 
-def _path_and_refits(seed: int, count: int, rounds: int) -> Record:
-    rng = np.random.default_rng(seed)
-    dimension, classes, rows = 1008, 20, 3000
-    places = np.arange(rows) % classes
-    values = np.clip(rng.normal(0, 0.05, (classes, dimension))[places] + rng.normal(0, 0.2, (rows, dimension)), -1, 1)
-    statistics = Statistics(dimension, [WHOLE])
-    for place in range(classes):
-        statistics.add(f"{place:02d}", 0, {WHOLE: to_codes(values[places == place], 1.0)})
-    task, penalties = task_of(statistics, WHOLE), np.geomspace(min(PENALTIES), max(PENALTIES), count).tolist()
-    with one_thread():
-        calls: dict[str, Callable[[], object]] = {
-            "path": lambda: fit_readouts(task, penalties),
-            "each": lambda: [fit_readout(task, penalty) for penalty in penalties],
-        }
-        timings = take_turns(calls, rounds, warm_up=1, clock=PROCESSOR)
-    pairs = zip(fit_readouts(task, penalties), (fit_readout(task, penalty) for penalty in penalties), strict=True)
-    worst = max(
-        float(np.abs(ours.weights - theirs.weights).max() / np.abs(theirs.weights).max()) for ours, theirs in pairs
-    )
-    return _record(
-        f"readouts of {count} λ, {dimension} features, {classes} materials: one tridiagonalisation",
-        timings["path"],
-        timings["each"],
-        "a Cholesky factorisation for each",
-        f"weights differ by {worst:.0e}",
-        "no bar",
-    )
+def _filled(checkout: Path, touches: Path, path: Path, total: int) -> None:
+    """A memory of the first touches, made in batches and closed."""
+    with Worker(checkout, touches) as worker:
+        worker.call("open", path=str(path))
+        for first in range(0, total, TOGETHER):
+            worker.call("fill", first=first, last=min(first + TOGETHER, total))
+        worker.call("close")
 
 
-def _large_and_small(seed: int, observations: int, rounds: int) -> list[Record]:
-    scene = Scene(sensor=sensors.BIOTAC, seed=seed)
-    fresh = [_ready(scene, 1000, 5 * rounds + 3) for _ in range(2)]
-    evaluated = [_ready(scene, 5000, 100) for _ in range(2)]
-    with tempfile.TemporaryDirectory() as folder:
-        small = _filled(Path(folder) / "small", scene, 1000, seed)
-        large = _filled(Path(folder) / "large", scene, observations, seed)
-        with small, large:
-            calls: dict[str, Callable[[], object]] = {
-                "observe, small": lambda: small.observe("new", next(fresh[0])[1]),
-                "observe, large": lambda: large.observe("new", next(fresh[1])[1]),
-            }
-            observing = take_turns(calls, rounds)
-            calls = {
-                "small": lambda: small.predict(next(evaluated[0])[1]),
-                "large": lambda: large.predict(next(evaluated[1])[1]),
-            }
-            predicting = take_turns(calls, rounds)
-    pairs = [
-        ("observe", observing["observe, large"], observing["observe, small"]),
-        ("predict", predicting["large"], predicting["small"]),
-    ]
-    return [
-        _record(
-            f"{verb}, memory of {observations} observations", large_, small_, "memory of 1000", "exact", "ratio ≤ 1.2"
+def _named(place: int) -> str:
+    return f"m{place:06d}"
+
+
+def _simulated(seed: int, materials: int, each: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
+    """Touches to learn, material after material in each round, and then those to predict, one each."""
+    for repetition in range(each):
+        for place in range(materials):
+            yield _named(place), _skin_touch(seed, place, repetition)
+    for i in range(min(200, materials)):
+        yield _named(37 * i % materials), _skin_touch(seed, 37 * i % materials, 1000)
+
+
+def _skin_touch(seed: int, place: int, repetition: int, sensor: Sensor = SKIN) -> npt.NDArray[np.float32]:
+    """A touch of one of any number of materials: twenty of each of the simulator's scenes."""
+    scene = Scene(sensor=sensor, seed=seed + place // 20)
+    return np.array(scene.touch(scene.materials[place % 20], repetition).readings)
+
+
+def _opening(bench: _Bench) -> None:
+    """Memories of many short touches: opened after a close, and after a process that ended without one."""
+    scene = Scene(sensor=SHORT, seed=bench.seed)
+    for number in bench.sizes.opening:
+        sides = bench.sides if number <= bench.sizes.before_opening else bench.only_now()
+        memory = f"{number} touches of {len(scene.materials)} materials (8 channels, 0.1 s)"
+        bench.note(f"{memory}: observing")
+        made = (
+            (name, np.array(scene.touch(name, i // len(scene.materials)).readings))
+            for i, name in ((i, scene.materials[i % len(scene.materials)]) for i in range(number + REPLAYED))
         )
-        for verb, large_, small_ in pairs
-    ]
-
-
-def _filled(path: Path, scene: Scene, observations: int, seed: int) -> TactileLearner:
-    """A learner on disk with so many touches of one window a scale, of made-up codes: only their number matters."""
-    with TactileLearner.open(path, sensor=scene.sensor) as learner:
-        dimension = learner.embedding.dimension
-    rng = np.random.default_rng([seed, observations])
-    widths = scales(scene.sensor)
-    of_touch = extent(widths[-1], widths)
-    with Store.open(path) as store:
-        for i in range(observations):
-            codes = {
-                Scale("window", width): rng.integers(0, 23, size=(1, dimension), dtype=np.int32) * 2**14
-                for width in of_touch
-            }
-            material = scene.materials[i % len(scene.materials)]
-            attributes = {"columns": widths[0]}
-            store.append(OBSERVE, material, rng.bytes(32), attributes=attributes, arrays=pack_codes(codes))
-    return TactileLearner.open(path)
+        touches = write_touches(bench.folder / "short", SHORT, made, SHORT.readings)
+        own = _Bench(sides, bench.folder / f"short-{number}", bench.sizes, bench.seed, bench.note, bench.records)
+        taken: dict[str, list[float]] = {name: [] for name in sides}
+        for name, checkout in sides.items():
+            _filled(checkout, touches, own.folder / name, number)
+            for _ in range(bench.sizes.starts):
+                with Worker(checkout, touches) as worker:
+                    taken[name].append(worker.wall("open", path=str(own.folder / name)))
+            with Worker(checkout, touches) as worker:
+                worker.call("open", path=str(own.folder / name))
+                for i in range(REPLAYED):
+                    worker.call("observe", touch=number + i)
+        own.seconds(memory, "open after a close", taken, "≤ 1000")
+        _open_killed(own, memory, touches, number, REPLAYED)

@@ -1,4 +1,4 @@
-"""Learners that are fed one feature vector at a time: other libraries' and, without streams and store, ours.
+"""Other libraries' learners, which are fed one feature vector at a time.
 
 Each is called as its documentation has it, with its own defaults where nothing else is said. None is needed to run a
 robot: what is not installed is named in a report as not measured.
@@ -13,27 +13,15 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from scroll_tactile.readouts.readout import Readout
-from scroll_tactile.readouts.recursive import WoodburyReadout
-from scroll_tactile.readouts.shrinkage import select
-from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import in_units, to_codes
-from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.statistics import Statistics, fold_of
-
 __all__ = [
     "GradientSteps",
-    "OneVsRest",
-    "Ours",
     "PseudoInverse",
-    "RecursiveFilters",
     "Refitted",
     "VectorPeer",
     "lacking",
 ]
 
 FloatArray = npt.NDArray[np.float64]
-WHOLE = Scale("window", 1)
 
 
 class VectorPeer(Protocol):
@@ -53,55 +41,6 @@ def lacking(package: str) -> str:
     if find_spec(package) is not None:
         return ""
     return f"{'scikit-learn' if package == 'sklearn' else package} is not installed"
-
-
-class Ours:
-    """The statistics and the readout of a memory, fed feature vectors as the peers are (`VectorPeer`).
-
-    dimension: d, of vectors in [-bound, bound]. λ is chosen again where there is a new class or the rows have grown
-    by the share `refit`; in between the readout follows, as a learner's does.
-    """
-
-    def __init__(self, dimension: int, refit: float, bound: float = 1.0) -> None:
-        self.bound = bound
-        self.statistics = Statistics(dimension, [WHOLE])
-        self.refit = refit
-        self._waiting: list[tuple[str, npt.NDArray[np.int32]]] = []
-        self._fitted_at = self._seen = 0
-        self._names: dict[str, int] = {}
-        self._tracked: WoodburyReadout | None = None
-        self._readout: Readout | None = None
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        """Learn one vector of the class at a place."""
-        name, codes = f"{place:03d}", to_codes(row[None], self.bound)
-        self.statistics.add(name, fold_of(codes.tobytes()), {WHOLE: codes})
-        self._seen += 1
-        self._waiting.append((name, codes))
-
-    def predict(self, row: FloatArray) -> int:
-        """The place of the class that a vector is most like."""
-        if self._waiting:
-            with one_thread():
-                self._take_in()
-        assert self._readout is not None
-        z = self._readout.project(in_units(row[None], self.bound))
-        return int(list(self._names)[int(self._readout.scores(z, "lda").argmax())])
-
-    def _take_in(self) -> None:
-        new = any(name not in self._names for name, _ in self._waiting)
-        if new or self._readout is None or self._seen > (1 + self.refit) * self._fitted_at:
-            selection = select(self.statistics, WHOLE, "lda")
-            assert selection is not None
-            self._names, self._readout = selection.places, selection.readout
-            self._fitted_at, self._tracked = self._seen, None
-        else:
-            if self._tracked is None:
-                self._tracked = WoodburyReadout(self.statistics, WHOLE, self._readout)
-            elif not all(self._tracked.add(codes, self._names[name]) for name, codes in self._waiting):
-                self._tracked.anchor(self.statistics)
-            self._readout = self._tracked.readout()
-        self._waiting.clear()
 
 
 class PseudoInverse:
@@ -183,45 +122,3 @@ class GradientSteps:
     def predict(self, row: FloatArray) -> int:
         """The class with the highest score."""
         return int(self.model.predict(self.scaler.transform(row[None]))[0])
-
-
-class OneVsRest:
-    """river's LogisticRegression behind its StandardScaler, one against the rest."""
-
-    def __init__(self) -> None:
-        from river.linear_model import LogisticRegression
-        from river.multiclass import OneVsRestClassifier
-        from river.preprocessing import StandardScaler
-
-        self.model = StandardScaler() | OneVsRestClassifier(LogisticRegression())
-
-    @staticmethod
-    def _named(row: FloatArray) -> dict[int, float]:
-        return dict(enumerate(row.tolist()))
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        """One step of each classifier."""
-        self.model.learn_one(self._named(row), place)
-
-    def predict(self, row: FloatArray) -> int:
-        """The class with the highest score; -1 before anything was learned."""
-        said = self.model.predict_one(self._named(row))
-        return -1 if said is None else int(said)
-
-
-class RecursiveFilters:
-    """padasip's FilterRLS, one for each class on 0/1 targets, without forgetting: each carries a P of its own."""
-
-    def __init__(self, classes: int, dimension: int) -> None:
-        from padasip.filters import FilterRLS
-
-        self.filters = [FilterRLS(n=dimension, mu=1.0, eps=1.0, w="zeros") for _ in range(classes)]
-
-    def observe(self, place: int, row: FloatArray) -> None:
-        """Adapt every filter."""
-        for i, classifier in enumerate(self.filters):
-            classifier.adapt(float(i == place), row)
-
-    def predict(self, row: FloatArray) -> int:
-        """The filter with the highest output."""
-        return int(np.argmax([classifier.predict(row) for classifier in self.filters]))

@@ -1,16 +1,20 @@
-"""Timings are medians with the 99th percentile beside them, of a memory on disk, and say what made them."""
+"""Each call is timed in a process of its own, by the public names alone, and every case of the table is there."""
 
 import json
-import re
+from dataclasses import replace
 from itertools import count
 
 import pytest
 from commands import refused, run
 
 from examples.benchmarks import speed
-from examples.benchmarks.before import HERE, run_before
+from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
+from examples.benchmarks.speed import SKIN, Sizes, run_speed
 from examples.benchmarks.timing import CLOCKS, Timing, take_turns
+from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from scroll_tactile.errors import InputError
+
+TINY = Sizes(touches=40, pairs=2, starts=2, materials=6, before_materials=6, each=2, opening=(100,), before_opening=100)
 
 
 def test_a_timing_is_the_median_and_the_99th_percentile_of_its_calls():
@@ -34,46 +38,82 @@ def test_alternatives_take_turns_and_all_calls_count(monkeypatch):
     }
 
 
-@pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setattr(speed, "TRAIN_TOUCHES", 2)
-    monkeypatch.setattr(speed, "FRESH", 2)
-    monkeypatch.setattr(speed, "take_turns", lambda calls, rounds, **more: take_turns(calls, 1, **more))
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """Every case, tiny, with this checkout beside itself."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(speed, "REPLAYED", 25)
+        patch.setattr(speed, "REFRESHES", 2)
+        return run_speed(sizes=TINY, before=HERE.parents[1])
 
 
-def test_the_command_times_a_users_calls_on_disk(tmp_path, small):
-    result = run("bench", "speed", "--observations", 1000, "--rounds", 5, "--json", tmp_path / "r.json")
-    assert result.exit_code == 0, result.output
-    found = json.loads((tmp_path / "r.json").read_text())
-    assert found["command"] == "python -m examples.benchmarks speed --observations 1000 --rounds 5"
-    assert str(tmp_path) not in (tmp_path / "r.json").read_text()
-    assert {"load_average", "load_average_after", "versions", "date"} <= found.keys()
-    cases = [re.split(", ", record["case"])[0] for record in found["records"]]
-    assert cases[:3] == ["predict", "observe", "predict right after an observe"]
-    assert cases[-2:] == ["observe", "predict"]
-    for record in found["records"]:
-        assert 0 < record["median_milliseconds"] <= record["p99_milliseconds"]
-        assert record["ratio"] == pytest.approx(
-            record["median_milliseconds"] / record["against_median_milliseconds"], rel=1e-4
-        )
-    assert {record["clock"] for record in found["records"]} == {"wall", "processor"}
-
-
-def test_a_checkout_is_timed_beside_another_in_one_run():
-    found = run_before(HERE.parents[1], seed=0, touches=1, pairs=2)
-    assert [(one["case"], one["calls"]) for one in found] == [
-        ("observe", 22),
+def test_every_case_is_measured_on_both_sides(measured):
+    found = {(record["memory"].split(" (")[0], record["case"]): record for record in measured["records"]}
+    everyday = "40 touches of 20 materials, BioTac"
+    for case, calls in (
+        ("observe, durable", 40),
+        ("import torch", 2),
+        ("first predict after opening", 2),
+        ("predict again", 200),
         ("predict right after an observe", 2),
-        ("predict again", 10),
-    ]
-    for record in found:
-        assert record["ratio"] == record["median_milliseconds"] / record["before_median_milliseconds"]
-        assert record["processor_ratio"] > 0
+        ("a reader's refresh after one observation", 2),
+        ("open, 25 observations after the last close", 2),
+    ):
+        record = found[everyday, case]
+        assert (record["calls"], record["before_calls"]) == (calls, calls)
+        assert 0 < record["median"] <= record["p99"] <= record["largest"]
+        assert record["times"] == record["before_median"] / record["median"]
+        assert record["of_forward"] == record["median"] / measured["resnet_forward"]["median_milliseconds"]
+    assert found[everyday, "predict again"]["wrong"] < 0.5
+    assert (
+        found[everyday, "disk after closing"]["median"]
+        > 40 * found[everyday, "journal, a touch with its readings"]["median"] / 1e3
+    )
+    assert (
+        found[everyday, "memory beyond torch, after them"]["median"]
+        <= found[everyday, "the most it held until then"]["median"]
+    )
+    many = "6 materials × 2 touches"
+    assert found[many, "predict, scene of 3"]["calls"] == found[many, "… a memory of these 3 alone"]["calls"] == 6
+    assert found[many, "predict, scene of 3"]["of_alone"] > 0
+    assert found["100 touches of 20 materials", "open after a close"]["median"] > 0
+
+
+def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(tmp_path):
+    rng = speed.np.random.default_rng(0)
+    made = [(f"m{i}", rng.uniform(-1, 1, (100, 8)).astype("float32")) for i in range(3)]
+    touches = write_touches(tmp_path / "touches", SKIN, made, 100)
+    for expected in (None, "m0"):
+        with Worker(HERE.parents[1], touches) as worker:
+            worker.call("open", path=str(tmp_path / "memory"))
+            assert worker.call("predict", touch=0)["said"] == expected
+            for i in range(3):
+                worker.call("observe", touch=i)
+            assert worker.memory() <= worker.memory("peak")
+    assert disk_bytes(tmp_path / "memory") > disk_bytes(tmp_path / "memory", "journal*") > 3 * 100 * 8
+    assert READ_BYTES == NAME_BYTES
+
+
+def test_the_command_measures_prints_and_writes_it(tmp_path, monkeypatch, measured):
+    command = __import__("examples.benchmarks.__main__", fromlist=["app"])
+    asked = {}
+    monkeypatch.setattr(command, "run_speed", lambda **given: asked.update(given) or measured)
+    result = run(
+        "bench", "speed", "--materials", 200, "--opening", 20000, "--before", tmp_path, "--json", tmp_path / "r"
+    )
+    assert result.exit_code == 0, result.output
+    assert asked["sizes"] == replace(Sizes(), materials=200, before_materials=200, opening=(10_000, 20_000))
+    found = json.loads((tmp_path / "r").read_text())
+    assert found["command"] == "python -m examples.benchmarks speed --before BEFORE --materials 200 --opening 20000"
+    assert str(tmp_path) not in (tmp_path / "r").read_text()
+    assert {"load_average", "load_average_after", "versions", "date", "seed"} <= found.keys()
+    assert "predict right after an observe" in result.output
 
 
 def test_a_folder_that_is_no_checkout_is_refused(tmp_path):
+    assert list(checkouts(None)) == ["now"]
     with pytest.raises(InputError, match="checkout"):
-        run_before(tmp_path, seed=0, touches=1, pairs=1)
+        checkouts(tmp_path)
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):

@@ -26,7 +26,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.model import Draft, Model
+from scroll_tactile.prediction.model import Draft, Model, enough_memory
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
@@ -401,11 +401,12 @@ class TactileLearner:
 
         evaluate: reads the memory and embeds the touch; gives the version that it read, and what answers.
         """
-        version, answer = evaluate()
-        with self._ledger.lock:
-            if self._ledger.version != version:
-                _, answer = evaluate()
-            return answer()
+        with enough_memory():
+            version, answer = evaluate()
+            with self._ledger.lock:
+                if self._ledger.version != version:
+                    _, answer = evaluate()
+                return answer()
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
@@ -477,13 +478,15 @@ class TactileLearner:
 
         Between two such moments the readouts are those of all that was observed, to rounding; the calibration may rest
         on an eighth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
+
+        Raises CapacityError where the system has no memory left for it; `predict` does, too.
         """
-        with self._ledger.lock:
+        with self._ledger.lock, enough_memory():
             self._current.settle(self._ledger)
 
     def model(self) -> Model:
-        """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in them."""
-        with self._ledger.lock:
+        """The readouts and calibrations of the memory as it is now, as after `settle`; what comes later is not in them."""
+        with self._ledger.lock, enough_memory():
             return Draft.of(self._ledger.memory, self._settings.readout).fit()
 
     def digest(self) -> str:
@@ -572,8 +575,9 @@ class TactileLearner:
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
-        self._current.close()
-        self._ledger.close()
+        with self._ledger.lock:
+            self._current.close()
+            self._ledger.close()
 
     def __enter__(self) -> Self:
         return self

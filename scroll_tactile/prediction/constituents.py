@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scroll_tactile.memory.descriptions import Target
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, RidgeSystem, fit_curve, solve
-from scroll_tactile.readouts.calibration import judged_touches
+from scroll_tactile.readouts.calibration import common_names, judged_touches
 from scroll_tactile.signals.windows import Scale
 
 __all__ = ["ConstituentHead", "HeadFitter", "MaterialSpace", "StageHeads", "combined"]
@@ -148,10 +148,10 @@ class HeadFitter:
 
 
 def space_of(model: Model, stage: int) -> MaterialSpace:
-    """The materials that the readouts of a stage rest on, as they see them."""
+    """The materials that the readouts of a stage rested on when they were fitted, as they see them."""
     readouts = [model.readouts[scale] for scale in model.stages[stage]]
     known = [[readout.names[place] for place in readout.reference] for readout in readouts]
-    names = sorted(set.intersection(*map(set, known)))
+    names = common_names([model.apart[scale] for scale in model.stages[stage]])
     gram = np.zeros((len(names), len(names)))
     for weight, own, readout in zip(_weights(model, stage), known, readouts, strict=True):
         places = [own.index(name) for name in names]

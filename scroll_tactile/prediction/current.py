@@ -8,9 +8,12 @@ thread is, so the same calls give the same answers.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import cast
+from contextlib import suppress
 
+from scroll_tactile.errors import InputError
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
@@ -23,6 +26,7 @@ __all__ = ["CurrentModel"]
 
 LAG = 8  # of the touches that a model was fitted to, one in so many may be missing in its calibration
 LEAST = 2  # touches, in a small memory
+MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
 class CurrentModel:
@@ -42,6 +46,7 @@ class CurrentModel:
         self._coming: Future[Model] | None = None
         self._since: list[Added] = []  # what came since the coming one was begun
         self._worker: ThreadPoolExecutor | None = None
+        self._process = os.getpid()
         self._filling: tuple[int, Filling | None] | None = None
         self._composer: tuple[Model, int, int, Composer] | None = None
 
@@ -49,9 +54,11 @@ class CurrentModel:
         """The model that predictions are made with."""
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
         self._take_in(ledger)
-        model, behind = self._model, self._behind
-        if model is None or behind != []:
-            self._model = None  # until it is whole again: Ctrl-C may come at any point
+        # Until the model is whole again: following that is cut short leaves it between two states.
+        model, (behind, self._behind) = self._model, (self._behind, None)
+        if model is None or behind is None or self._overdue(model, memory):
+            model = self._adopted(memory)
+        elif behind:
             self._exact = False
             followed = model is not None and behind is not None and not self._overdue(model, memory)
             if not followed or not cast(Model, model).follow(memory, cast("list[Added]", behind)):
@@ -62,15 +69,18 @@ class CurrentModel:
         return model
 
     def prepare(self, ledger: Ledger) -> None:
-        """Begin to fit the next model where the memory has grown enough since the last."""
+        """Begin to fit the next model where enough has come since the last. Raises nothing: an observation is kept."""
         self._take_in(ledger)
         model, touches = self._model, ledger.memory.statistics.touches
         if model is None or self._behind is None or self._coming is not None:
             return
-        if abs(touches - model.fitted_to) >= max(LEAST // 2, model.fitted_to // (2 * LAG)):
-            self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-            self._since = []
-            self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit)
+        lag = abs(touches - model.fitted_to)
+        if lag >= max(LEAST // 2, model.fitted_to // (2 * LAG)) or (lag and model.crowded):
+            # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
+            with suppress(MemoryError, InputError, RuntimeError):
+                self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
+                self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit)
+                self._since = []
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
@@ -82,20 +92,24 @@ class CurrentModel:
         return self._model
 
     def close(self) -> None:
-        """End the thread that fits."""
-        if self._worker is not None:
-            self._worker.shutdown()
+        """End the thread that fits; a later prediction begins another where it needs one."""
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.shutdown()
 
     def _take_in(self, ledger: Ledger) -> None:
         """Note what has changed since it was last noted."""
+        if self._process != os.getpid():  # a forked process has not the thread
+            self._process, self._worker, self._coming = os.getpid(), None, None
         if ledger.version == self._version:
             return
         added = ledger.added if self._model is not None else None
         if added is None:
             self._behind, self._coming = None, None
         else:
-            self._since = [*self._since, *added]
-            self._behind = None if self._behind is None else [*self._behind, *added]
+            self._behind = _with(self._behind, added)
+            if self._coming is not None and _with(self._since, added) is None:
+                self._coming = None
         self._version = ledger.version
         ledger.follow, ledger.added = True, []
 
@@ -104,11 +118,12 @@ class CurrentModel:
 
     def _adopted(self, memory: Memory) -> Model:
         """The coming model, followed to the memory as it is; a new one where there is none, or it cannot follow."""
-        coming, self._coming = self._coming, None
-        if coming is not None:
-            model, self._exact = coming.result(), not self._since
+        coming = self._coming
+        if coming is not None and coming.exception() is None:  # it waits; interrupted there, the next call does
+            model, self._exact, self._coming = coming.result(), not self._since, None
             if not self._overdue(model, memory) and model.follow(memory, self._since):
                 return model
+        self._coming = None
         return self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
@@ -131,3 +146,11 @@ class CurrentModel:
         if self._composer is None or self._composer[:3] != state:
             self._composer = *state, Composer.of(model, ledger.memory)
         return self._composer[3]
+
+
+def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:
+    """The list with some more in it; None where it would be too long."""
+    if touches is None or len(touches) + len(more) > MOST_BEHIND:
+        return None
+    touches.extend(more)
+    return touches

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +19,23 @@ from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "Judgement", "Model"]
+__all__ = ["Draft", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 
 NEGLIGIBLE = 40.0  # of a logit: ten thousand materials so far behind have 4e-14 of the probability together
+
+
+@contextmanager
+def enough_memory() -> Iterator[None]:
+    """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept."""
+    try:
+        yield
+    except MemoryError as error:
+        raise CapacityError(
+            f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer materials "
+            "in a scene, or give the process more"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -56,7 +69,9 @@ class Draft:
         statistics, sample = memory.statistics, list(memory.sample)
         names = list(statistics.materials)
         if kind == "ridge" and len(names) > EAGER:
-            raise InputError(f'readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"')
+            raise InputError(
+                f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"'
+            )
         # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if scale != CHANNELS and statistics.second(scale).rows]
@@ -66,19 +81,9 @@ class Draft:
         return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)
 
     def fit(self) -> Model:
-        """Solve the readouts and calibrate them.
-
-        Raises CapacityError where the system has not the memory for it; nothing was changed then.
-        """
-        try:
-            with one_thread():
-                readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
-                calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
-        except MemoryError as error:
-            raise CapacityError(
-                f"the system has no memory left to fit the readouts of {len(self.names)} materials: what was observed "
-                "is kept; name fewer in a scene, or give the process more"
-            ) from error
+        """Solve the readouts and calibrate them."""
+        readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+        calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
         give_back_scratch()
         return Model(self, readouts, calibrations, apart)
 
@@ -126,6 +131,11 @@ class Model:
         self.known = frozenset(self.names)
         self._of_all = {}
         return True
+
+    @property
+    def crowded(self) -> bool:
+        """Whether half of what the readouts can follow has come."""
+        return any(readout.crowded for readout in self.readouts.values())
 
     def is_last(self, columns: int) -> bool:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""

@@ -73,13 +73,15 @@ def left_out(
             rows = touch.rows[judged] - readout.origin
             groups.setdefault(len(judged), []).append((number, at, rows, weight, own[material]))
     index: dict[tuple[int, int], int] = {}
-    left, parts = _Leaving(readout, task, kind), []
+    parts = []
+    leaving = _Leaving(readout, task, kind) if groups else None
     for members in groups.values():
         for number, at, *_ in members:
             for stage in at:
                 index[number, stage] = len(index)
         rows, weights, owners = (np.stack([member[i] for member in members]) for i in (2, 3, 4))
-        parts.append(left.out(np.asarray(rows), np.asarray(weights), np.asarray(owners)))
+        assert leaving is not None
+        parts.append(leaving.out(np.asarray(rows), np.asarray(weights), np.asarray(owners)))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
     return LeftOut(index, names, *joined)
 

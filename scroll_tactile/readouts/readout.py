@@ -44,9 +44,7 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
 LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
-# Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much louder
-# than all before, or one retracted on which the scatter rests, have K inverted again, that scores keep their 1e-9.
-LARGEST_CONDITION = 256.0
+FIRST_KNOWN = 256  # materials
 FEW = 8  # rows that are solved for one by one: half of the time of a product of matrices
 
 
@@ -71,7 +69,9 @@ class Task:
         """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
         names = statistics.names(scale)
         places = {name: place for place, name in enumerate(names)}
-        own = np.array([places[name] for name in reference if name in places], dtype=np.intp)
+        # Of no touch that was sampled may any have rows here: then the first materials that have.
+        known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
+        own = np.array(known, dtype=np.intp)
         packed, (counts, sums) = statistics.second(scale).packed().copy(), statistics.totals(scale)
         return cls(scale, packed, names, counts, sums, own, statistics.touches)
 
@@ -136,6 +136,11 @@ class Readout:
             self._hold(places, means)
 
     @property
+    def crowded(self) -> bool:
+        """Whether half of the columns have come that may come before it has to be solved again."""
+        return 2 * self._rank > len(self._u)
+
+    @property
     def gamma(self) -> float:
         """γ, by which K⁻¹ becomes Σ⁻¹."""
         return float(self.counts.sum()) / (1 - self.share)
@@ -152,29 +157,16 @@ class Readout:
         return self._means[:count], self._solved[:count]
 
     def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
-        """Hold more materials, whose means about the origin are these, shape (k, d)."""
-        solved, first = self.system.solve(means), len(self._held)
-        self._held |= {int(place): first + i for i, place in enumerate(places)}
-        self._means, self._solved = np.vstack([self._means, means]), np.vstack([self._solved, solved])
-        self._sizes = np.append(self._sizes, np.einsum("hd,hd->h", means, solved))
-
-    def held(self, places: Sequence[int] | Places) -> Places:
-        """Where the materials at some places are held; those that were not are from now on."""
-        absent = [int(place) for place in places if int(place) not in self._held]
-        if absent:
-            if len(self._held) + len(absent) > MOST_HELD:
-                self._let_go()
-                absent = [int(place) for place in places if int(place) not in self._held]
-            names = [self.names[place] for place in absent]
-            counts, sums = self._statistics.counts(self.scale, names), self._statistics.sums(self.scale, names)
-            with one_thread():
-                self._hold(absent, _class_means(counts, sums, self.origin))
-        return np.array([self._held[int(place)] for place in places], dtype=np.intp)
-
-    def _let_go(self) -> None:
-        count = len(self.reference)
-        self._held = {int(place): i for i, place in enumerate(self.reference)}
-        self._means, self._solved, self._sizes = self._means[:count], self._solved[:count], self._sizes[:count]
+        """Keep the means of more places, shape (k, d), and what follows from them."""
+        solved = self.solve(means)
+        crossed = np.zeros((len(self._u), len(means)))
+        crossed[: self._rank] = self._u[: self._rank] @ solved.T
+        # All of it before any is kept: there may be no memory for it.
+        more = np.vstack([self._means, means]), np.vstack([self._solved, solved]), np.hstack([self._crossed, crossed])
+        held = {int(place): len(self._means) + i for i, place in enumerate(places)}
+        self._means, self._solved, self._crossed = more
+        self._held |= held
+        self._derived = None
 
     def follow(self, changes: Sequence[Change]) -> bool:
         """Take in touches, in the order they came, that the statistics have already; False where it has to be solved

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import lru_cache
 
 import numpy as np
@@ -31,11 +32,36 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run BLAS on one thread: on busy cores two made a 2 ms Cholesky take up to 439 ms."""
-    with _controller().limit(limits=1, user_api="blas"):
-        yield
+class _Limit:
+    """The limit of BLAS to one thread, which is the whole process's, and those that need it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._restore: Callable[[], None]
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._restore = _controller().limit(limits=1, user_api="blas").restore_original_limits
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._restore()
+
+
+_LIMIT = _Limit()
+
+
+def one_thread() -> AbstractContextManager[None]:
+    """Run BLAS on one thread: on busy cores two made a 2 ms Cholesky take up to 439 ms.
+
+    The limit holds for the whole process until the last of those that asked for it, of whatever thread, has left.
+    """
+    return _LIMIT
 
 
 @lru_cache(maxsize=4)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scroll_tactile import Kernels, Maps, Sensor, TactileLearner
+from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import DescriptionError, MaterialError
 from scroll_tactile.memory.descriptions import checked, targets_of
 from scroll_tactile.prediction.composition import Composer
@@ -98,51 +98,11 @@ def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares)
     targets = targets_of({name: checked(name, description) for name, description in descriptions.items()})
     head = ConstituentHead(np.arange(2), np.zeros(3), None)
     heads = {name: "too few" if name in unknown else head for name in targets}
-    composer = Composer(None, targets, [StageHeads(Curve(1.0, 0.0), 1.0, heads, heads)])
+    composer = Composer(None, targets, [StageHeads(Curve(1.0, 0.0), heads, heads)], [])
     touch_through_noise = Encoded(np.zeros((4, 50), np.float32), {}, noisy=True, seconds=1.0)
     found, unfamiliar = composer.compose(["silk", "wool"], {"a": 0.5, "b": 0.5}, touch_through_noise, 0.1)
     assert [constituent.share for constituent in found] == shares
     assert unfamiliar == 0.1
-
-
-class TestSharpness:
-    """Where a touch is one row of the statistics, each can be taken out of the readouts that answer."""
-
-    # Its touches are shorter than a wide window, and read as one.
-    SLOW = SKIN.model_copy(update={"duration": 1.4})
-
-    def trained(self, names, touches=6):
-        trained = TactileLearner(sensor=self.SLOW, embedding=Maps(layout=(4,), parts=5, cosines=200, reach=8.0))
-        for at in range(touches):
-            for number, name in enumerate(names):
-                trained.observe(name, self.shape(number, at))
-        return trained
-
-    def shape(self, number, seed):
-        rng = np.random.default_rng([number, seed])
-        level = np.array([[number % 2, number // 2, 1.0, -0.5]]) + rng.normal(0, 0.35, (1, 4))
-        return np.clip(np.repeat(level, 50, axis=0), -2, 2)
-
-    def test_probabilities_of_known_materials_are_as_sharp_as_touches_taken_out_deserve(self):
-        trained = self.trained("abcd")
-        for name in "abcd":
-            trained.describe(name, {"hard": name in "bd", "wet": name in "cd"})
-        composer = trained._current.composer(trained._ledger, trained.model())
-        assert composer.stages[0].sharpness == 1  # of many windows a touch
-        sharpness = composer.stages[-1].sharpness
-        assert sharpness > 1.1
-        said = trained.compose(self.shape(3, 50), unfamiliar=0.0)
-        chances = {name: chance**sharpness for name, chance in said.prediction.ranking}
-        assert said["hard"].presence == pytest.approx((chances["b"] + chances["d"]) / sum(chances.values()))
-        assert said["hard"].evidence[0][1] == pytest.approx(max(chances.values()) / sum(chances.values()))
-
-    def test_fewer_than_eight_touches_or_one_material_leave_them_as_they_are(self):
-        for names, touches, sharp in (("ab", 3, False), ("a", 9, False), ("abc", 3, True)):
-            trained = self.trained(names, touches)
-            for name in names:
-                trained.describe(name, {"hard": name == "b"})
-            composer = trained._current.composer(trained._ledger, trained.model())
-            assert (composer.stages[-1].sharpness != 1) == sharp
 
 
 class TestDescribing:
@@ -260,6 +220,19 @@ class TestDescribing:
         assert targets["viscose"].presence == {"felt": True, "tweed": False}
         assert targets["soft"].presence == {"felt": True, "stone": False}
         assert targets["silk"] == replace(targets["silk"], presence={}, share={})
+
+    @pytest.mark.parametrize("readout", ["lda", "ridge"])
+    def test_a_material_observed_since_the_heads_could_be_measured_is_weighed_too(self, readout):
+        trained = observed(["c", "l", "s"], 8, readout=readout)
+        for name in ("c", "l", "s", "w"):
+            trained.describe(name, described(mixtures()[name]))
+        assert trained.compose(touch(mixtures()["w"], 60))["wool"].unlearned.startswith("no material")
+        trained.observe("w", touch(mixtures()["w"], 0))
+        said = trained.compose(touch(mixtures()["w"], 61), unfamiliar=0.0)
+        assert said.prediction.material == "w"
+        assert said["cotton"].presence < 0.5
+        trained.settle()
+        assert trained.compose(touch(mixtures()["w"], 61))["wool"].presence > 0.5
 
     def test_what_is_unknown_of_a_material_takes_no_part(self):
         names = ["c", "l", "s", "w", "cl"]

@@ -1,4 +1,4 @@
-"""BLAS is held to one thread in small factorisations, whenever its libraries are loaded."""
+"""BLAS is held to one thread in small factorisations, whenever its libraries are loaded and whoever else holds it."""
 
 import subprocess
 import sys
@@ -17,3 +17,19 @@ def test_the_blas_that_scipy_brings_is_governed_though_it_is_loaded_late():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     ).stdout.splitlines()
     assert held == str([1] * int(count))
+
+
+def test_it_stays_on_one_thread_until_the_last_that_needs_it_has_left_and_has_as_many_as_before_then():
+    code = (
+        "from scroll_tactile.statistics.moments import one_thread\n"
+        "from threadpoolctl import threadpool_info, threadpool_limits\n"
+        "threads = lambda: {pool['num_threads'] for pool in threadpool_info() if pool['user_api'] == 'blas'}\n"
+        "with one_thread(): pass\n"
+        "threadpool_limits(2, user_api='blas')\n"
+        "ours, theirs = one_thread(), one_thread()\n"
+        "ours.__enter__(); theirs.__enter__(); ours.__exit__(None, None, None)\n"
+        "within = threads()\n"
+        "theirs.__exit__(None, None, None)\n"
+        "assert (within, threads()) == ({1}, {2}), (within, threads())"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,0 +1,387 @@
+"""The current model: the same calls give the same answers, whatever a thread's speed, and no failure leaves a trace."""
+
+import copy
+import gc
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from touches import PAD, SMALL
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import CapacityError, InputError
+from scroll_tactile.prediction import current
+from scroll_tactile.prediction.model import Draft, Model
+from scroll_tactile.readouts.readout import Readout
+
+OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
+PROBES = (("a", 50, 60), ("b", 51, 25), ("c", 52, 6))
+FIT = Draft.fit
+
+
+def stream(material, seed, readings=60):
+    """A noisy wave whose level and pace are the material's, such that some are taken for others."""
+    rng, place = np.random.default_rng([ord(material), seed]), "abcdef".index(material)
+    wave = np.sin(np.arange(readings)[:, None] * (0.2 + 0.1 * place) + rng.uniform(0, 6, 2))
+    return 0.4 + 0.05 * place + 0.2 * wave + rng.normal(0, 0.15, (readings, 2))
+
+
+def fed(observed, **settings):
+    """A memory without a path that observed these touches."""
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, **settings)
+    for material, seed in observed:
+        learner.observe(material, stream(material, seed))
+    return learner
+
+
+def bits(learner, probes=PROBES, scene=None):
+    """Answers such that equal means equal to the bit."""
+    said = [learner.predict(stream(*probe), scene=scene) for probe in probes]
+    return [([(name, share.hex()) for name, share in one.ranking], one.novelty.hex(), one.known) for one in said]
+
+
+def require_followed(learner):
+    """Its readouts count each touch that the memory has, once."""
+    learner.predict(stream(*PROBES[0]))
+    statistics = learner.memory.statistics
+    for scale, readout in learner._current.present(learner._ledger).readouts.items():
+        names = statistics.names(scale)
+        counts = [readout.counts[readout.places[name]] for name in names]
+        assert counts == statistics.counts(scale, names).tolist()
+        assert readout.rows == sum(counts)
+
+
+def slowly(monkeypatch, seconds):
+    """Let every fit that a thread makes beside take longer."""
+
+    def fit(draft):
+        if threading.current_thread() is not threading.main_thread():
+            time.sleep(seconds)
+        return FIT(draft)
+
+    monkeypatch.setattr(Draft, "fit", fit)
+
+
+# A touch that is observed, or None for a prediction.
+CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=24)
+
+
+@settings(max_examples=8, deadline=None)
+@given(CALLS, st.sampled_from(["lda", "ridge"]), st.sampled_from([0.01, 0.03]))
+def test_the_same_calls_give_the_same_answers_whatever_the_threads_speed(calls, readout, seconds):
+    said = []
+    for wait in (0.0, seconds):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            slowly(monkeypatch, wait)
+            learner = fed(OBSERVED[:9], readout=readout)
+            answers = bits(learner)
+            for call in calls:
+                if call is None:
+                    answers += bits(learner, PROBES[:1])
+                else:
+                    learner.observe(call[0], stream(*call))
+            said.append(answers + bits(learner))
+            learner.close()
+    assert said[0] == said[1]
+
+
+@settings(max_examples=8, deadline=None)
+@given(CALLS, st.sampled_from(["lda", "ridge"]))
+def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
+    learner, observed = fed(OBSERVED[:6], readout=readout), list(OBSERVED[:6])
+    for call in calls:
+        if call is None:
+            learner.predict(stream(*PROBES[0]))
+        else:
+            learner.observe(call[0], stream(*call))
+            observed.append(call)
+    learner.settle()
+    fresh = fed(sorted(observed), readout=readout)
+    assert bits(learner) == bits(fresh)
+    before = learner._current._model
+    learner.settle()
+    assert learner._current._model is before  # settled already
+
+
+@pytest.mark.parametrize("readout", ["lda", "ridge"])
+def test_what_was_just_observed_counts_and_the_calibration_lags_by_an_eighth(readout):
+    learner = fed([(name, seed) for seed in range(16) for name in "ab"], readout=readout)
+    for i in range(40):
+        learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))
+        learner.predict(stream(*PROBES[0]))
+        model = learner._current.present(learner._ledger)
+        touches = learner.memory.statistics.touches
+        assert 0 <= touches - model.fitted_to < max(2, model.fitted_to // 8)
+        assert model.names == list(learner.materials)
+        require_followed(learner)
+
+
+def test_no_prediction_fits_in_the_foreground_while_touches_come_one_by_one(monkeypatch):
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    fitted = []
+    monkeypatch.setattr(Draft, "fit", lambda draft: fitted.append(threading.current_thread()) or FIT(draft))
+    for i in range(60):
+        learner.observe("abcd"[i % 4], stream("abcd"[i % 4], 100 + i))
+        learner.predict(stream(*PROBES[0]))
+    assert len(fitted) >= 3
+    assert threading.main_thread() not in fitted
+
+
+def test_many_touches_without_a_question_are_not_kept():
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    for i in range(current.MOST_BEHIND + 50):
+        learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
+    held = learner._current
+    assert len(held._behind or []) + len(held._since) <= 2 * current.MOST_BEHIND
+    assert bits(learner) == bits(copy.deepcopy(learner))
+
+
+# What goes wrong
+
+
+def failing(monkeypatch, what, name, error):
+    monkeypatch.setattr(what, name, lambda *_, **__: (_ for _ in ()).throw(error))
+
+
+@pytest.mark.parametrize(
+    ("what", "name"), [(Draft, "of"), (Draft, "fit"), (Model, "follow"), (Model, "judge"), (Readout, "solve")]
+)
+def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, monkeypatch, what, name):
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+        for touch in OBSERVED:
+            learner.observe(touch[0], stream(*touch))
+        if name in ("follow", "judge"):
+            learner.predict(stream(*PROBES[0]))
+        learner.observe("a", stream("a", 90))
+        with monkeypatch.context() as broken:
+            failing(broken, what, name, MemoryError("no room"))
+            with pytest.raises(CapacityError, match=r"no memory left.*no room.*what was observed is kept"):
+                learner.predict(stream(*PROBES[0]))
+            learner.observe("b", stream("b", 91))  # it is kept all the same
+        require_followed(learner)
+        learner.settle()
+        settled = bits(learner)
+    fresh = fed([*OBSERVED, ("a", 90), ("b", 91)])
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as again:
+        assert bits(again) == settled == bits(fresh)
+
+
+@pytest.mark.parametrize("error", [MemoryError("no room"), InputError("too many"), RuntimeError("no new thread")])
+def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monkeypatch, error):
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    with monkeypatch.context() as broken:
+        failing(broken, Draft, "of", error)
+        for i in range(5):
+            assert learner.observe("a", stream("a", 90 + i)).sequence == len(OBSERVED) + 1 + i
+    fresh = fed([*OBSERVED, *(("a", 90 + i) for i in range(5))])
+    assert bits(learner) == bits(fresh)
+
+
+def test_a_fit_that_failed_beside_is_made_again(monkeypatch):
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    with monkeypatch.context() as broken:
+        failing(broken, Draft, "fit", MemoryError("no room"))
+        for i in range(3):
+            learner.observe("a", stream("a", 90 + i))
+        learner._current._coming.exception()
+    assert bits(learner) == bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
+
+
+@pytest.mark.parametrize("touches", [1, 3])
+def test_following_that_is_cut_short_counts_no_touch_twice(monkeypatch, touches):
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    for i in range(touches):
+        learner.observe("a", stream("a", 90 + i))
+    own, calls = Readout.follow, []
+
+    def follow(readout, changes):
+        calls.append(changes)
+        done = own(readout, changes)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return done
+
+    monkeypatch.setattr(Readout, "follow", follow)
+    with pytest.raises(KeyboardInterrupt):
+        learner.predict(stream(*PROBES[0]))
+    fresh = fed([*OBSERVED, *(("a", 90 + i) for i in range(touches))])
+    require_followed(learner)
+    learner.settle()
+    assert bits(learner) == bits(fresh)
+
+
+def test_an_interruption_while_a_prediction_waits_for_the_coming_model_does_no_harm(monkeypatch):
+    go, begun = threading.Event(), threading.Event()
+
+    def fit(draft):
+        if threading.current_thread() is not threading.main_thread():
+            begun.set()
+            go.wait(30)
+        return FIT(draft)
+
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    monkeypatch.setattr(Draft, "fit", fit)
+    for i in range(3):
+        learner.observe("a", stream("a", 90 + i))
+    assert begun.wait(30)
+
+    def interrupt():
+        time.sleep(0.2)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        learner.predict(stream(*PROBES[0]))
+    learner.observe("b", stream("b", 95))
+    go.set()
+    fresh = fed([*OBSERVED, *(("a", 90 + i) for i in range(3)), ("b", 95)])
+    assert dict(learner.predict(stream(*PROBES[0])).ranking).keys() == {"a", "b", "c"}
+    learner.settle()
+    assert bits(learner) == bits(fresh)
+
+
+# With a fit running
+
+
+@pytest.fixture
+def fitting(monkeypatch):
+    """A learner of which a thread is fitting the next model for a while."""
+    slowly(monkeypatch, 0.3)
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    for i in range(3):
+        learner.observe("a", stream("a", 90 + i))
+    assert not learner._current._coming.done()
+    return learner
+
+
+def test_closed_pickled_copied_and_dropped_while_a_fit_runs(fitting):
+    fresh = bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
+    for snapshot in (pickle.loads(pickle.dumps(fitting)), copy.deepcopy(fitting)):
+        assert bits(snapshot) == fresh
+    fitting.close()
+    assert fitting._current._coming.done()
+    for _ in range(3):
+        assert dict(fitting.predict(stream(*PROBES[0])).ranking).keys() == {"a", "b", "c"}
+    fitting.close()
+
+
+def test_a_learner_that_nobody_holds_is_gone_and_its_thread_ends(monkeypatch):
+    slowly(monkeypatch, 0.1)
+    threads = set(threading.enumerate())
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    learner.observe("a", stream("a", 90))
+    learner.observe("a", stream("a", 91))
+    gone = weakref.ref(learner)
+    del learner
+    gc.collect()
+    assert gone() is None
+    for thread in set(threading.enumerate()) - threads:
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a process cannot be forked here")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_process_waits_for_no_thread_of_its_parent(fitting):
+    child = os.fork()
+    if not child:
+        signal.alarm(20)
+        fitting.predict(stream(*PROBES[0]))
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_predictions_from_four_threads_while_a_fifth_observes_are_each_of_some_state():
+    observed = [("abcd"[i % 4], 100 + i) for i in range(24)]
+    learner = fed(OBSERVED)
+    learner.predict(stream(*PROBES[0]))
+    said, failures, done = [], [], threading.Event()
+
+    def ask():
+        try:
+            while not done.is_set():
+                said.append(learner.predict(stream(*PROBES[0])))
+        except BaseException as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for touch in observed:
+        learner.observe(touch[0], stream(*touch))
+        time.sleep(0.005)
+    done.set()
+    for thread in threads:
+        thread.join(60)
+    assert not failures
+    assert said
+    for prediction in said:
+        assert {name for name, _ in prediction.ranking} in ({*"abc"}, {*"abcd"})
+        assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
+        assert np.isfinite(prediction.novelty)
+    learner.settle()
+    assert bits(learner) == bits(fed([*OBSERVED, *observed]))
+
+
+ENDS = """
+import os, signal, sys, threading, time
+sys.path[:0] = sys.argv[3:]
+from prediction.test_current import PAD, SMALL, stream
+from scroll_tactile import TactileLearner
+from scroll_tactile.prediction.model import Draft
+
+fit, begun = Draft.fit, threading.Event()
+def slow(draft):
+    if threading.current_thread() is not threading.main_thread():
+        begun.set()
+        time.sleep(1.0)
+    return fit(draft)
+Draft.fit = slow
+learner = TactileLearner.open(sys.argv[1], sensor=PAD, embedding=SMALL)
+for i in range(8):
+    for name in "ab":
+        learner.observe(name, stream(name, i))
+learner.predict(stream("a", 50))
+for i in range(3):
+    learner.observe("a", stream("a", 90 + i))
+assert begun.wait(30)
+print("fitting", flush=True)
+how = sys.argv[2]
+if how == "killed":
+    os.kill(os.getpid(), signal.SIGKILL)
+if how == "interrupted":
+    signal.raise_signal(signal.SIGINT)
+"""
+
+
+@pytest.mark.parametrize(("how", "code"), [("ended", 0), ("killed", -9), ("interrupted", (1, -2, 130))])
+def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS, tmp_path / "m", how, *sys.path],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.stdout == "fitting\n", done.stderr
+    assert done.returncode in (code if isinstance(code, tuple) else (code,)), done.stderr
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+        observed = [(name, i) for i in range(8) for name in "ab"] + [("a", 90 + i) for i in range(3)]
+        assert bits(learner) == bits(fed(observed))

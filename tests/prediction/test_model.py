@@ -1,0 +1,111 @@
+"""The model: scenes, materials that no sampled touch is of, and readouts that hold only the materials asked for."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from prediction.test_current import fed
+from touches import PAD, SMALL, SmallSample
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import UnknownMaterialError
+
+NAMES = [f"material {i:02d}" for i in range(12)]
+LONG = PAD.model_copy(update={"duration": 4.0})
+
+
+def stream(place, seed, readings=60):
+    """A noisy wave whose level is the material's."""
+    rng = np.random.default_rng([place, seed])
+    wave = np.sin(np.arange(readings)[:, None] * 0.4 + rng.uniform(0, 6, 2))
+    return 0.2 + 0.05 * place + 0.2 * wave + rng.normal(0, 0.05, (readings, 2))
+
+
+def learner_of(touches=3, sensor=PAD, **settings):
+    learner = TactileLearner(sensor=sensor, embedding=SMALL, **settings)
+    for i in range(touches):
+        for place, name in enumerate(NAMES):
+            learner.observe(name, stream(place, i))
+    return learner
+
+
+LEARNERS = {readout: learner_of(readout=readout) for readout in ("lda", "ridge")}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(["lda", "ridge"]), st.sets(st.sampled_from(NAMES), min_size=1), st.integers(50, 90))
+def test_the_probabilities_of_a_scene_are_those_of_its_materials_alone(readout, scene, seed):
+    whole = LEARNERS[readout].predict(stream(seed % 12, seed))
+    part = LEARNERS[readout].predict(stream(seed % 12, seed), scene=sorted(scene, reverse=True))
+    shares = {name: share for name, share in whole.ranking if name in scene}
+    expected = {name: share / sum(shares.values()) for name, share in shares.items()}
+    assert dict(part.ranking) == pytest.approx(expected, rel=1e-6, abs=1e-12)
+    assert part.novelty >= whole.novelty - 1e-9 * abs(whole.novelty)
+
+
+def test_a_scene_of_ten_thousand_names():
+    learner, probe = LEARNERS["lda"], stream(3, 60)
+    assert learner.predict(probe, scene=NAMES * 1000) == learner.predict(probe)
+    with pytest.raises(UnknownMaterialError, match="never observed") as raised:
+        learner.predict(probe, scene=[*NAMES, *(f"nobody's {i}" for i in range(10_000))])
+    assert len(str(raised.value)) < 2000
+    assert learner.predict(probe, scene=[NAMES[3]]).ranking == ((NAMES[3], 1.0),)
+
+
+@pytest.mark.parametrize("touches", [1, 3])
+def test_materials_held_only_when_asked_for_are_weighed_alike(monkeypatch, touches):
+    """Of a memory of more materials than are solved for at once, in which a few are of sampled touches."""
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
+    plain = learner_of(touches)
+    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
+    held = learner_of(touches)
+    for i in range(20):
+        scene = [NAMES[place] for place in {i % 12, (5 * i + 1) % 12, (7 * i + 3) % 12}]
+        for chosen in (scene, NAMES[i % 10 : i % 10 + 2], None):
+            ours, theirs = (learner.predict(stream(i % 12, 50 + i), scene=chosen) for learner in (plain, held))
+            assert dict(ours.ranking) == pytest.approx(dict(theirs.ranking), rel=1e-7, abs=1e-9)
+            assert ours.novelty == pytest.approx(theirs.novelty, rel=1e-7, abs=1e-7)
+        for learner in (plain, held):  # materials that were held, that were not, and new ones
+            learner.observe([*NAMES, "new", "newer"][5 * i % 14], stream(5 * i % 14, 100 + i))
+
+
+def test_a_scale_at_which_no_sampled_touch_was_read(monkeypatch):
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
+    learner = learner_of(sensor=LONG)
+    seeds = iter(range(1000))
+    learner.observe("long", stream(9, next(seeds), 200))
+    while "long" in {material for material, *_ in learner.memory.sample}:
+        learner.observe("long", stream(9, next(seeds), 200))
+        learner.observe(NAMES[0], stream(0, 1000 + next(seeds)))
+    learner.describe("long", {"wet": True})
+    learner.describe(NAMES[0], {"wet": False})
+    for readings in (10, 60, 200):
+        prediction = learner.predict(stream(9, 5000, readings))
+        assert {name for name, _ in prediction.ranking} == {*NAMES, "long"}
+        assert np.isfinite(prediction.novelty)
+        assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
+        learner.compose(stream(9, 5000, readings))
+
+
+def test_a_material_that_was_observed_briefly_among_others_that_came_since(monkeypatch):
+    """What follows a fit may reach scales and stages that no touch had reached before it."""
+    learner = TactileLearner(sensor=LONG, embedding=SMALL)
+    for i in range(6):
+        for place in range(3):
+            learner.observe(NAMES[place], stream(place, i, 20))
+    learner.predict(stream(0, 50, 20))
+    learner.observe(NAMES[0], stream(0, 60, 200))
+    learner.observe("new", stream(7, 61, 12))
+    for readings in (10, 20, 60, 200):
+        prediction = learner.predict(stream(7, 70, readings))
+        assert {name for name, _ in prediction.ranking} == {*NAMES[:3], "new"}
+        assert np.isfinite(prediction.novelty)
+
+
+def test_one_material_and_one_touch():
+    learner = fed([("a", 1)])
+    for readings in (6, 60, 500):
+        assert learner.predict(stream(3, 4, readings)).ranking == (("a", 1.0),)
+    learner.observe("a", stream(3, 5))
+    learner.observe("b", stream(5, 5))
+    assert {name for name, _ in learner.predict(stream(3, 6)).ranking} == {"a", "b"}

@@ -232,8 +232,8 @@ class Memory:
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         stages = self.plan.scored_stages(columns)
         if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage after all others
-            unreached: list[dict[Scale, list[int]]] = [{}] * (len(self.plan.milestones()) - len(stages))
-            stages += [*unreached, {scale: [0] for scale in NOISE}]
+            unreached: list[dict[Scale, list[list[int]]]] = [{}] * (len(self.plan.milestones()) - len(stages))
+            stages += [*unreached, {scale: [[0]] for scale in NOISE}]
         return SampledTouch.of(stages, codes)
 
     def _join(self, record: Record) -> None:

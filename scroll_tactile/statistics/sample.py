@@ -26,27 +26,28 @@ T = TypeVar("T")
 Codes = dict[Scale, npt.NDArray[np.int32]]
 
 
-Stages = Sequence[Mapping[Scale, Sequence[int]]]
-"""For each stage that a touch reached: scale → places of the windows that are scored there."""
+Stages = Sequence[Mapping[Scale, Sequence[Sequence[int]]]]
+"""For each stage that a touch reached: scale → places of the windows that are scored there, in groups of one row."""
 
 
 def stage_rows(stages: Stages, windows: Codes) -> Codes:
-    """What is learned of a touch: for each scale one row for each stage that it judges at, (rows, d) by scale.
+    """What is learned of a touch: for each scale a row for each group of each stage that it judges at, (rows, d) by scale.
 
-    windows: the codes of the touch's windows by scale. A row is the mean of those that are scored at the stage: what
-    will be judged of a touch that ends there.
+    windows: the codes of the touch's windows by scale. A row is the mean of a group. Of a stage that is one group it is
+    what will be judged of a touch that ends there.
     """
     rows: dict[Scale, list[npt.NDArray[np.int64]]] = {}
     for stage in stages:
-        for scale, places in stage.items():
-            row = mean_code(windows[scale][places].sum(axis=0, dtype=np.int64), len(places))
-            rows.setdefault(scale, []).append(row)
+        for scale, groups in stage.items():
+            rows.setdefault(scale, []).extend(
+                mean_code(windows[scale][places].sum(axis=0, dtype=np.int64), len(places)) for places in groups
+            )
     return {scale: np.stack(rows[scale]).astype(np.int32) for scale in sorted(rows)}
 
 
 @dataclass(frozen=True)
 class SampledTouch:
-    """The rows that a touch added to the statistics, of each stage that it reached and each scale that judges there.
+    """The mean row that a touch added to the statistics, of each stage that it reached and each scale that judges there.
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
     the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
@@ -63,11 +64,11 @@ class SampledTouch:
         rows, pairs = [], []
         for stage, scales in enumerate(stages):
             for place, scale in enumerate(sorted(scales)):
-                row = used.get(scale, 0)
-                used[scale] = row + 1
-                rows.append(codes[scale][row])
+                row, count = used.get(scale, 0), len(scales[scale])
+                used[scale] = row + count
+                rows.append(mean_code(codes[scale][row : row + count].sum(axis=0, dtype=np.int64), count))
                 pairs.append((stage, place, len(codes[scale])))
-        return cls(np.stack(rows), np.array(pairs))
+        return cls(np.stack(rows).astype(np.int32), np.array(pairs))
 
     @classmethod
     def of_sums(cls, sums: npt.NDArray[np.int32], pairs: npt.NDArray[np.int64]) -> SampledTouch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -540,11 +541,13 @@ class TactileLearner:
             self._ledger.require_writing()
             model, ranked, memory = self.model(), self.ranked_exemplars(), self._ledger.memory
             upto, retractions = memory.sequence, memory.retractions
+            statistics = copy.deepcopy(memory.statistics)
         tuned, report = fine_tune(
             self._embedding,
             model,
+            statistics,
             ranked,
-            self._sensor,
+            self._extractor,
             epochs=epochs,
             seed=seed,
             device=device,

@@ -3,9 +3,10 @@
 As in SCROLL (Wang et al. 2022, arXiv 2210.05561) f* restarts each time from the pre-trained weights with its head set
 from the readout, and is trained by cross-entropy on the buffer only. Small buffers train residual adapters (Li et al.
 2022, arXiv 2107.00358), a 1 × 1 convolution beside each 3 × 3 one, and the head; larger ones the whole network. How
-long to train, and whether f* is used at all, is decided on the buffer's own folds: every exemplar is classified by an
-f* that neither its training nor the readout it began from had seen. The temperature is learned there, too: on touches
-that f was solved from it would only sharpen what is certain already.
+long to train, and whether f* is used at all, is decided on three folds of the buffer: a fold is taken out of the
+statistics, exactly, and every exemplar in it is classified by an f, and by an f* that began from that f, that never saw
+it. The temperature is learned there, too: on touches that f was solved from it would only sharpen what is certain
+already.
 """
 
 from __future__ import annotations
@@ -19,18 +20,24 @@ import numpy.typing as npt
 import torch
 from scipy.special import logsumexp
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
+from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.network import TouchFeatures, TrainingSample
-from scroll_tactile.finetune.training import Progress, Trained, Trainer, named_out_of_memory, repeatable, start_of
+from scroll_tactile.finetune.training import (
+    FOLDS,
+    Progress,
+    Trained,
+    Trainer,
+    named_out_of_memory,
+    repeatable,
+    start_of,
+)
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.contact import Rest, image_of
-from scroll_tactile.signals.stream import validate
 from scroll_tactile.signals.windows import WindowPlan
-from scroll_tactile.statistics.statistics import FOLDS
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune", "require_tunable"]
 
@@ -52,8 +59,9 @@ TEMPERATURES = np.exp(np.linspace(-2.0, 2.0, 81))
 def fine_tune(
     embedding: Embedding,
     model: Model,
+    statistics: Statistics,
     exemplars: Mapping[str, Sequence[Exemplar]],
-    sensor: Sensor,
+    extractor: FeatureExtractor,
     *,
     epochs: int | None = None,
     seed: int = 0,
@@ -63,7 +71,8 @@ def fine_tune(
 ) -> tuple[Tuned, TuneReport]:
     """Fine-tune on exemplars; the same arguments give the same bytes on the same device.
 
-    model: of the memory that the exemplars come from. epochs: the most, `EPOCHS` unless given; fewer are taken where
+    model: of the memory that the exemplars come from. statistics: a copy of that memory's. extractor: as the exemplars
+    were observed with. epochs: the most, `EPOCHS` unless given; fewer are taken where
     the exemplars held out say so. device: torch's name of one. mode: what to train; by the number of exemplars unless
     given.
 
@@ -74,7 +83,7 @@ def fine_tune(
     most = EPOCHS if epochs is None else epochs
     _require_settings(most, seed, device, exemplars, model.names)
     touches = TouchFeatures(embedding, model.plan)
-    samples = list(_samples(touches, model, exemplars, sensor, capabilities_of(embedding).rest, progress))
+    samples = list(_samples(touches, model, exemplars, extractor, progress))
     names = sorted({sample.material for sample in samples})
     if len(names) < 2:
         raise InputError(
@@ -85,7 +94,7 @@ def fine_tune(
     with repeatable(device), named_out_of_memory(device):
         spreads = touches.spreads(samples)
         trainer = Trainer(touches, spreads, most, seed, torch.device(device), chosen, progress)
-        best, temperature, scores = _best(*trainer.held_out(model, samples), most)
+        best, temperature, scores = _best(*trainer.held_out(model, statistics, samples), most)
         progress("training", 0, best)
         final = trainer.train(start_of(model, names), samples, [], best, salt=FOLDS)
     kept, reason = _verdict(scores)
@@ -137,21 +146,21 @@ def _samples(
     touches: TouchFeatures,
     model: Model,
     exemplars: Mapping[str, Sequence[Exemplar]],
-    sensor: Sensor,
-    rest: Rest,
+    extractor: FeatureExtractor,
     progress: Progress,
 ) -> Iterator[TrainingSample]:
-    """The exemplars that reach the last stage, by material and rank; rest: the resting image of a camera."""
+    """The exemplars that reach the last stage, by material and rank."""
     if len(model.calibrations) < len(model.stages):  # nothing was observed for long enough
         return
-    known = {name for name in model.names if all(name in model.selections[s].places for s in model.stages[-1])}
+    known = {name for name in model.names if all(name in model.readouts[s].places for s in model.stages[-1])}
     total, done = sum(map(len, exemplars.values())), 0
     for material, buffered in sorted(exemplars.items()):
         for exemplar in buffered:
-            image = image_of(validate(exemplar.readings, sensor), rest)
+            image = extractor.image(extractor.stream(exemplar.readings))
             columns = image.shape[1]
             if material in known and model.is_last(columns) and touches.reads(columns):
-                yield TrainingSample(material, exemplar.key, image, touches.frozen(image))
+                codes = extractor.codes(image, exemplar.key)
+                yield TrainingSample(material, exemplar.key, image, touches.frozen(image), codes)
             done += 1
             progress("reading exemplars", done, total)
 

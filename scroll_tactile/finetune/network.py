@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import cast
 
@@ -17,6 +17,7 @@ from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
+from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
 
@@ -34,13 +35,15 @@ SPREAD_FLOOR = 0.05
 class TrainingSample:
     """An exemplar made ready: its tactile image, and of each judging scale the mean of its windows' frozen features.
 
-    frozen: width → float64 (d,), zero where the features come from the network.
+    frozen: width → float64 (d,), zero where the features come from the network. codes: the rows that it added to the
+    statistics.
     """
 
     material: str
     key: bytes
     image: npt.NDArray[np.float32]
     frozen: Mapping[int, FloatArray]
+    codes: Codes = field(default_factory=dict)
 
 
 class Backbone(nn.Module):

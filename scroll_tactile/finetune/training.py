@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,18 @@ from scroll_tactile.errors import FineTuneError
 from scroll_tactile.finetune.network import Backbone, TouchFeatures, TrainingSample, adapted
 from scroll_tactile.memory.tuned import TuneMode
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.readout import Readout, Task
 from scroll_tactile.signals.augmentation import Augmentation
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.statistics import FOLDS, fold_of
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Progress", "Start", "Trained", "Trainer", "named_out_of_memory", "repeatable", "start_of"]
+__all__ = ["FOLDS", "Progress", "Start", "Trained", "Trainer", "named_out_of_memory", "repeatable", "start_of"]
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], object]
 
+FOLDS = 3  # of the exemplars
 BATCH = 32
 # Larger rates train faster away from what f has solved. Held out, with 400 exemplars of RoboSkin, f's log loss is
 # 0.171; f*'s is 0.151 with adapters' rates of 5e-6 and 5e-5, 0.159 with 1e-6. BioTac tells them apart: f 0.060, f*
@@ -64,34 +66,42 @@ class Trained:
     network: dict[str, npt.NDArray[np.float32]]
 
 
-def start_of(model: Model, names: Sequence[str], fold: int | None = None) -> Start:
-    """f's own readout at the last stage as one linear head; of the other folds where one is held out."""
+def start_of(model: Model, names: Sequence[str], readouts: Mapping[Scale, Readout] | None = None) -> Start:
+    """f's own readouts at the last stage as one linear head; or others in their place."""
     heads, bias = {}, np.zeros(len(names))
     for scale, weight in zip(model.stages[-1], model.calibrations[-1].weights, strict=True):
-        selection = model.selections[scale]
-        known = list(selection.names)
-        readout: Readout = selection.readout
-        if fold is not None:
-            places, readout = selection.held_out[fold]
-            known = [selection.names[place] for place in places]
-        columns = [known.index(name) for name in names]
-        mixing = np.eye(len(known)) if model.kind == "lda" else readout.ridge
-        slopes = readout.weights @ mixing[:, columns]
-        offset = readout.scores(np.zeros(len(known)), model.kind)[columns]
-        heads[scale.width] = weight * slopes * 2.0**BITS
-        bias += weight * (offset - readout.center @ slopes)
+        readout = (readouts or model.readouts)[scale]
+        slopes, offsets = readout.linear(names, model.kind)
+        heads[scale.width] = np.ascontiguousarray(weight * slopes * 2.0**BITS)  # as it will lie when it is read again
+        bias += weight * (offsets - readout.origin @ slopes)
     return Start(list(names), heads, bias)
 
 
-def held_names(model: Model, fold: int, names: Sequence[str]) -> list[str]:
-    """Those of the names that the readouts of the other folds know."""
-    known = set(names)
-    for scale in model.stages[-1]:
-        selection = model.selections[scale]
-        if fold not in selection.held_out:
-            return []
-        known &= {selection.names[place] for place in selection.held_out[fold][0]}
-    return sorted(known)
+def start_without(
+    model: Model, statistics: Statistics, samples: Sequence[TrainingSample], names: Sequence[str]
+) -> Start:
+    """The head that f would be had it never observed some samples; of those of the names that it would know then.
+
+    statistics: of the memory; they are as before when this returns.
+    """
+    for sample in samples:
+        statistics.remove(sample.material, sample.codes, sample.image.shape[1])
+    scales = model.stages[-1]
+    known = sorted(set(names).intersection(*(statistics.names(scale) for scale in scales)))
+    if len(known) < 2:
+        start = Start(known, {}, np.zeros(len(known)))
+    else:
+        reference = names if model.kind == "lda" else list(statistics.materials)
+        readouts = {scale: Readout(Task.of(statistics, scale, reference), statistics) for scale in scales}
+        start = start_of(model, known, readouts)
+    for sample in samples:
+        statistics.add(sample.material, sample.codes, sample.image.shape[1])
+    return start
+
+
+def fold_of(key: bytes) -> int:
+    """The fold of an exemplar, from its content hash: the same wherever and whenever it was observed."""
+    return int.from_bytes(key[:8], "little") % FOLDS
 
 
 @contextmanager
@@ -141,18 +151,19 @@ class Trainer:
         self.mode = mode
         self.progress = progress
 
-    def held_out(self, model: Model, samples: list[TrainingSample]) -> tuple[list[Trained], list[Trained]]:
-        """For each fold what training on the others gives for it, and what f gives."""
+    def held_out(
+        self, model: Model, statistics: Statistics, samples: list[TrainingSample]
+    ) -> tuple[list[Trained], list[Trained]]:
+        """For each fold of the samples what training on the others gives for it, and what f gives that never saw it."""
         trials, before = [], []
         names = sorted({sample.material for sample in samples})
         for fold in range(FOLDS):
-            known = held_names(model, fold, names)
-            usable = [sample for sample in samples if sample.material in known]
-            train = [sample for sample in usable if fold_of(sample.key) != fold]
-            test = [sample for sample in usable if fold_of(sample.key) == fold]
-            if len(known) < 2 or not train or not test:
+            held = [sample for sample in samples if fold_of(sample.key) == fold]
+            start = start_without(model, statistics, held, names)
+            train = [s for s in samples if fold_of(s.key) != fold and s.material in start.names]
+            test = [sample for sample in held if sample.material in start.names]
+            if len(start.names) < 2 or not train or not test:
                 continue
-            start = start_of(model, known, fold)
             head = LinearHead(start, self.spreads).to(self.device)
             before.append(Trained([self._judge(head, None, test)], _targets(head, test), {}, start.bias, {}))
             what = f"held out {fold + 1}/{FOLDS}"
@@ -211,7 +222,7 @@ class Trainer:
         if random.random() >= AUGMENTED:
             return sample
         image = AUGMENTATION.augment(sample.image, random, columns=sample.image.shape[1])
-        return TrainingSample(sample.material, sample.key, image, self.touches.frozen(image))
+        return replace(sample, image=image, frozen=self.touches.frozen(image))
 
     def _step(
         self,

@@ -263,6 +263,20 @@ class Readout:
         z = self._solved[held] @ row if solved is None else (solved @ row)[held]
         return np.asarray(z - self._sizes[held] / 2)
 
+    def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
+        """The scores of materials as weights (d, k) of codes about the origin, and offsets (k,); see `scores`."""
+        places, derived = [self.places[name] for name in names], self.derived()
+        held = derived.reference if kind == "ridge" else self.held(places)
+        moved = self._crossed[: self._rank, held].T @ (derived.inner @ self._v[: self._rank])
+        weights = self.gamma * (self._solved[held] - moved).T
+        if kind == "lda":
+            return weights, -self.derived().sizes[held] / 2
+        rank = {int(place): i for i, place in enumerate(self.reference)}
+        background = derived.background[[rank[place] for place in places]]
+        mixing = background - np.outer(background.sum(axis=1), self.shares)
+        shares = self.shares[[rank[place] for place in places]]
+        return weights @ mixing.T, np.asarray(shares - background @ derived.towards)
+
     def centred(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about their mean, shape (R,)."""
         z = self._reference_z(codes)

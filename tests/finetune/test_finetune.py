@@ -1,5 +1,6 @@
 """f*: from exemplars alone, the same bytes whatever the schedule, durable, and never in f's way."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -81,7 +82,8 @@ def test_an_f_star_that_is_kept_gives_the_probabilities(kind):
     answer = learner.predict(probe, tuned=True)
     reader = TunedReader(learner.embedding, learner.plan, learner.memory.tuned)
     logits = reader.logits(tactile_image(probe))
-    chances = np.exp(np.array([logits[name] for name in sorted(NAMES)]))
+    values = np.array([logits[name] for name in sorted(NAMES)])
+    chances = np.exp(values - values.max())
     expected = dict(zip(sorted(NAMES), chances / chances.sum(), strict=True))
     assert answer.tuned
     assert dict(answer.ranking) == pytest.approx(expected)
@@ -249,6 +251,37 @@ def test_the_start_is_f_itself():
         chances = np.exp(logits - logits.max())
         said = dict(learner.predict(SCENE.touch(NAMES[3], 40)).ranking)
         assert said == pytest.approx(dict(zip(model.names, chances / chances.sum(), strict=True)), abs=1e-4)
+
+
+@pytest.mark.parametrize("readout", ["lda", "ridge"])
+def test_a_fold_held_out_starts_as_a_memory_that_never_observed_it(readout):
+    learner = learned("kernels", readout=readout)
+    model, statistics = learner.model(), copy.deepcopy(learner.memory.statistics)
+    extractor = learner._extractor
+    held = [(name, extractor.stream(stream)) for name, stream in touches[4:14]]
+    samples = []
+    for name, stream in held:
+        image = extractor.image(stream)
+        samples.append(TrainingSample(name, stream.key, image, {}, extractor.codes(image, stream.key)))
+    start = training.start_without(model, statistics, samples, model.names)
+    assert statistics == learner.memory.statistics
+    others = learned("kernels", [*range(4), *range(14, len(touches))], readout=readout).model()
+    expected = training.start_of(model, others.names, others.readouts)
+    assert start.names == expected.names
+    assert start.bias == pytest.approx(expected.bias)
+    for width, head in expected.heads.items():
+        assert np.allclose(start.heads[width], head, rtol=1e-9, atol=1e-12 * np.abs(head).max())
+
+
+def test_a_material_of_which_all_is_held_out_is_not_compared():
+    learner = learned("kernels")
+    model, extractor = learner.model(), learner._extractor
+    learner.observe("once", SCENE.touch(SCENE.materials[6], 0))
+    stream = extractor.stream(SCENE.touch(SCENE.materials[6], 0))
+    image = extractor.image(stream)
+    sample = TrainingSample("once", stream.key, image, {}, extractor.codes(image, stream.key))
+    start = training.start_without(learner.model(), learner.memory.statistics, [sample], [*model.names, "once"])
+    assert start.names == model.names
 
 
 @pytest.mark.parametrize("kind", ["kernels", "vision"])

@@ -78,7 +78,7 @@ def _scales(model: Model, columns: int) -> tuple[int, list[Scale]]:
     stage = min(len(model.plan.stages(columns)), len(model.calibrations)) - 1
     scales = list(model.stages[stage])
     for name in model.names:
-        if any(name not in model.selections[scale].places for scale in scales):
+        if any(name not in model.readouts[scale].places for scale in scales):
             raise InputError(
                 f"expected every material to have been observed for the sensor's usual length; {name!r} was "
                 "only observed briefly, and would have no score. Observe a longer touch of it first"
@@ -151,21 +151,14 @@ def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int
     stage, scales = _scales(model, columns)
     logits = ""
     for scale, weight in zip(scales, model.calibrations[stage].weights, strict=True):
-        selection = model.selections[scale]
-        readout = selection.readout
+        readout = model.readouts[scale]
+        weights, offsets = readout.linear(model.names, model.kind)
         fine = graph.add("Cast", features[scale], to=graph.onnx.TensorProto.DOUBLE)
         units = graph.add("Mul", fine, graph.constant(np.float64(2.0**BITS / Vision.bound)))
         mean = graph.add("ReduceMean", units, axes=[0], keepdims=1)
-        z = graph.add("MatMul", graph.add("Sub", mean, graph.constant(readout.center)), graph.constant(readout.weights))
-        if model.kind == "lda":
-            scores = graph.add("Sub", z, graph.constant(np.diagonal(readout.gram) / 2))
-        else:
-            scores = graph.add(
-                "Add", graph.add("MatMul", z, graph.constant(readout.ridge)), graph.constant(readout.shares)
-            )
-        order = np.array([selection.places[name] for name in model.names], np.int64)
-        ordered = graph.add("Gather", scores, graph.constant(order), axis=1)
-        weighed = graph.add("Mul", ordered, graph.constant(np.float64(weight)))
+        about = graph.add("Sub", mean, graph.constant(readout.origin))
+        scores = graph.add("Add", graph.add("MatMul", about, graph.constant(weights)), graph.constant(offsets))
+        weighed = graph.add("Mul", scores, graph.constant(np.float64(weight)))
         logits = graph.add("Add", logits, weighed) if logits else weighed
     return graph.add("Squeeze", graph.add("LogSoftmax", logits, axis=1), graph.constant(np.array([0])))
 

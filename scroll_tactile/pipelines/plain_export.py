@@ -19,9 +19,11 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.results import Observation
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.statistics import FOLDS, Statistics
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["export_plain"]
+
+FORMAT = 2
 
 
 def export_plain(
@@ -33,12 +35,21 @@ def export_plain(
 
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
       (learned from, features given up), retracted. Only where the memory has a path.
-    - `statistics.npz`: `materials`; for each scale (a width of windows) `counts-<scale>` int64 (C,), `sums-<scale>`
-      int64 (C, d) and `second-<scale>` int64 (d, d), over all folds, of features in units of bound · 2⁻²⁰.
+    - `statistics.npz`: `materials`; for each scale (a width of windows) of its rows, of which a touch adds one at each
+      stage that the scale judges at (of a camera one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d)
+      and `second-<scale>` Σ x xᵀ, int64 (d, d), of features x in units of bound · 2⁻²⁰.
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
     - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given. Only
       where anything was described.
-    - `memory.json`: sensor, embedding, digest, date. It is written last.
+    - `memory.json`: format 2, sensor, embedding, digest, date, and the number of touches. It is written last.
+
+    The classifier of a scale follows with NumPy alone. With means m_y = sums / counts, N rows and n touches,
+    S = second − Σ_y counts_y m_y m_yᵀ, t = tr S and q = Σ S_ij², its shrinkage is
+
+        ρ = ((1 − 2/d) q + t²) / ((n + 1 − 2/d) (q − t² / d)), from 0.0001 to 0.99,
+
+    and lda scores x by N / (1 − ρ) · (m_y K⁻¹ x − m_y K⁻¹ m_y / 2), K = S + ρ / (1 − ρ) · t / d · I (see
+    `readouts.readout`). Format 1, of versions before 0.3, had a row for each window and named its number of folds.
 
     Raises InputError for a folder that holds something or cannot be written; StoreError.
     """
@@ -81,7 +92,8 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
         "sensor": held.sensor.model_dump(mode="json"),
         "embedding": {name: getattr(held.embedding, name) for name in ("name", "dimension", "bound", "fingerprint")},
         "unit": f"bound / 2**{BITS}",
-        "folds": FOLDS,
+        "format": FORMAT,
+        "touches": held.memory.statistics.touches,
     }
     (target / "memory.json").write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
@@ -113,16 +125,15 @@ def _arrays(statistics: Statistics) -> dict[str, npt.NDArray[Any]]:
     arrays: dict[str, npt.NDArray[Any]] = {}
     names = sorted(statistics.materials)
     arrays["materials"] = np.array(names, dtype=np.str_)
-    lower = np.tril_indices(statistics.dimension)
+    dimension = statistics.dimension
+    lower = np.tril_indices(dimension)
     for scale in statistics.scales:
-        known = sorted({*names} & {*statistics.names(scale)})
+        known = statistics.names(scale)
         places = [names.index(name) for name in known]
-        counts = np.zeros(len(names), np.int64)
-        sums = np.zeros((len(names), statistics.dimension), np.int64)
-        counts[places] = statistics.counts(scale, known).sum(axis=1)
-        sums[places] = statistics.sums(scale, known).sum(axis=1)
-        second = np.zeros((statistics.dimension, statistics.dimension), np.int64)
-        second[lower] = statistics.total_second(scale)
+        counts, sums = np.zeros(len(names), np.int64), np.zeros((len(names), dimension), np.int64)
+        counts[places], sums[places] = statistics.totals(scale)
+        second = np.zeros((dimension, dimension), np.int64)
+        second[lower] = statistics.second(scale).packed()
         arrays |= {f"counts-{scale}": counts, f"sums-{scale}": sums}
         arrays[f"second-{scale}"] = second + np.tril(second, -1).T
     return arrays

@@ -185,11 +185,12 @@ class TestExport:
         with np.load(out / "statistics.npz") as arrays:
             assert arrays["materials"].tolist() == ["a", "b/ü", "c"]
             for scale in whole.memory.statistics.scales:
-                rows = [whole._extractor.features(whole_image(touch))[scale] for _, touch in left]
-                codes = np.concatenate([np.rint(np.asarray(one, float) * 2**20) for one in rows]).astype(np.int64)
+                found = [whole._extractor.codes(whole_image(touch), b"") for _, touch in left]
+                codes = np.concatenate([rows[scale] for rows in found if scale in rows]).astype(np.int64)
                 assert np.array_equal(arrays[f"second-{scale}"], codes.T @ codes)
                 assert np.array_equal(arrays[f"sums-{scale}"].sum(axis=0), codes.sum(axis=0))
                 assert arrays[f"counts-{scale}"].sum() == len(codes)
+                self.require_scores(arrays, about["touches"], whole.model().readouts[scale], codes[5])
         with (out / "exemplars.csv").open(newline="") as file:
             index = list(csv.DictReader(file))
         found = {}
@@ -198,6 +199,22 @@ class TestExport:
             readings = np.load(out / row["file"], allow_pickle=False)
             assert readings.shape == (60, 2)
         assert found == whole.exemplars
+
+    def require_scores(self, arrays, touches, readout, row):
+        """The scores of a row follow from the exported arrays, as `export_plain` says."""
+        known = arrays[f"counts-{readout.scale}"] > 0
+        counts, sums, second = (
+            arrays[f"{what}-{readout.scale}"].astype(float) for what in ("counts", "sums", "second")
+        )
+        means, d = sums[known] / counts[known, None], len(second)
+        scatter = second - means.T * counts[known] @ means
+        trace, squares = np.trace(scatter), np.square(scatter).sum()
+        share = ((1 - 2 / d) * squares + trace**2) / ((touches + 1 - 2 / d) * (squares - trace**2 / d))
+        share = min(max(share, 0.0001), 0.99)
+        solved = np.linalg.solve(scatter + share / (1 - share) * trace / d * np.eye(d), means.T)
+        scores = counts.sum() / (1 - share) * (row @ solved - (means.T * solved).sum(axis=0) / 2)
+        expected = readout.scores(row.astype(float), range(len(readout.names)), "lda")
+        assert np.allclose(np.diff(scores), np.diff(expected), rtol=1e-4)
 
     def test_nothing_is_written_over(self, path, tmp_path):
         (tmp_path / "out").mkdir()

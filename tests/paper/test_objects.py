@@ -100,21 +100,26 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     centres = rng.uniform(-0.5, 0.5, (30, 6))
     for i, centre in enumerate(centres):
         rows = centre + 0.05 * rng.standard_normal((5, 6))
-        statistics.add(f"m{i:02}", i % 3, {1: to_codes(rows, 1.0)})
+        statistics.add(f"m{i:02}", {1: to_codes(rows, 1.0)})
         shown[f"m{i:02}"] = {"bright": int(centre[0] > 0)}
     known = {name: value for name, value in shown.items() if name < "m20"}
     head = fit_heads(statistics, 1, known, ["bright"])["bright"]
     reported = [head(in_units(centre, 1.0)) for centre in centres[20:]]
     assert np.mean([item == shown[f"m{i + 20}"]["bright"] for i, item in enumerate(reported)]) >= 0.8
     # Leaving one out by the formula is leaving it out of the system.
-    gram = head.readout.gram[np.ix_(head.places, head.places)]
-    inverse = solve(gram, head.gamma).inverse
-    by_formula = head.weights[3] / inverse[3, 3]
-    others = np.delete(np.arange(21), 3)
-    system = np.linalg.inv(inverse)
+    counts, sums = statistics.totals(1)
+    means = sums[:20] / counts[:20, None] - head.origin
+    scatter = np.triu(statistics.scatter(1)) + np.triu(statistics.scatter(1), 1).T
+    gram = means @ np.linalg.solve(scatter + head.penalty * np.trace(scatter) / 6 * np.eye(6), means.T)
+    system = np.linalg.inv(solve(gram, head.gamma).inverse)
     targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)
-    left = np.linalg.solve(system[np.ix_(others, others)], np.append(np.delete(targets, 3, axis=0), [[0, 0]], axis=0))
-    assert targets[3] - system[3, others] @ left == pytest.approx(by_formula)
+    error = 0.0
+    for i in range(20):
+        others = np.delete(np.arange(21), i)
+        known_others = np.append(np.delete(targets, i, axis=0), [[0, 0]], axis=0)
+        left = np.linalg.solve(system[np.ix_(others, others)], known_others)
+        error += np.square(targets[i] - system[i, others] @ left).sum()
+    assert error == pytest.approx(head.error)
     with pytest.raises(InputError, match="observed was 1"):
         fit_heads(statistics, 1, {"m00": known["m00"]}, ["bright"])
 

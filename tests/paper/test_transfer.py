@@ -213,7 +213,7 @@ class TestAligning:
 
     def known(self, streams, **kind):
         found, names = vectors(1, **kind)
-        return Known(found, names, [stream.key for stream in streams])
+        return Known(found, names)
 
     def test_a_shifted_sensor_is_read_where_its_own_touches_standardise(self, streams):
         found, names = vectors(2, shift=40.0)

@@ -196,7 +196,7 @@ class Objects:
             graded[key] = {
                 "right": _share(truth, [heads[key](mean) for mean in means]),
                 "composed": _share(truth, composed),
-                "penalty": heads[key].readout.penalty,
+                "penalty": heads[key].penalty,
                 "gamma": heads[key].gamma,
                 **self._baselines(key, truth, tested, progress),
             }

@@ -1,9 +1,9 @@
 """Heads for objects never touched, over a memory's own statistics, with a λ that is chosen by leaving objects out.
 
-`compose` takes over the λ by which materials are classified, 0.03 of a feature's variance at most, so that describing
-costs no factorisation. Where objects are few and unlike each other a head wants a tamer one. Here both λ and γ (see
-`ridge.attributes`) are those of least squared error on the class means of objects left out, one by one: of a head that
-solves with B, the error of leaving object y out is α_y / B_yy, so no head is fitted twice.
+`compose` takes over the shrinkage by which materials are classified, so that describing costs no factorisation. Where
+objects are few and unlike each other a head wants a tamer one. Here both λ, the ridge beside the scatter within objects,
+and γ (see `readouts.attributes`) are those of least squared error on the class means of objects left out, one by one:
+of a head that solves with B, the error of leaving object y out is α_y / B_yy, so no head is fitted twice.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
-from scroll_tactile.readouts.readout import Readout, fit_readout
-from scroll_tactile.readouts.shrinkage import task_of
+from scroll_tactile.readouts.readout import Task, inverted
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
@@ -27,28 +26,28 @@ __all__ = ["PENALTIES", "UnseenHead", "fit_heads"]
 FloatArray = npt.NDArray[np.float64]
 
 PENALTIES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
-"""λ, as shares of a scaled feature's variance."""
+"""λ, as shares of a feature's mean variance within objects."""
 
 
 @dataclass(frozen=True)
 class UnseenHead:
     """A head for one attribute: how much speaks for each of its values.
 
-    values: V of them. readout: with the chosen λ, of all objects. places: of the K objects whose value is known.
-    weights: (α, b) of each value, shape (K + 1, V). gamma: the chosen γ. error: squared, of objects left out, summed.
+    values: V of them. origin: (d,), in the codes' unit. weights: (d, V) of features about it; offsets: (V,). penalty: the
+    chosen λ. gamma: the chosen γ. error: squared, of objects left out, summed.
     """
 
     values: tuple[int, ...]
-    readout: Readout
-    places: npt.NDArray[np.intp]
+    origin: FloatArray
     weights: FloatArray
+    offsets: FloatArray
+    penalty: float
     gamma: float
     error: float
 
     def __call__(self, mean: FloatArray) -> int:
         """The value that a touch feels like; mean: its mean features in the codes' unit, (d,). Ties go to the first."""
-        z = self.readout.project(mean)[self.places]
-        return self.values[int(np.argmax(z @ self.weights[:-1] + self.weights[-1]))]
+        return self.values[int(np.argmax((mean - self.origin) @ self.weights + self.offsets))]
 
 
 def fit_heads(
@@ -67,18 +66,22 @@ def fit_heads(
     known = {key: np.array([attributes[names[i]][key] for i in places]) for key in keys}
     best: dict[str, UnseenHead] = {}
     with one_thread():
-        task = task_of(statistics, scale)
+        task = Task.of(statistics, scale, names)
+        means = task.sums[places] / task.counts[places, None] - task.origin
+        variance = float(np.trace(task.scatter)) / len(task.origin)
         # From the tamest on: of equals the first stays.
         for penalty in sorted(PENALTIES, reverse=True):
-            readout = fit_readout(task, penalty)
-            gram = readout.gram[np.ix_(places, places)]
+            inverse = inverted(task.scatter + np.asfortranarray(penalty * variance * np.eye(len(task.origin))))
+            solved = means @ (np.triu(inverse) + np.triu(inverse, 1).T)
             for gamma in sorted(GAMMAS, reverse=True):
-                inverse = solve(gram, gamma).inverse
+                system = solve(solved @ means.T, gamma).inverse
                 for key, truth in known.items():
                     values = np.unique(truth)
-                    weights = inverse[:, :-1] @ (truth[:, None] == values).astype(np.float64)
-                    missed = weights[:-1] / np.diagonal(inverse)[:-1, None]
+                    weights = system[:, :-1] @ (truth[:, None] == values).astype(np.float64)
+                    missed = weights[:-1] / np.diagonal(system)[:-1, None]
                     error = float(np.square(missed).sum())
                     if key not in best or error < best[key].error:
-                        best[key] = UnseenHead(tuple(values.tolist()), readout, places, weights, gamma, error)
+                        answers = tuple(values.tolist())
+                        slopes = solved.T @ weights[:-1]
+                        best[key] = UnseenHead(answers, task.origin, slopes, weights[-1], penalty, gamma, error)
     return best

@@ -187,7 +187,7 @@ class SensorTransfer:
         for done, stream in enumerate(old.streams):
             vectors.append(self._features[kind](stream))
             progress(f"{kind} of {old.name}", done + 1, len(old))
-        return Known(np.array(vectors), list(old.materials), [stream.key for stream in old.streams])
+        return Known(np.array(vectors), list(old.materials))
 
     @cached_property
     def _kernels(self) -> Cached:

@@ -12,12 +12,12 @@ from scipy.linalg import cho_factor, cho_solve
 
 from examples.paper.transfer.shared_features import Features
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.shrinkage import Selection, select
+from scroll_tactile.readouts.readout import Readout, Task
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.statistics import Statistics, fold_of
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["Known", "MapsAcross", "OneReadout", "SharesPrior"]
 
@@ -33,11 +33,10 @@ _SPREAD = 0.3  # variance of one touch about its material's mean, as a share of 
 
 @dataclass(frozen=True)
 class Known:
-    """What was learned with the old sensor: features (N, d), their materials, and the keys of their streams."""
+    """What was learned with the old sensor: features (N, d) and their materials."""
 
     features: FloatArray
     materials: list[str]
-    keys: list[bytes]
 
     @cached_property
     def standardised(self) -> FloatArray:
@@ -48,7 +47,7 @@ class Known:
         """What the library keeps of the standardised features; `before` goes before the materials' names."""
         if before not in self._statistics:
             names = [before + name for name in self.materials]
-            self._statistics[before] = _statistics(self.standardised, names, self.keys)
+            self._statistics[before] = _statistics(self.standardised, names)
         return self._statistics[before]
 
     @cached_property
@@ -100,13 +99,11 @@ class _Touches:
         self.features = features
         self.vectors: list[FloatArray] = []
         self.materials: list[str] = []
-        self.keys: list[bytes] = []
 
     def observe(self, material: str, stream: Stream) -> None:
-        """See `Feeler.observe`."""
+        """See `FewTouchLearner.observe`."""
         self.vectors.append(self.features(stream))
         self.materials.append(material)
-        self.keys.append(stream.key)
         for name in ("fitted", "standard"):  # what rests on the touches, and is made anew when it is asked for
             self.__dict__.pop(name, None)
 
@@ -150,30 +147,29 @@ class OneReadout(_Touches):
             self._given = _Standard(unlabelled)
 
     def name_of(self, stream: Stream) -> str:
-        """See `Feeler.name_of`. Raises InputError where nothing was learned."""
-        selection, candidates = self.fitted
-        z = selection.readout.project(in_units(self._by(self.features(stream)), _BOUND))
-        scores = selection.readout.scores(z, "lda")[candidates]
-        return selection.names[candidates[int(scores.argmax())]]
+        """See `FewTouchLearner.name_of`. Raises InputError where nothing was learned."""
+        readout, candidates = self.fitted
+        codes = in_units(self._by(self.features(stream)), _BOUND)
+        return readout.names[candidates[int(readout.scores(codes, candidates, "lda").argmax())]]
 
     @property
     def _by(self) -> _Standard:
         return self._given or self.standard
 
     @cached_property
-    def fitted(self) -> tuple[Selection, list[int]]:
+    def fitted(self) -> tuple[Readout, list[int]]:
         """The readout, and the places of the materials that can be answered."""
         parts = []
         if self._known is not None:
             parts.append(self._known.statistics(_OLD if self._apart else ""))
         if self.vectors:
-            parts.append(_statistics(self._by(np.array(self.vectors)), self.materials, self.keys))
+            parts.append(_statistics(self._by(np.array(self.vectors)), self.materials))
         if not parts:
             raise InputError("expected touches to have been learned; there are none. Call observe first")
-        with one_thread():
-            selection = select(parts[0] if len(parts) == 1 else parts[0] + parts[1], WHOLE, "lda")
-        assert selection is not None
-        return selection, [i for i, name in enumerate(selection.names) if not name.startswith(_OLD)]
+        statistics = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+        names = statistics.names(WHOLE)
+        readout = Readout(Task.of(statistics, WHOLE, names), statistics)
+        return readout, [i for i, name in enumerate(names) if not name.startswith(_OLD)]
 
 
 class MapsAcross(_Touches):
@@ -190,7 +186,7 @@ class MapsAcross(_Touches):
         self._turned = turned
 
     def name_of(self, stream: Stream) -> str:
-        """See `Feeler.name_of`. Raises InputError before a touch was observed."""
+        """See `FewTouchLearner.name_of`. Raises InputError before a touch was observed."""
         mapped = self.standard(self.features(stream)) @ self.fitted
         means, weights = self._known.means, self._known.weights
         scores = mapped @ weights - np.einsum("cd,dc->c", means, weights) / 2
@@ -230,7 +226,7 @@ class SharesPrior(_Touches):
         self._likeness = likeness
 
     def name_of(self, stream: Stream) -> str:
-        """See `Feeler.name_of`. Raises InputError before a touch was observed."""
+        """See `FewTouchLearner.name_of`. Raises InputError before a touch was observed."""
         weights, offset = self.fitted
         return self.names[int((self.standard(self.features(stream)) @ weights - offset).argmax())]
 
@@ -267,11 +263,11 @@ def _means(features: FloatArray, materials: Sequence[str], names: Sequence[str])
     return np.stack([features[labels == name].mean(axis=0) for name in names])
 
 
-def _statistics(features: FloatArray, materials: Sequence[str], keys: Sequence[bytes]) -> Statistics:
+def _statistics(features: FloatArray, materials: Sequence[str]) -> Statistics:
     """Statistics of one scale, 0, of standardised features (N, d)."""
     statistics = Statistics(features.shape[1], (WHOLE,))
-    for vector, material, key in zip(features, materials, keys, strict=True):
-        statistics.add(material, fold_of(key), {WHOLE: to_codes(vector[None], _BOUND)})
+    for vector, material in zip(features, materials, strict=True):
+        statistics.add(material, {WHOLE: to_codes(vector[None], _BOUND)})
     return statistics
 
 

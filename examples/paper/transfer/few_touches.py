@@ -14,14 +14,13 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.readouts.shrinkage import Selection, select
+from scroll_tactile.readouts.readout import Readout, Task
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import in_units, to_codes
-from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.statistics import Statistics, fold_of
+from scroll_tactile.statistics.grid import in_units, mean_code, to_codes
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = [
     "COUNTS",
@@ -88,23 +87,23 @@ class WidestReadout:
     def __init__(self, features: WidestFeatures) -> None:
         self._features = features
         self._statistics = Statistics(features.embedding.dimension, (WHOLE,))
-        self._selection: Selection | None = None
+        self._readout: Readout | None = None
 
     def observe(self, material: str, stream: Stream) -> None:
-        """See `Feeler.observe`."""
+        """See `FewTouchLearner.observe`."""
         codes = to_codes(self._features(stream), self._features.embedding.bound)
-        self._statistics.add(material, fold_of(stream.key), {WHOLE: codes})
-        self._selection = None
+        mean = mean_code(codes.sum(axis=0, dtype=np.int64), len(codes)).astype(np.int32)
+        self._statistics.add(material, {WHOLE: mean[None]})
+        self._readout = None
 
     def name_of(self, stream: Stream) -> str:
-        """See `Feeler.name_of`. Raises InputError before anything was learned."""
-        with one_thread():
-            self._selection = self._selection or select(self._statistics, WHOLE, "lda")
-        if self._selection is None:
+        """See `FewTouchLearner.name_of`. Raises InputError before anything was learned."""
+        names = self._statistics.names(WHOLE)
+        if not names:
             raise InputError("expected a readout that has learned something; it has not. Call observe first")
+        self._readout = self._readout or Readout(Task.of(self._statistics, WHOLE, names), self._statistics)
         mean = in_units(self._features(stream), self._features.embedding.bound).mean(axis=0)
-        readout = self._selection.readout
-        return self._selection.names[int(readout.scores(readout.project(mean), "lda").argmax())]
+        return names[int(self._readout.scores(mean, range(len(names)), "lda").argmax())]
 
 
 class _LearnerFeeler:

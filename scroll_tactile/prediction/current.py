@@ -60,11 +60,9 @@ class CurrentModel:
             model = self._adopted(memory)
         elif behind:
             self._exact = False
-            followed = model is not None and behind is not None and not self._overdue(model, memory)
-            if not followed or not cast(Model, model).follow(memory, cast("list[Added]", behind)):
+            if not model.follow(memory, behind):
                 model = self._adopted(memory)
-            self._model, self._behind = model, []
-        assert model is not None
+        self._model, self._behind = model, []
         self.prepare(ledger)
         return model
 

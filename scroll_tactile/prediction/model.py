@@ -82,8 +82,9 @@ class Draft:
 
     def fit(self) -> Model:
         """Solve the readouts and calibrate them."""
-        readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
-        calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
+        with one_thread():
+            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+            calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
         give_back_scratch()
         return Model(self, readouts, calibrations, apart)
 

@@ -88,9 +88,7 @@ def calibrate(
     apart = {scale: left_out(readouts[scale], tasks[scale], sample, stages, kind) for scale in readouts}
     materials = [material for material, *_ in sample]
     return [
-        calibrate_stage(
-            stage, materials, [readouts[scale] for scale in scales], [apart[scale] for scale in scales], kind
-        )
+        calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
         for stage, scales in enumerate(stages)
         if all(scale in readouts for scale in scales)
     ], apart
@@ -110,9 +108,7 @@ def calibrate_stage(
     if not touches:
         return Calibration(prior, _assumed([readout for readout, _ in scales]), np.zeros(0))
     scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
-    distances = np.stack(
-        [_picked(left, left.distances, names, touches, stage).min(axis=1, initial=np.inf) for left in apart], axis=1
-    )
+    distances = np.stack([_picked(left, left.distances, names, touches, stage).min(axis=1) for left in apart], axis=1)
     own = {name: i for i, name in enumerate(names)}
     weights = fit_weights(scores, [own[materials[touch]] for touch in touches], prior)
     if len(distances) < FEWEST:

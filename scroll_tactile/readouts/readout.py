@@ -42,10 +42,8 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 """A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
-LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
-LEAST_RANK = 32
 FIRST_KNOWN = 256  # materials
-FEW = 8  # rows that are solved for one by one: half of the time of a product of matrices
+MOST_HELD = 4 * EAGER  # then those that were asked for are let go
 
 
 @dataclass(frozen=True)
@@ -120,25 +118,16 @@ class Readout:
         # Of single touches there is no scatter: then the nearest mean answers.
         spread = trace / dimension * self.share / (1 - self.share)
         self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
-        scatter[np.diag_indices(dimension)] += self.penalty
-        room = max(LEAST_RANK, dimension // LARGEST_RANK)
-        self._rank = 0
-        self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
-        self._inner = np.empty((room, room))  # E
-        self._largest = 1.0  # entry of what E is the inverse of
-        self._held: dict[int, int] = {}  # place → row of the next three
-        self._means = np.empty((0, dimension))
-        self._solved = np.empty((0, dimension))  # K⁻¹ m
-        self._crossed = np.empty((room, 0))  # U K⁻¹ m
-        self._derived: _Derived | None = None
+        matrix[np.diag_indices(dimension)] += self.penalty
+        self._held: dict[int, int] = {}  # place → row of these
+        self._means = self._solved = np.empty((0, dimension))  # m about the origin, and K⁻¹ m
+        self._sizes = np.empty(0)  # mᵀ K⁻¹ m
+        self._derived: Derived | None = None
+        self._coarse: Coarse | None = None
+        self._compared: tuple[FloatArray, FloatArray, FloatArray] | None = None
         with one_thread():
             self.system = System(matrix)
             self._hold(places, means)
-
-    @property
-    def crowded(self) -> bool:
-        """Whether half of the columns have come that may come before it has to be solved again."""
-        return 2 * self._rank > len(self._u)
 
     @property
     def gamma(self) -> float:
@@ -151,26 +140,48 @@ class Readout:
         counts = self.counts[self.reference]
         return np.asarray(counts / counts.sum())
 
+    @property
+    def crowded(self) -> bool:
+        """Whether half of the columns have come that may come before it has to be solved again."""
+        return self.system.rank > self.system.room
+
     def means_solved(self) -> tuple[FloatArray, FloatArray]:
         """The means of the reference materials about the origin, and K⁻¹ times them, each of shape (R, d)."""
         count = len(self.reference)
         return self._means[:count], self._solved[:count]
 
     def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
-        """Keep the means of more places, shape (k, d), and what follows from them."""
-        solved = self.solve(means)
-        crossed = np.zeros((len(self._u), len(means)))
-        crossed[: self._rank] = self._u[: self._rank] @ solved.T
+        """Hold more materials, whose means about the origin are these, shape (k, d)."""
+        solved, first = self.system.solve(means), len(self._means)
         # All of it before any is kept: there may be no memory for it.
-        more = np.vstack([self._means, means]), np.vstack([self._solved, solved]), np.hstack([self._crossed, crossed])
-        held = {int(place): len(self._means) + i for i, place in enumerate(places)}
-        self._means, self._solved, self._crossed = more
-        self._held |= held
-        self._derived = None
+        more = np.vstack([self._means, means]), np.vstack([self._solved, solved])
+        sizes = np.append(self._sizes, np.einsum("hd,hd->h", means, solved))
+        (self._means, self._solved), self._sizes = more, sizes
+        self._held |= {int(place): first + i for i, place in enumerate(places)}
+
+    def held(self, places: Sequence[int] | Places) -> Places:
+        """Where the materials at some places are held; those that were not are from now on."""
+        absent = [int(place) for place in places if int(place) not in self._held]
+        if absent:
+            if len(self._held) + len(absent) > MOST_HELD:
+                self._let_go()
+                absent = [int(place) for place in places if int(place) not in self._held]
+            names = [self.names[place] for place in absent]
+            counts, sums = self._statistics.counts(self.scale, names), self._statistics.sums(self.scale, names)
+            with one_thread():
+                self._hold(absent, _class_means(counts, sums, self.origin))
+        return np.array([self._held[int(place)] for place in places], dtype=np.intp)
+
+    def _let_go(self) -> None:
+        count = len(self.reference)
+        self._held = {int(place): i for i, place in enumerate(self.reference)}
+        self._means, self._solved, self._sizes = self._means[:count], self._solved[:count], self._sizes[:count]
 
     def follow(self, changes: Sequence[Change]) -> bool:
-        """Take in touches, in the order they came, that the statistics have already; False where it has to be solved
-        again: they are too many, they outweigh what it was solved from, or a material went.
+        """Take in touches, in the order they came, that the statistics have already.
+
+        Returns False where all has to be solved again: they are too many, outweigh what it was solved from, or a
+        material went.
         """
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
@@ -182,11 +193,8 @@ class Readout:
                 before = 0.0 if place is None else self.counts[place]
                 if sign < 0 and before <= len(rows):
                     return False
-                if place is None:
-                    place = self._new_place(material)
-                self._follow(place, rows - self.origin, sign, before)
-        self._derived = None
-        return bool(self._largest * np.abs(self.inner()).max(initial=0.0) <= LARGEST_CONDITION)
+                self._follow(self._new_place(material) if place is None else place, rows - self.origin, sign, before)
+        return self.system.sound
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
@@ -226,19 +234,17 @@ class Readout:
         if self._coarse is not None:
             self._coarse.put(place, self._means[held], self._sizes[held])
 
-    def _border(self, cross: FloatArray, sign: int) -> None:
-        """Border E, the inverse of D + U K⁻¹ Uᵀ, by the last columns of that matrix without D, shape (r + k, k)."""
-        first, last = self._rank, len(cross)
-        self._largest = max(self._largest, float(np.abs(cross).max(initial=0.0)))
-        inner, above = self._inner[:first, :first], cross[:first]
-        onto = inner @ above
-        corner = np.linalg.inv(cross[first:] + sign * np.eye(last - first) - above.T @ onto)
-        corner = (corner + corner.T) / 2
-        beside = -onto @ corner
-        inner -= beside @ onto.T
-        self._inner[:first, first:last], self._inner[first:last, :first] = beside, beside.T
-        self._inner[first:last, first:last] = corner
-        self._rank = last
+    def _border(self, columns: FloatArray, sign: int) -> FloatArray:
+        """Take columns into K; returns K⁻¹ times them, shape (k, d)."""
+        if not len(columns):
+            return columns
+        leaving, corner = self.system.border(columns, sign)
+        onto = self._means @ leaving.T
+        self._solved -= (onto @ corner) @ leaving
+        self._sizes -= np.einsum("hk,kl,hl->h", onto, corner, onto)
+        if self._coarse is not None:
+            self._coarse.border(leaving, corner)
+        return np.asarray(leaving - (columns @ leaving.T) @ corner @ leaving)
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
@@ -265,17 +271,13 @@ class Readout:
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
         """The scores of materials as weights (d, k) of codes about the origin, and offsets (k,); see `scores`."""
-        places, derived = [self.places[name] for name in names], self.derived()
-        held = derived.reference if kind == "ridge" else self.held(places)
-        moved = self._crossed[: self._rank, held].T @ (derived.inner @ self._v[: self._rank])
-        weights = self.gamma * (self._solved[held] - moved).T
+        held = self.held([self.places[name] for name in names])
         if kind == "lda":
-            return weights, -self.derived().sizes[held] / 2
-        rank = {int(place): i for i, place in enumerate(self.reference)}
-        background = derived.background[[rank[place] for place in places]]
+            return self.gamma * self._solved[held].T, -self.gamma * self._sizes[held] / 2
+        derived, weights = self.derived(), self.gamma * self._solved[: len(self.reference)].T
+        background = derived.background[held]
         mixing = background - np.outer(background.sum(axis=1), self.shares)
-        shares = self.shares[[rank[place] for place in places]]
-        return weights @ mixing.T, np.asarray(shares - background @ derived.towards)
+        return weights @ mixing.T, np.asarray(self.shares[held] - background @ derived.towards)
 
     def centred(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about their mean, shape (R,)."""

@@ -22,6 +22,9 @@ FloatArray = npt.NDArray[np.float64]
 
 LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
+# Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much
+# louder than all before, or one retracted on which the scatter rests, have K inverted again, that scores keep their 1e-9.
+LARGEST_CONDITION = 256.0
 FEW = 8  # rows that are solved for one by one: half of the time of a product of matrices
 
 
@@ -60,7 +63,14 @@ class System:
         room = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
         self._e = np.empty((room, room))
+        self._largest = 1.0  # entry of what E is the inverse of
         self.rank = 0
+
+    @property
+    def sound(self) -> bool:
+        """Whether what came does not outweigh what K was made of."""
+        largest = float(np.abs(self._e[: self.rank, : self.rank]).max(initial=0.0))
+        return self._largest * largest <= LARGEST_CONDITION
 
     @property
     def room(self) -> int:
@@ -90,6 +100,7 @@ class System:
         solved = self._solve_first(columns)
         self._u[first:last], self._v[first:last] = columns, solved
         cross = self._u[:last] @ solved.T
+        self._largest = max(self._largest, float(np.abs(cross).max(initial=0.0)))
         e, above = self._e[:first, :first], cross[:first]
         onto = e @ above
         corner = np.linalg.inv(cross[first:] + sign * np.eye(last - first) - above.T @ onto)

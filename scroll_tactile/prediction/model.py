@@ -84,7 +84,7 @@ class Draft:
         """Solve the readouts and calibrate them."""
         with one_thread():
             readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
-            calibrations, apart = calibrate(self.sample, self.stages, self.tasks, readouts, self.kind)
+            calibrations, apart = calibrate(self.sample, self.stages, readouts, self.kind)
         give_back_scratch()
         return Model(self, readouts, calibrations, apart)
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, ReadoutName, Task
+from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.system import contrasts
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
@@ -50,10 +50,8 @@ class LeftOut:
     distances: FloatArray
 
 
-def left_out(
-    readout: Readout, task: Task, sample: Sampled, stages: Sequence[Sequence[Scale]], kind: ReadoutName
-) -> LeftOut:
-    """Leave each sampled touch out of the readout of a scale that was just made of a task.
+def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], kind: ReadoutName) -> LeftOut:
+    """Leave each sampled touch out of the readout of a scale, which has followed nothing yet.
 
     stages: the scales that judge at each stage, ascending. Touches of materials that have no others are not there.
     """
@@ -74,7 +72,7 @@ def left_out(
             groups.setdefault(len(judged), []).append((number, at, rows, weight, own[material]))
     index: dict[tuple[int, int], int] = {}
     parts = []
-    leaving = _Leaving(readout, task, kind) if groups else None
+    leaving = _Leaving(readout, kind) if groups else None
     for members in groups.values():
         for number, at, *_ in members:
             for stage in at:
@@ -87,99 +85,97 @@ def left_out(
 
 
 class _Leaving:
-    """Takes touches out of one readout; all of M touches with k rows each, shape (M, k, d), at once."""
+    """Takes touches out of one readout that was just made; all of M touches with k rows each at once.
 
-    def __init__(self, readout: Readout, task: Task, kind: ReadoutName) -> None:
-        from scipy.linalg.lapack import dpotrf
+    All products are taken between whitened vectors, L⁻¹ x with K = L Lᵀ. Those of T follow from them (Woodbury): with
+    B = √(N p_y) (m_y − μ) whitened and A Aᵀ = I + B Bᵀ, xᵀ T⁻¹ y = x·y − (A⁻¹ B x)·(A⁻¹ B y).
+    """
 
+    def __init__(self, readout: Readout, kind: ReadoutName) -> None:
         self.readout, self.kind = readout, kind
         self.derived = readout.derived()
-        self.means, self.solved = readout.means_solved()
+        means, _ = readout.means_solved()
         self.counts = readout.counts[readout.reference]
         self.total = float(self.counts.sum())
-        self.center = readout.shares @ self.means
         # The whole is that of the reference materials alone, weighed as if they were all.
         self.excess = float(readout.counts.sum()) / self.total
-        spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
         with one_thread():
-            system = task.scatter + np.asfortranarray(spread.T @ spread)
-            system[np.diag_indices(len(system))] += readout.penalty
-            self.factor, failed = dpotrf(system, lower=0, overwrite_a=1)
-        if failed:
-            raise np.linalg.LinAlgError(f"the scatter of the whole is not positive definite at row {failed}")
+            self.means = readout.system.whiten(means)
+            self.center = readout.shares @ self.means
+            spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
+            factor = np.linalg.cholesky(spread @ spread.T + np.eye(len(spread)))
+            self.onto_spread = np.linalg.solve(factor, spread)
 
     def out(
         self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, each of shape (M·k, R), of rows about the origin.
+        """Scores, z and distances, each of shape (M·k, R), of rows about the origin, shape (M, k, d).
 
         weights: the rows of the statistics that each touch stands for, shape (M,). own: its material among the
         reference, shape (M,).
         """
         touches, count, dimension = rows.shape
         with one_thread():
-            solved = self.readout.system.solve(rows.reshape(-1, dimension)).reshape(rows.shape)
+            white = self.readout.system.whiten(rows.reshape(-1, dimension)).reshape(rows.shape)
             counts = self.counts[own]
-            mean = np.sqrt(weights * counts / (counts - weights))[:, None]
+            stretch = np.sqrt(weights * counts / (counts - weights))[:, None]
             share = np.sqrt(weights / count)[:, None, None]
-            columns = _columns(rows, share, mean * (rows.mean(axis=1) - self.means[own]))
-            outer = _columns(solved, share, mean * (solved.mean(axis=1) - self.solved[own]))
-            crossed = columns @ outer.transpose(0, 2, 1)
-            inner = np.linalg.inv(crossed - np.eye(count))
-            onto = rows @ outer.transpose(0, 2, 1)  # U K⁻¹ p of the rows, (M, k, columns)
-            classes = np.einsum("nid,rd->nri", outer, self.means, optimize=True)  # and of the means, (M, R, columns)
+            columns = _columns(white, share, stretch * (white.mean(axis=1) - self.means[own]))
+            inner = np.linalg.inv(columns @ columns.transpose(0, 2, 1) - np.eye(count))
+            onto = white @ columns.transpose(0, 2, 1)  # U K⁻¹ p of the rows, (M, k, columns)
+            classes = (columns @ self.means.T).transpose(0, 2, 1)  # and of the means, (M, R, columns)
             onto_inner, classes_inner = onto @ inner, classes @ inner
-            z = rows @ self.solved.T - onto_inner @ classes.transpose(0, 2, 1)
-            sizes = np.einsum("rd,rd->r", self.means, self.solved) - np.einsum("nri,nri->nr", classes, classes_inner)
+            z = white @ self.means.T - onto_inner @ classes.transpose(0, 2, 1)
+            sizes = np.square(self.means).sum(axis=1) - np.einsum("nri,nri->nr", classes, classes_inner)
             i = np.arange(touches)
             change = np.sqrt(weights / (counts * (counts - weights)))
             z[i, :, own] += change[:, None] * onto_inner[:, :, -1]
             sizes[i, own] += 2 * change * classes_inner[i, own, -1] - np.square(change) * (1 + inner[:, -1, -1])
-            length = np.einsum("nkd,nkd->nk", rows, solved) - np.einsum("nki,nki->nk", onto, onto_inner)
-            whole, leverage = self._whole(rows, weights, own, share)
+            length = np.square(white).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto_inner)
+            whole, leverage = self._whole(white, columns, weights, share)
         gamma = self.readout.gamma
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
-        scores = lda if self.kind == "lda" else self._ridge(rows, own, leverage)
+        scores = lda if self.kind == "lda" else self._ridge(white, own, leverage)
         return tuple(part.reshape(touches * count, -1) for part in (scores, centred, distances))  # type: ignore[return-value]
 
     def _whole(
-        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp], share: FloatArray
+        self, white: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The squared length of each row about the mean of all under T without its touch, (M, k), and B, (M, k, k)."""
-        from scipy.linalg.lapack import dtrtrs
+        """The squared length of each row about the mean of all under T without its touch, (M, k), and B, (M, k, k).
 
-        _, count, dimension = rows.shape
-        half = dtrtrs(self.factor, (rows - self.center).reshape(-1, dimension).T, lower=0, trans=1)[0].T
-        half = np.ascontiguousarray(half).reshape(rows.shape)
-        middle = half.mean(axis=1)
+        leaving: the columns that leave K, whitened, shape (M, k, d).
+        """
+        count, half = white.shape[1], white - self.center
         rest = (self.total - weights)[:, None]
+        middle = half.mean(axis=1)
         columns = np.sqrt(self.excess) * _columns(half, share, np.sqrt(weights[:, None] * self.total / rest) * middle)
         signs = -np.ones(count)
         if self.excess > 1:
-            apart = dtrtrs(self.factor, (self.means - self.center).T, lower=0, trans=1)[0].T[own]
-            counts = self.counts[own]
-            way = np.sqrt(weights * counts / (counts - weights))[:, None] * (middle - apart)
-            columns = np.concatenate([columns, np.sqrt(self.excess - 1) * _columns(half, share, way)], axis=1)
+            columns = np.concatenate([columns, np.sqrt(self.excess - 1) * leaving], axis=1)
             signs = np.repeat([-1.0, 1.0], count)
-        inner = np.linalg.inv(columns @ columns.transpose(0, 2, 1) + np.diag(signs))
         moved = half + (weights[:, None] / rest * middle)[:, None, :]
-        onto = moved @ columns.transpose(0, 2, 1)
-        whole = np.einsum("nkd,nkd->nk", moved, moved) - np.einsum("nki,nki->nk", onto, onto @ inner)
-        leverage = np.square(share) * (half @ half.transpose(0, 2, 1) + 1 / self.total)
-        return whole, leverage
+        inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
+        onto = self._products(moved, columns)
+        length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
+        whole = length - np.einsum("nki,nki->nk", onto, onto @ inner)
+        return whole, np.square(share) * (self._products(half, half) + 1 / self.total)
 
-    def _ridge(self, rows: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray) -> FloatArray:
-        z = self.readout.gamma * (rows @ self.solved.T)
+    def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """xᵀ T⁻¹ y of whitened vectors, shape (M, a, b)."""
+        near = left @ self.onto_spread.T, right @ self.onto_spread.T
+        return np.asarray(left @ right.transpose(0, 2, 1) - near[0] @ near[1].transpose(0, 2, 1))
+
+    def _ridge(self, white: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray) -> FloatArray:
+        z = self.readout.gamma * (white @ self.means.T)
         z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
         fitted = self.readout.shares + z @ self.derived.background
         targets = np.zeros_like(fitted)
         targets[np.arange(len(own)), :, own] = 1.0
-        return np.asarray(np.linalg.solve(np.eye(rows.shape[1]) - leverage, fitted - leverage @ targets))
+        return np.asarray(np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - leverage @ targets))
 
 
 def _columns(rows: FloatArray, share: FloatArray, way: FloatArray) -> FloatArray:
     """The contrasts of the rows of each touch and its way, shape (M, k, d)."""
-    own = contrasts(rows.shape[1])
-    return np.concatenate([share * (own @ rows), way[:, None]], axis=1)
+    return np.concatenate([share * (contrasts(rows.shape[1]) @ rows), way[:, None]], axis=1)

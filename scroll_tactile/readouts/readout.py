@@ -75,7 +75,7 @@ class Task:
 
     @cached_property
     def scatter(self) -> FloatArray:
-        """S_w, shape (d, d), upper triangle in Fortran's order."""
+        """S_w, shape (d, d): the lower triangle."""
         return within_scatter(self.packed, self.counts, self.sums)
 
     @property
@@ -109,7 +109,7 @@ class Readout:
         self.origin = task.origin
         self.counts = task.counts.astype(np.float64)
         self._statistics = statistics
-        matrix = task.scatter.copy(order="F")
+        matrix = task.scatter.copy()
         trace, dimension = float(np.trace(matrix)), len(matrix)
         self.share = shrinkage(matrix, task.touches) if trace > 0 else 0.0
         all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)

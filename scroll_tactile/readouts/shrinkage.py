@@ -22,12 +22,12 @@ LEAST, LARGEST = 1e-4, 0.99
 
 
 def shrinkage(scatter: npt.NDArray[np.float64], touches: int) -> float:
-    """ρ of a scatter in any unit, shape (d, d), of which the upper triangle is read, made of so many touches."""
+    """ρ of a scatter in any unit, shape (d, d), of which the lower triangle is read, made of so many touches."""
     dimension = len(scatter)
     diagonal = np.diagonal(scatter)
     trace = float(diagonal.sum())
-    above = sum(float(column[:i] @ column[:i]) for i, column in enumerate(scatter.T))  # no copy of 8 MB
-    squares = 2.0 * above + float(diagonal @ diagonal)
+    below = sum(float(row[:i] @ row[:i]) for i, row in enumerate(scatter))  # no copy of 8 MB
+    squares = 2.0 * below + float(diagonal @ diagonal)
     spread = squares - trace**2 / dimension  # zero where S is a multiple of the identity already
     if not spread > 0:
         return LARGEST

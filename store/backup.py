@@ -72,7 +72,7 @@ def _copy_tree(source: Path, target: Path) -> None:
         if entry.is_dir():
             _copy_tree(entry, target / entry.name)
         else:
-            shutil.copyfile(entry, target / entry.name)
+            (target / entry.name).write_bytes(entry.read_bytes())
 
 
 def _verify(source: Path, draft: Path, progress: Progress | None) -> None:

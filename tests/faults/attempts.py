@@ -38,6 +38,8 @@ class Attempt:
         if start is None:
             return
         copied(start, path)
+        for copy in path.parent.glob(f"{path.name}-copy-*"):
+            shutil.rmtree(copy)
         path.parent.mkdir(exist_ok=True)
         if operation[0] != "open":
             self.learner = opened(path)

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from faults import shim as watch
 from faults.attempts import SUCCESS, Attempt, Trials
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, State, after, opened, warm
+from faults.model import Operation, State, after, opened, unsound_copies, warm
 from faults.plans import prepare
 from faults.shim import Shim
 
@@ -43,6 +43,7 @@ OPERATIONS: dict[str, Operation] = {
     "merge": ("merge", "plain", "twice"),
     "merge of one compacted": ("merge", "compacted", "twice"),
     "fine_tune": ("fine_tune",),
+    "backup": ("backup",),
     "compact": ("compact", 0),
     "close": ("close",),
     "open": ("open",),
@@ -102,6 +103,7 @@ class Bench(Trials):
         """With the fault over: nothing was changed by what was refused, and it can be done."""
         if attempt.changes_nothing and not (outcome == SUCCESS and attempt.operation[0] == "open"):
             attempt.learner = opened(attempt.path)
+        self.failures += [f"{where}: {what}" for what in unsound_copies(attempt.path, [self.ground])]
         self.require(f"{where}: after {outcome}", attempt.learner, [self.then(attempt, outcome)])
         if outcome != SUCCESS and not attempt.changes_nothing:
             if (again := self.outcome(where, attempt.do)) != SUCCESS:
@@ -160,7 +162,7 @@ def from_now_on(bench: Bench, path: Path, name: str, error: int, allowed: tuple[
         told = f"{name}: {operation_name}"
         attempt = bench.ready(path, operation)
         with warnings_told(lambda text: None):
-            shim.arm(path, watch.FAIL, watch.WRITES, first=1, last=watch.FOREVER, error=error)
+            shim.arm(path.parent, watch.FAIL, watch.WRITES, first=1, last=watch.FOREVER, error=error)
             outcome = bench.outcome(told, attempt.do)
             shim.disarm()
             if outcome not in allowed:

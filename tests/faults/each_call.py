@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from faults import shim as watch
 from faults.attempts import NEVER, SUCCESS, Attempt, Trials, copied
 from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, Other, State, after, one_scale, opened, perform, warm
+from faults.model import Operation, Other, State, after, one_scale, opened, perform, unsound_copies, warm
 from faults.plans import prepare
 from faults.shim import Shim
 from faults.zygote import Zygote
@@ -65,6 +65,7 @@ HISTORY: tuple[tuple[str, Operation, int], ...] = (
     ("merge", ("merge", "taken", "twice", "theirs"), NEVER),
     ("merge of one compacted", ("merge", "compacted", "twice", "theirs"), NEVER),
     ("fine-tune", ("fine_tune",), NEVER),
+    ("backup", ("backup",), NEVER),
     ("compact all but 3", ("compact", 3), NEVER),
     ("", ("observe", "b", (3, 60)), NEVER),
     ("compact", ("compact", 0), NEVER),
@@ -180,6 +181,7 @@ class Trial(Trials):
                 self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then])
         if step.operation[0] == "close" or attempt.learner is None:
             attempt.learner = opened(self.path)
+        self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [step.before])]
         state = step.then if outcome.startswith(SUCCESS) else step.before
         self.require(f"{where}: the learner, after {outcome}", attempt.learner, [state])
         self._finish(where, step, attempt.learner, state, number)
@@ -230,6 +232,7 @@ class Trial(Trials):
         return True
 
     def _recovers(self, where: str, step: Step, number: int) -> None:
+        self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [step.before])]
         learner = opened(self.path)
         state = self.require(f"{where}: opened again", learner, [step.before, step.then])
         step.outcomes["found as after" if state is step.then and step.then != step.before else "found as before"] += 1

@@ -26,7 +26,7 @@ from hypothesis.stateful import (
 from touches import SMALL, SmallSample, contents, fed, stream
 
 from faults.common import parser, progress, run
-from faults.model import MATERIALS, State, after, expected, opened, perform, seen
+from faults.model import MATERIALS, State, after, expected, opened, perform, seen, unsound_copies
 from faults.plans import KINDS, draw, prepare, touch
 from scroll_tactile.errors import StreamError
 from scroll_tactile.statistics.statistics import Statistics
@@ -61,6 +61,7 @@ class History(RuleBasedStateMachine):
     @rule(kind=st.sampled_from(KINDS), rng=randoms)
     def change(self, kind: str, rng: Any) -> None:
         self.do(draw(rng, self.state, self.others, kind))
+        assert unsound_copies(self.path, [self.state]) == []
 
     @rule(rng=randoms)
     def fail_in_a_batch(self, rng: Any) -> None:

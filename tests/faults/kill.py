@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, Other, State, after, opened, perform, seen, settle, warm
+from faults.model import Operation, Other, State, after, opened, perform, seen, settle, unsound_copies, warm
 from faults.plans import KINDS, history, prepare
 from faults.zygote import Child, Zygote
 
@@ -148,6 +148,8 @@ class Killing:
         try:
             with warnings_told(self.failures.append), opened(self.path, mode) as learner:
                 self._settle(seen(learner), f"{where}, opened to {mode}")
+            # It was the last that the child did, if at all.
+            self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [self.state])]
         except Exception as error:
             self.failures.append(f"{where}, opened to {mode}: {error!r}")
         self.counts[f"opened afterwards to {mode}"] += 1

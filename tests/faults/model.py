@@ -2,14 +2,17 @@
 
 An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
 ("forget", material), ("describe", material, constituents or None), ("merge", name, shared), ("compact", keep),
-("fine_tune",). `after` says what it makes of a `State` and what the call returns, `perform` does it to a learner, and
-`expected` is what can be seen of a learner in that state: made anew, in memory, from the touches in another order.
+("fine_tune",), ("backup",). `after` says what it makes of a `State` and what the call returns, `perform` does it to a
+learner, and `expected` is what can be seen of a learner in that state: made anew, in memory, from the touches in
+another order.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import shutil
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +25,7 @@ from touches import PAD, SETTINGS, SmallSample, fed, stream
 import scroll_tactile.memory.state
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
+from store import check_store
 
 MATERIALS = ("a", "b", "c", "ü")
 LENGTHS = (9, 16, 25, 40, 60, 90, 90)  # the widest scale needs 37, a fine-tune some of two materials
@@ -214,6 +218,10 @@ def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
     return replace(state, tuned=state.pairs, tuned_upto=state.last), digest
 
 
+def _backup(state: State, _: Any) -> tuple[State, Any]:
+    return state, None
+
+
 _AFTER = {
     "observe": _observe,
     "batch": _batch,
@@ -223,6 +231,7 @@ _AFTER = {
     "merge": _merge,
     "compact": _compact,
     "fine_tune": _fine_tune,
+    "backup": _backup,
 }
 
 
@@ -249,6 +258,11 @@ def _do_merge(learner: TactileLearner, home: Path, name: str, shared: Any, descr
     return [merged.observations, merged.shared, merged.described]
 
 
+def _do_backup(learner: TactileLearner, _: Path) -> None:
+    store = learner._ledger.store
+    store.backup(store.path.with_name(f"{store.path.name}-copy-{time.time_ns()}"))
+
+
 _CALLS = {
     "observe": _do_observe,
     "batch": _do_batch,
@@ -258,7 +272,24 @@ _CALLS = {
     "merge": _do_merge,
     "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,
     "fine_tune": lambda learner, _: learner.fine_tune(epochs=1).digest,
+    "backup": _do_backup,
 }
+
+
+def unsound_copies(path: Path, states: Sequence[State]) -> list[str]:
+    """What is wrong with the backups that there are of a memory: each must be whole, and in one of the states.
+
+    They are removed, and so is what was cut short.
+    """
+    wrong = []
+    for copy in sorted(path.parent.glob(f"{path.name}-copy-*")):
+        if not copy.name.endswith(".partial"):
+            wrong += [f"a backup: {problem.what}" for problem in check_store(copy) if problem.kind != "leftover"]
+            with opened(copy, "read") as learner:
+                if settle(seen(learner), states)[0] is None:
+                    wrong.append(f"{copy.name} is a backup of no state that there was")
+        shutil.rmtree(copy)
+    return wrong
 
 
 def seen(learner: TactileLearner) -> dict[str, Any]:

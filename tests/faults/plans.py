@@ -9,7 +9,7 @@ from touches import stream
 
 from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
 
-KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune")
+KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune", "backup")
 
 # Few touches, so that the same stream is observed again, by this memory and by those merged into it.
 SEEDS = 6

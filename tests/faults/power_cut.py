@@ -27,7 +27,20 @@ import scroll_tactile.memory.ledger
 from faults import shim as watch
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.disks import STYLES, Disk, Event, events
-from faults.model import Operation, Other, State, after, expected, one_scale, opened, perform, seen, settle, warm
+from faults.model import (
+    Operation,
+    Other,
+    State,
+    after,
+    expected,
+    one_scale,
+    opened,
+    perform,
+    seen,
+    settle,
+    unsound_copies,
+    warm,
+)
 from faults.plans import KINDS, draw, history, prepare
 from faults.shim import Shim
 
@@ -146,6 +159,12 @@ class Cutting:
         state = None
         try:
             with warnings_told(lambda text: self.failures.append(f"{where}: warned {text}")):
+                made = sum(operation == ("backup",) for operation in recorded.operations[: number + done])
+                there = len([path for path in to.glob("*-copy-*") if not path.name.endswith(".partial")])
+                if there - made not in (0, operation == ("backup",)):
+                    self.failures.append(f"{where}: {there} backups are there of {made} that were acknowledged")
+                wrong = unsound_copies(to / "memory", recorded.states[: number + 1])
+                self.failures += [f"{where}: {what}" for what in wrong]
                 state = self._opens(where, to / "memory", candidates)
         except Exception as error:
             self.failures.append(f"{where}: {error!r}")

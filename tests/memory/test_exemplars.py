@@ -172,7 +172,7 @@ def test_negative_numbers_are_refused(available, capacity):
 # --- candidates ---
 
 
-def exemplar(material, number, scale=1):
+def exemplar(material, number, scale=40):
     """A stream of two readings of four bytes; number gives its key."""
     code = np.random.default_rng([number, ord(material[0])]).integers(-LARGEST, LARGEST, 3).astype(np.int32)
     packed = pack_readings(np.full((2, 1), number, np.float32))

@@ -12,8 +12,9 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Augmented, Joined, Kernels, Maps, Robust, Sensor, TactileLearner, Vision
+from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
-from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from store import DamageError, Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
@@ -138,6 +139,24 @@ def test_another_embedding_under_the_same_configuration_is_found_out_at_the_firs
             with pytest.raises(EmbeddingMismatchError, match="Features of one mean nothing to the other"):
                 use(touch(0))
         assert learner.materials == {}
+
+
+MADE = [make() for make in EMBEDDINGS.values()] + [
+    Joined(Kernels(dimension=64), Maps(layout=(3,))),
+    Robust(Maps(layout=(3,))),
+    Vision(weights=None, seed=0),
+]
+
+
+@pytest.mark.parametrize("embedding", MADE, ids=repr)
+def test_what_follows_from_readings_on_any_machine_is_known_without_making_it(embedding):
+    identity = Identity.of(PAD, embedding, None)
+    assert identity.embedding.bare == capabilities_of(embedding).exact
+    assert AbsentEmbedding(identity, None).capabilities.exact == capabilities_of(embedding).exact
+
+
+def test_exact_are_kernels_and_what_is_made_of_them():
+    assert [capabilities_of(embedding).exact for embedding in MADE] == [True, True, True, False, True] + [False] * 3
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.readouts.attributes import solve
+from scroll_tactile.readouts.readout import Task
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.statistics import Statistics
@@ -109,7 +110,8 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     # Leaving one out by the formula is leaving it out of the system.
     counts, sums = statistics.totals(1)
     means = sums[:20] / counts[:20, None] - head.origin
-    scatter = np.triu(statistics.scatter(1)) + np.triu(statistics.scatter(1), 1).T
+    upper = Task.of(statistics, 1, statistics.names(1)).scatter
+    scatter = np.triu(upper) + np.triu(upper, 1).T
     gram = means @ np.linalg.solve(scatter + head.penalty * np.trace(scatter) / 6 * np.eye(6), means.T)
     system = np.linalg.inv(solve(gram, head.gamma).inverse)
     targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)

@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
-from scroll_tactile.readouts.readout import Task, inverted
+from scroll_tactile.readouts.readout import Task
+from scroll_tactile.readouts.system import System
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
@@ -71,8 +72,8 @@ def fit_heads(
         variance = float(np.trace(task.scatter)) / len(task.origin)
         # From the tamest on: of equals the first stays.
         for penalty in sorted(PENALTIES, reverse=True):
-            inverse = inverted(task.scatter + np.asfortranarray(penalty * variance * np.eye(len(task.origin))))
-            solved = means @ (np.triu(inverse) + np.triu(inverse, 1).T)
+            ridge = penalty * variance * np.eye(len(task.origin))
+            solved = System(np.asfortranarray(task.scatter + ridge)).solve(means)
             for gamma in sorted(GAMMAS, reverse=True):
                 system = solve(solved @ means.T, gamma).inverse
                 for key, truth in known.items():

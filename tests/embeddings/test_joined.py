@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from images import image
 
-from scroll_tactile import Joined, Kernels, Maps, Vision
+from scroll_tactile import Joined, Kernels, Vision
 from scroll_tactile.errors import InputError
 
 KERNELS = Kernels(dimension=64)
@@ -52,10 +52,3 @@ def test_the_fingerprint_depends_on_the_parts_and_their_order():
 def test_what_cannot_be_joined_is_refused(parts, message):
     with pytest.raises(InputError, match=message):
         Joined(*parts)
-
-
-def test_penalties_are_named_only_where_every_part_names_some():
-    cosines = Maps(layout=(3,), cosines=64)
-    both = Joined(cosines, Maps(layout=(3,), cosines=64, seed=2))
-    assert both.capabilities.penalties == cosines.capabilities.penalties
-    assert Joined(cosines, Kernels(dimension=64)).capabilities.penalties == ()

@@ -96,8 +96,6 @@ def test_cosines_fall_off_with_the_sum_of_differences():
     assert product == pytest.approx(np.exp(-1), abs=0.03)
 
 
-def test_cosines_ask_for_larger_penalties_and_maps_for_none():
-    assert Maps(layout=(3,), cosines=64).capabilities.penalties[-1] == 1.0
-    assert Maps(layout=(3,)).capabilities.penalties == ()
+def test_fewer_cosines_than_views_are_refused():
     with pytest.raises(InputError, match="one or more for each of 3 views"):
         Maps(layout=(4, 4), cosines=2)

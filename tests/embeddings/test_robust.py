@@ -106,11 +106,12 @@ class TestMemory:
         statistics = learner.memory.statistics
         assert statistics.scales[:4] == (NOISE[0], BEGINNING, CHANNELS, NOISE[1])
         rows = [int(statistics.counts(scale, ["a", "b"]).sum()) for scale in (*NOISE, BEGINNING, CHANNELS)]
-        assert rows == [2 * 2, 2 * 2, 2 * 2, 2 * 32]  # two touches: 2 noisy copies; itself and a copy; 32 readings
+        # Two touches: 2 noisy copies; itself and a copy, at each of 3 stages; 32 readings.
+        assert rows == [2 * 2, 2 * 2, 2 * 2 * 3, 2 * 32]
         assert learner.materials == {"a": 1, "b": 1}
 
     def test_it_follows_as_another_does(self):
-        learner, fresh = fed(OBSERVED, refit=1.0), fed([*OBSERVED, ("a", (8, 60))])
+        learner, fresh = fed(OBSERVED), fed([*OBSERVED, ("a", (8, 60))])
         learner.predict(stream((9, 60)))
         learner.observe("a", stream((8, 60)))
         assert learner.predict(stream((9, 60))).material == fresh.predict(stream((9, 60))).material
@@ -168,7 +169,7 @@ class TestFilling:
         statistics = Statistics(8, (CHANNELS,))
         image = np.ascontiguousarray(readings.T, dtype=np.float32)
         for at in range(0, image.shape[1], 32):
-            statistics.add("m", at % 3, {CHANNELS: to_codes(sampled_readings(image[:, at : at + 32], 8), 2.0)})
+            statistics.add("m", {CHANNELS: to_codes(sampled_readings(image[:, at : at + 32], 8), 2.0)})
         return Filling.of(statistics, len(image), 2.0)
 
     def test_mean_and_covariance_are_those_of_the_readings(self):

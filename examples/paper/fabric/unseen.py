@@ -34,7 +34,7 @@ PENALTIES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 class UnseenHead:
     """A head for one attribute: how much speaks for each of its values.
 
-    values: V of them. origin: (d,), in the codes' unit. weights: (d, V) of features about it; offsets: (V,). penalty: the
+    values: V of them. origin: (d,), in codes. weights: (d, V) of features about it; offsets: (V,). penalty: the
     chosen λ. gamma: the chosen γ. error: squared, of objects left out, summed.
     """
 

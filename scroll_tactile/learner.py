@@ -320,6 +320,16 @@ class TactileLearner:
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
         return self._ledger.merge(path, shared, descriptions, progress or _silent)
 
+    def backup(
+        self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
+    ) -> None:
+        """Copy the memory to a new folder, also while it is in use: whole, as it was at one moment, or not at all.
+
+        Raises InputError in a memory without a path; StoreError where something is there already, or it cannot be
+        written or verified.
+        """
+        self._ledger.require_store("be copied").backup(destination, progress=progress)
+
     def compact(self, *, keep: int = 0) -> Compacted:
         """Give up the features and readings of old observations, for space; what was learned from them stays.
 

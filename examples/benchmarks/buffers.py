@@ -25,6 +25,7 @@ from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
 from scroll_tactile.pipelines.classification import hold_out
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
@@ -196,7 +197,7 @@ def run_buffers(
     for touch in train:
         learner.observe(*touch)
     assert learner.memory.exemplars is not None
-    kept = candidates_of(learner.memory, None)
+    kept = [source for *_, source in learner.memory.exemplars if isinstance(source, Exemplar)]
     codes, keys = np.stack([exemplar.code for exemplar in kept]), [exemplar.key for exemplar in kept]
     f = float(np.mean([learner.predict(stream).material == name for name, stream in test]))
     records = []
@@ -223,7 +224,9 @@ def _tuned(
     """Accuracy of an f* fine-tuned on a buffer, whether it would be kept or not."""
     of = {exemplar.key: exemplar for exemplar in kept}
     exemplars = {name: [of[key] for key in chosen] for name, chosen in buffer.items()}
-    tuned, _ = fine_tune(learner.embedding, learner.model(), exemplars, learner.sensor, seed=seed)
+    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
+    statistics = learner.memory.statistics
+    tuned, _ = fine_tune(learner.embedding, learner.model(), statistics, exemplars, extractor, seed=seed)
     reader = TunedReader(learner.embedding, learner.plan, tuned)
     right = []
     for name, stream in test:

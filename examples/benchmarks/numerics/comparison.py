@@ -53,10 +53,9 @@ def run_numerics(
 
     data: a folder with biotac_slide_20_50; nist: the file of certified regressions. Without them these are left out.
     """
-    size = QUICK if quick else 1.0
     missing: dict[str, str] = {}
-    memories = [*make_memories(seed, size), *_real(seed, quick, data, missing)]
-    regressions = [*make_cases(seed, size), *_certified(nist, missing)]
+    memories = [*make_memories(seed, QUICK if quick else 1.0), *_real(seed, quick, data, missing)]
+    regressions = [*make_cases(seed), *_certified(nist, missing)]
     steps = (len(memories) + len(regressions)) * (1 + len(SOLVERS))
     done = 0
 

@@ -1,20 +1,20 @@
-"""What a learner runs, measured on a memory: features to codes, exact sums, the readout solved from them and followed."""
+"""What a learner runs, measured on a memory: codes, exact sums, the readout that is solved from them and followed."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from examples.benchmarks.numerics.memories import Memory
-from examples.benchmarks.numerics.truth import Answers, TrueReadout, true_share
+from examples.benchmarks.numerics.truth import Answers, TrueReadout
 from scroll_tactile.readouts.leave_one_out import left_out
 from scroll_tactile.readouts.readout import Change, Readout, Task
 from scroll_tactile.readouts.shrinkage import LARGEST, LEAST
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -26,6 +26,7 @@ __all__ = [
     "compared",
     "flips",
     "follow",
+    "keep_worst",
     "measure_learned",
     "name_of",
     "solved",
@@ -38,11 +39,12 @@ Record = dict[str, Any]
 SCALE = Scale("window", 1)
 AGREED = 1e-9  # the relative error that scores of a followed readout stay below
 LEFT_OUT = 20  # touches that are really left out
-MOST_DENSE = 64  # features: up to here touches are left out, and distances compared, in balls too
+EDGE = 2.0**BITS
+MOST_DENSE = 64  # features: up to here touches are really left out
 
 
 def answers_error(found: Scores, true: Scores) -> float:
-    """The largest error of a row of scores, (m, C), about their mean over the materials, relative to its largest score."""
+    """The largest error of a row of scores, (m, C), about their mean over the materials, relative to its largest."""
     difference = (found - found.mean(axis=1, keepdims=True)) - (true - true.mean(axis=1, keepdims=True))
     sizes = np.abs(true - true.mean(axis=1, keepdims=True)).max(axis=1)
     error = np.abs(difference).max(axis=1) / np.where(sizes > 0, sizes, sizes.max() or 1.0)
@@ -52,39 +54,6 @@ def answers_error(found: Scores, true: Scores) -> float:
 def flips(found: Scores, true: Scores) -> int:
     """How many rows of scores, (m, C), name another material."""
     return int(np.count_nonzero(found.argmax(axis=1) != true.argmax(axis=1)))
-
-
-@dataclass
-class Learned:
-    """A memory that was learned: the statistics of all touches, and the readout solved from them."""
-
-    memory: Memory
-    statistics: Statistics
-    task: Task
-    readout: Readout
-    seconds_per_row: float
-    solve_seconds: float
-
-    @classmethod
-    def of(cls, memory: Memory) -> Learned:
-        """Learn all touches, one by one."""
-        statistics = Statistics(memory.features.shape[2], [SCALE])
-        memory.codes  # noqa: B018  # rounding is the embedding's
-        begun = time.process_time()
-        for place, rows in zip(memory.places.tolist(), memory.codes, strict=True):
-            statistics.add(name_of(place), {SCALE: rows}, 1)
-        statistics.second(SCALE).packed()
-        summed = time.process_time()
-        task, readout = solved(statistics)
-        rows_in_all = memory.codes.shape[0] * memory.codes.shape[1]
-        return cls(
-            memory, statistics, task, readout, (summed - begun) / rows_in_all, time.process_time() - summed
-        )  # fmt: skip
-
-    def truth(self, readout: Readout, rows: npt.NDArray[Any] | None = None) -> TrueReadout:
-        """The true readout with the P and the γ of another, of the codes or of other rows (t, k, d)."""
-        table = self.memory.codes if rows is None else rows
-        return TrueReadout(table.reshape(-1, table.shape[2]), self.memory.row_places, readout.penalty, readout.gamma)
 
 
 def name_of(place: int) -> str:
@@ -121,108 +90,90 @@ def compared(found: Answers, true: Answers) -> Record:
 
 def measure_learned(memory: Memory) -> list[Record]:
     """Records of a memory: solved from the integers, followed, and what the grid costs."""
-    learned = Learned.of(memory)
-    readout, evaluated = learned.readout, np.rint(memory.evaluated * 2**20).astype(np.int64)
-    truth = learned.truth(readout)
+    evaluated = np.rint(memory.evaluated * EDGE).astype(np.int64)
+    begun = time.process_time()
+    statistics = taught(memory, len(memory.places))
+    statistics.second(SCALE).packed()
+    summed = time.process_time()
+    task, readout = solved(statistics)
+    done = time.process_time()
+    truth = truth_of(memory, memory.codes, readout)
     true = truth.answers(evaluated)
-    base = {
-        "case": memory.name,
-        "family": memory.family,
-        "rows": memory.row_places.size,
-        "dimension": memory.features.shape[2],
-        "penalty": readout.penalty,
-    }
-    weights = _centred(readout.gamma * readout.means_of(readout.held(readout.reference))[1].T)
-    fresh = base | {
+    free = truth_of(memory, memory.units, readout)
+    solution = readout.gamma * readout.means_of(readout.held(readout.reference))[1].T
+    weights = solution - solution.mean(axis=1, keepdims=True)
+    share = truth.share(len(memory.places), LEAST, LARGEST)
+    base = {"case": memory.name, "family": memory.family, "penalty": readout.penalty}
+    base |= {"rows": memory.row_places.size, "dimension": memory.features.shape[2]}
+    fresh = {
         "method": "learner",
-        "weights_error": _norm_error(weights, truth.weights()),
         **compared(asked(readout, evaluated), true),
-        "seconds_per_row": learned.seconds_per_row,
-        "solve_seconds": learned.solve_seconds,
-        "share_error": share_error(learned),
-        "left_out_error": left_out_error(learned),
+        "weights_error": _norm_error(weights, truth.weights()),
+        "share_error": abs(readout.share - share) / (share or 1.0),
+        "left_out_error": _left_out_error(memory, task, readout),
+        "seconds_per_row": (summed - begun) / memory.row_places.size,
+        "solve_seconds": done - summed,
     }
-    free = learned.truth(readout, memory.units)
-    unrounded = free.answers(memory.evaluated * 2.0**20)
-    grid = base | {
+    grid = {
         "method": "grid",
+        **compared(true, free.answers(memory.evaluated * EDGE)),
         "weights_error": _norm_error(truth.weights(), free.weights()),
-        **compared(true, unrounded),
     }
-    return [fresh, base | followed_error(learned, evaluated), grid]
+    return [base | found for found in (fresh, _followed(memory, evaluated), grid)]
 
 
-def _centred(weights: FloatArray) -> FloatArray:
-    return np.asarray(weights - weights.mean(axis=1, keepdims=True))
+def taught(memory: Memory, count: int) -> Statistics:
+    """The statistics of the first touches of a memory."""
+    statistics = Statistics(memory.features.shape[2], [SCALE])
+    for place, rows in zip(memory.places[:count].tolist(), memory.codes, strict=False):
+        statistics.add(name_of(place), {SCALE: rows}, 1)
+    return statistics
+
+
+def truth_of(memory: Memory, rows: npt.NDArray[Any], readout: Readout, kept: Any = slice(None)) -> TrueReadout:
+    """The true readout of some touches' rows, (t, k, d), with the P and the γ of a readout."""
+    places = np.repeat(memory.places[kept], rows.shape[1])
+    return TrueReadout(rows[kept].reshape(-1, rows.shape[2]), places, readout.penalty, readout.gamma)
 
 
 def _norm_error(found: FloatArray, true: FloatArray) -> float:
     return float(np.linalg.norm(found - true) / (np.linalg.norm(true) or 1.0))
 
 
-def share_error(learned: Learned) -> float:
-    """The relative error of ρ, of the scatter's fractions; 0 where there is no scatter and the readout has none."""
-    rows, places = (
-        learned.memory.codes.reshape(-1, learned.memory.codes.shape[2]).astype(object),
-        learned.memory.row_places,
-    )
-    scatter = rows.T @ rows
-    counts = np.bincount(places).tolist()
-    common = int(np.lcm.reduce(np.array(counts, dtype=object)))
-    scatter = scatter * common  # ρ does not depend on the unit
-    for place, count in enumerate(counts):
-        total = rows[places == place].sum(axis=0)
-        scatter = scatter - np.outer(total, total) * (common // count)
-    if not np.trace(scatter):
-        return abs(learned.readout.share)
-    true = true_share(scatter, len(learned.memory.places), LEAST, LARGEST)
-    return float(abs(learned.readout.share - true) / true)
-
-
-def followed_error(learned: Learned, evaluated: npt.NDArray[np.int64]) -> Record:
+def _followed(memory: Memory, evaluated: npt.NDArray[np.int64]) -> Record:
     """The readout of the first touches, followed to all of them: its worst errors then, when one more has come, was
     answered for and is retracted, and when the first touch is retracted.
     """
-    memory = learned.memory
     touches = [(name_of(place), rows, 1) for place, rows in zip(memory.places.tolist(), memory.codes, strict=True)]
     rows, dimension = memory.codes.shape[1:]
     # As many touches as a readout follows, less three changes behind them.
-    later = min(len(touches) // 2, max(32, dimension // 4) // rows - 3)
-    statistics = Statistics(dimension, [SCALE])
-    for name, codes, _ in touches[: len(touches) - later]:
-        statistics.add(name, {SCALE: codes}, 1)
+    early = len(touches) - min(len(touches) // 2, max(32, dimension // 4) // rows - 3)
+    statistics = taught(memory, early)
     _, readout = solved(statistics)
-    worst: Record = {"solved_again": 0}
-    spent = changed = 0.0
-
-    def change(touch: Change) -> None:
-        nonlocal readout, spent, changed
-        begun = time.process_time()
-        followed = follow(statistics, readout, touch)
-        followed.scores(touch[1][0].astype(np.float64), range(len(followed.names)), "lda")
-        spent += time.process_time() - begun
-        worst["solved_again"] += followed is not readout
-        readout, changed = followed, changed + 1
-
-    def compare(kept: slice) -> None:
-        true = TrueReadout(
-            memory.codes[kept].reshape(-1, dimension), np.repeat(memory.places[kept], rows), readout.penalty, readout.gamma
-        )  # fmt: skip
-        for name, error in compared(asked(readout, evaluated), true.answers(evaluated)).items():
-            worst[name] = max(error, worst.get(name, 0))
-
-    for touch in touches[len(touches) - later :]:
-        change(touch)
-    compare(slice(None))
     extra = np.repeat(evaluated[:1], rows, axis=0).astype(np.int32)
-    for sign in (1, -1):
-        change((name_of(0), extra, sign))
-    compare(slice(None))
-    name, codes, _ = touches[0]
-    if statistics.counts(SCALE, [name])[0] > rows:
-        change((name, codes, -1))
-        compare(slice(1, None))
-    return {"method": "learner, followed", **worst, "seconds_per_row": spent / changed, "solve_seconds": 0.0}
+    changes: list[Change] = [*touches[early:], (name_of(0), extra, 1), (name_of(0), extra, -1)]
+    compared_after = {len(touches) - early: slice(None), len(changes): slice(None)}
+    if np.count_nonzero(memory.places == memory.places[0]) > 1:
+        changes.append((*touches[0][:2], -1))
+        compared_after[len(changes)] = slice(1, None)
+    worst: Record = {"solved_again": 0}
+    spent = 0.0
+    for done, change in enumerate(changes, 1):
+        begun = time.process_time()
+        before, readout = readout, follow(statistics, readout, change)
+        readout.scores(change[1][0].astype(np.float64), range(len(readout.names)), "lda")
+        spent += time.process_time() - begun
+        worst["solved_again"] += readout is not before
+        if done in compared_after:
+            true = truth_of(memory, memory.codes, readout, compared_after[done]).answers(evaluated)
+            keep_worst(worst, compared(asked(readout, evaluated), true))
+    return {"method": "learner, followed", **worst, "seconds_per_row": spent / len(changes), "solve_seconds": 0.0}
+
+
+def keep_worst(worst: Record, errors: Record) -> None:
+    """Bring errors into the worst so far."""
+    for name, error in errors.items():
+        worst[name] = max(error, worst.get(name, 0))
 
 
 def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
@@ -232,9 +183,8 @@ def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
     return readout if readout.follow([change]) else solved(statistics)[1]
 
 
-def left_out_error(learned: Learned) -> float | None:
-    """The largest error of scores and distances of touches left out, against readouts of all others; None if too large."""
-    memory, readout = learned.memory, learned.readout
+def _left_out_error(memory: Memory, task: Task, readout: Readout) -> float | None:
+    """The largest error of scores and distances of touches left out, against readouts of the others; None if many."""
     rows, dimension = memory.codes.shape[1:]
     if dimension > MOST_DENSE or len(memory.places) > 1000:
         return None
@@ -242,16 +192,13 @@ def left_out_error(learned: Learned) -> float | None:
     pairs = np.array([(stage, 0, rows) for stage in range(rows)])
     for i, (place, codes) in enumerate(zip(memory.places.tolist(), memory.codes, strict=True)):
         sample.add(name_of(place), i.to_bytes(4, "big"), SampledTouch(codes, pairs))
-    apart = {kind: left_out(readout, learned.task, sample, stages, kind) for kind in ("lda", "ridge")}
+    apart = {kind: left_out(readout, task, sample, stages, kind) for kind in ("lda", "ridge")}
     worst = 0.0
     for number, (_, key, _) in list(enumerate(sample))[:LEFT_OUT]:
         if (number, 0) not in apart["lda"].rows:
             continue
         i = int.from_bytes(key, "big")
-        others = np.arange(len(memory.places)) != i
-        true = TrueReadout(
-            memory.codes[others].reshape(-1, dimension), np.repeat(memory.places[others], rows), readout.penalty, readout.gamma
-        ).answers(memory.codes[i])  # fmt: skip
+        true = truth_of(memory, memory.codes, readout, np.arange(len(memory.places)) != i).answers(memory.codes[i])
         at = [apart["lda"].rows[number, stage] for stage in range(rows)]
         distances = np.abs(apart["lda"].distances[at] - true.distances).max() / (np.abs(true.distances).max() or 1.0)
         worst = max(worst, float(distances))

@@ -1,4 +1,4 @@
-"""What `benchmarks numerics` measures beside single cases: a million observations, and a thousand schedules in bytes."""
+"""What `benchmarks numerics` measures beside single cases: a million observations, and a thousand schedules."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.numerics.learned import SCALE, asked, compared, follow, name_of, solved
+from examples.benchmarks.numerics.learned import SCALE, asked, compared, follow, keep_worst, name_of, solved
 from examples.benchmarks.numerics.peers import Record, decided, error_of, new_solver, record
 from examples.benchmarks.numerics.peers import solved as weights_of
 from examples.benchmarks.numerics.regressions import updates
@@ -54,8 +54,7 @@ def run_drift(seed: int, dimension: int, count: int, note: Note) -> Iterator[Rec
         a, c = rounds * second - last.T @ last, rounds * sums - own.astype(int).T.astype(object) @ last
         counts = (rounds * targets.sum(axis=0) - own.sum(axis=0)).astype(int).tolist()
         true = TrueReadout.of_sums(a, c, counts, readout.penalty, readout.gamma).answers(evaluated)
-        for name, error in compared(asked(readout, evaluated), true).items():
-            worst[name] = max(error, worst.get(name, 0))
+        keep_worst(worst, compared(asked(readout, evaluated), true))
 
     for rounds in range(1, count // DISTINCT + 1):
         fed = rounds * DISTINCT
@@ -100,7 +99,7 @@ def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], no
                 spent += time.process_time() - begin
                 fed = upto
                 if fed not in truths:
-                    truths[fed] = exact_weights(rows, targets, penalty, fed // DISTINCT)
+                    truths[fed] = np.asarray(exact_weights(rows, targets, penalty, fed // DISTINCT))
                 begin = time.process_time()
                 weights, diagnosis = weights_of(solver)
                 found = record(_updates_name(fed, dimension), "updates", method, fed, dimension, penalty)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from examples.benchmarks.numerics.learned import AGREED
 from examples.paper.drawing import picture
 
 __all__ = ["draw_numerics", "points"]
@@ -49,10 +50,8 @@ def draw_numerics(path: Path, records: Records, *, title: str) -> None:
 
     Raises InputError where matplotlib is missing or the file cannot be written.
     """
-    grid = [
-        max([LEAST, *(r["answers_error"] for r in records if r["method"] == "grid" and r["family"] == family)])
-        for family in ("within the bound", "below the grid")
-    ]
+    wanted = {"method": "grid", "family": "within the bound"}
+    grid = [LEAST, *(record["answers_error"] for record in records if wanted.items() <= record.items())]
     with picture(path, 9, 6) as figure:
         panel = figure.add_subplot()
         for method, drawn in points(records).items():
@@ -62,9 +61,14 @@ def draw_numerics(path: Path, records: Records, *, title: str) -> None:
             middle, worst = float(np.median(seconds)) * 1e3, float(errors.max())
             panel.plot([middle, middle], [errors.min(), worst], color=colour, linewidth=1)
             panel.scatter(middle, worst, s=90, color=colour, label=method)
-        for height, words in ((grid[0], "the grid's share, within the bound"), (1e-9, "claimed of the learner"), (2.0**-53, "rounding of a double")):  # fmt: skip
+        for height, words in (
+            (max(grid), "what the grid costs"),
+            (AGREED, "claimed"),
+            (2.0**-53, "rounding of a double"),
+        ):
             panel.axhline(height, color="grey", linewidth=0.8, linestyle=":")
-            panel.annotate(words, (0.995, height), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8, color="grey")  # fmt: skip
+            place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+            panel.annotate(words, (0.995, height), fontsize=8, color="grey", **place)
         panel.set(xscale="log", yscale="log", title=title, ylim=(LEAST / 3, 3 * NO_ANSWER))
         panel.set(xlabel="processor time of an observation and the answer after it, ms")
         panel.set(ylabel="relative error of the answers: each memory, and the worst")

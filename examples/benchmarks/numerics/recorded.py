@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from examples.benchmarks.numerics.memories import Memory
+from examples.benchmarks.numerics.memories import JUDGED, Memory
 from examples.benchmarks.numerics.regressions import Case
 from scroll_tactile import Kernels
 from scroll_tactile.datasets.biotac_slide import load
@@ -56,7 +56,7 @@ def digits(weights: np.ndarray, certified: np.ndarray) -> float:
 def real_memory(
     name: Literal["biotac", "roboskin"], data: Path, seed: int, dimension: int, most: int | None = None
 ) -> Memory:
-    """Features of whole touches of "biotac" or "roboskin", one row a touch; one fold is evaluated.
+    """Features of whole touches of "biotac" or "roboskin", one row a touch; some of one fold are evaluated.
 
     Raises DatasetError for a folder that is not laid out as published.
     """
@@ -67,4 +67,6 @@ def real_memory(
     train = recordings.fold[chosen] != 0
     names = sorted({recordings.materials[i] for i in chosen[train]})
     places = np.array([names.index(recordings.materials[i]) for i in chosen[train]])
-    return Memory(f"{recordings.name}, {dimension} features", features[train][:, None], places, features[~train])
+    return Memory(
+        f"{recordings.name}, {dimension} features", features[train][:, None], places, features[~train][:JUDGED]
+    )

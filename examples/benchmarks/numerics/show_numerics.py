@@ -17,7 +17,7 @@ WIDE = 140  # characters that the table takes
 
 
 def show_numerics(result: Mapping[str, Any]) -> None:
-    """Show relative errors of answers, or of weights where a case has none, case by method; in brackets those flipped."""
+    """Show relative errors of answers, or of weights where a case has none, case by method."""
     records, claimed = result["records"], result["claims"]
     methods = list(dict.fromkeys(record["method"] for record in records))
     table = Table(
@@ -47,7 +47,7 @@ def show_numerics(result: Mapping[str, Any]) -> None:
             say(f"the learner's worst {name.replace('_', ' ')}: {escape(said)}")
     verdict = "stay below" if claimed["agreed"] else "[red]exceed[/]"
     say(
-        f"scores, novelty and ρ of what the learner runs {verdict} {claimed['limit']:.0e}; answers flipped: {claimed['flipped']}"
+        f"scores, novelty and ρ of the learner {verdict} {claimed['limit']:.0e}; flipped: {claimed['flipped']}"
     )
 
 

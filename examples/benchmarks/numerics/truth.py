@@ -1,4 +1,4 @@
-"""The truth, in FLINT's fractions and balls, from the rows themselves and by the textbook's dense formulas.
+"""The truth, in FLINT's integers and balls, from the rows themselves and by the textbook's dense formulas.
 
 `exact_weights` solves a ridge regression of doubles; `TrueReadout` answers as a readout does that has no rounding. They
 share no formula with what is measured: sums are formed at once from all rows, and every matrix is solved by itself.
@@ -8,20 +8,18 @@ The tests hold both against mpmath.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from flint import arb, arb_mat, ctx, fmpq, fmpq_mat, fmpz, fmpz_mat
+from flint import arb, arb_mat, ctx, fmpq, fmpz, fmpz_mat
 
-__all__ = ["Answers", "TrueReadout", "exact_weights", "true_share", "whole"]
+__all__ = ["Answers", "TrueReadout", "exact_weights"]
 
 FloatArray = npt.NDArray[np.float64]
 LongArray = npt.NDArray[np.longdouble]
 Integers = npt.NDArray[np.object_]
 
-VANISHING = 300  # bits: with λ so far below the matrix, a singular system's solution is its smallest to a long double
 FIRST_BITS, ENOUGH_BITS = 256, 80
 
 
@@ -36,46 +34,24 @@ def whole(values: npt.NDArray[Any]) -> tuple[Integers, int]:
     return digits << (places - least).astype(object), least
 
 
-def _by_column(values: FloatArray) -> tuple[Integers, list[int]]:
-    """Doubles as integers, with one exponent for each column."""
-    parts = [whole(column) for column in values.T]
-    return np.stack([part for part, _ in parts], axis=1), [exponent for _, exponent in parts]
-
-
-def exact_weights(rows: FloatArray, targets: FloatArray, penalty: float, repeats: int = 1) -> LongArray:
+def exact_weights(rows: FloatArray, targets: FloatArray, penalty: float, repeats: int = 1) -> LongArray | None:
     """W of shape (d, C), exact and then rounded to long doubles; of rows that were given `repeats` times.
 
-    Where λ = 0 and the rows leave weights open, the smallest.
+    None where λ = 0 and the rows leave weights open.
     """
-    x, places = _by_column(rows)
-    y, above = _by_column(targets)
-    gram, right = repeats * (x.T @ x), repeats * (x.T @ y)
-    # In units: A_ij = 2^(p_i + p_j) gram_ij, so λ counts 2^(−2 p_i) λ on the diagonal; all brought to whole numbers.
-    ridge = [Fraction(penalty) / Fraction(2) ** (2 * place) for place in places]
-    solution = _solved(gram, right, ridge)
-    if solution is None:
-        size = max((Fraction(2) ** (2 * p) * int(gram[j, j]) for j, p in enumerate(places)), default=Fraction(1))
-        least = (size or Fraction(1)) / 2**VANISHING
-        solution = _solved(gram, right, [least / Fraction(2) ** (2 * place) for place in places])
-    assert solution is not None
+    # Columns in units of their own, A_ij = 2^(p_i + p_j) gram_ij: so λ counts 2^(−2 p_i) λ on the diagonal.
+    (x, places), (y, above) = ([*zip(*map(whole, table.T), strict=True)] for table in (rows, targets))
+    digits, wanted = fmpz_mat([list(column) for column in x]), fmpz_mat([list(column) for column in y])
+    gram, right = repeats * (digits * digits.transpose()), repeats * (digits * wanted.transpose())
+    if not penalty and gram.rank() < len(places):
+        return None
+    with ctx.workprec(4 * FIRST_BITS):
+        ridge = [arb(penalty) * arb((1, -2 * place)) for place in places]
+        solution = certain(arb_mat(gram) + _diagonal(ridge), arb_mat(right))
     weights = np.zeros((len(places), len(above)), dtype=np.longdouble)
     for row, column in np.ndindex(weights.shape):
         weights[row, column] = _long(solution[row, column], above[column] - places[row])
     return weights
-
-
-def _solved(gram: Integers, right: Integers, ridge: list[Fraction]) -> arb_mat | fmpq_mat | None:
-    """The solution of (gram + ridge) X = right; None where the matrix is singular."""
-    common = max((value.denominator for value in ridge), default=1)  # powers of two: the largest is a multiple of all
-    system = gram * common
-    system[np.diag_indices(len(gram))] += np.array([int(value * common) for value in ridge], dtype=object)
-    matrix, wanted = fmpz_mat(system.tolist()), fmpz_mat((right * common).tolist())
-    if any(ridge):
-        return certain(arb_mat(matrix), arb_mat(wanted))
-    try:
-        return fmpq_mat(matrix).solve(fmpq_mat(wanted))
-    except ZeroDivisionError:
-        return None
 
 
 def certain(matrix: arb_mat, right: arb_mat) -> arb_mat:
@@ -99,10 +75,10 @@ def certain(matrix: arb_mat, right: arb_mat) -> arb_mat:
         bits *= 2
 
 
-def _long(value: arb | fmpq, exponent: int) -> Any:
+def _long(value: arb, exponent: int) -> Any:
     """value · 2^exponent as a long double, whatever its exponent."""
     with ctx.workprec(128):
-        middle = arb(value).mid()
+        middle = value.mid()
         if not middle:
             return np.longdouble(0)
         mantissa, place = middle.man_exp()
@@ -110,18 +86,6 @@ def _long(value: arb | fmpq, exponent: int) -> Any:
     cut = max(0, digits.bit_length() - 64)
     high, low = divmod(digits >> cut if digits > 0 else -(-digits >> cut), 2**32)
     return np.ldexp(np.longdouble(high) * np.longdouble(2**32) + np.longdouble(low), int(place) + cut + exponent)
-
-
-def true_share(scatter: Integers, touches: int, least: float, largest: float) -> Fraction:
-    """ρ of a scatter in fractions, shape (d, d), by equation 23 of Chen et al. 2010, within its limits."""
-    dimension = len(scatter)
-    squares, trace = Fraction(np.square(scatter).sum()), Fraction(np.trace(scatter))
-    spread = squares - trace**2 / dimension
-    if not spread:
-        return Fraction(largest)
-    part = 1 - Fraction(2, dimension)
-    ratio = (part * squares + trace**2) / ((touches + part) * spread)
-    return min(max(ratio, Fraction(least)), Fraction(largest))
 
 
 @dataclass(frozen=True)
@@ -171,7 +135,7 @@ class TrueReadout:
             shares = [[arb(v) / n for v in row] for row, n in zip(sums.tolist(), counts, strict=True)]
             scatter = arb_mat(second) - arb_mat(shares).transpose() * arb_mat(sums)
             ridge = arb(penalty) * arb((1, -2 * self._unit))
-            self._within = scatter + _diagonal([ridge] * sums.ncols())
+            self._scatter, self._within = scatter, scatter + _diagonal([ridge] * sums.ncols())
             weighed = _diagonal([arb(n) for n in counts]) * self._means
             self._whole = self._within + self._means.transpose() * weighed
             self._pull = weighed.transpose()
@@ -179,6 +143,17 @@ class TrueReadout:
             self._sizes = [
                 _dot(m, s) for m, s in zip(self._means.tolist(), self._solved.transpose().tolist(), strict=True)
             ]
+
+    def share(self, touches: int, least: float, largest: float) -> float:
+        """ρ by equation 23 of Chen et al. 2010, within limits, of so many touches; 0 where there is no scatter."""
+        d = self._scatter.nrows()
+        with ctx.workprec(4 * FIRST_BITS):
+            trace, squares = self._scatter.trace(), (self._scatter * self._scatter).trace()
+            spread, part = squares - trace * trace / d, 1 - arb(2) / d
+            if not spread > 0:
+                return largest if trace > 0 else 0.0
+            ratio = (part * squares + trace * trace) / ((touches + part) * spread)
+        return min(max(float(ratio.mid()), least), largest)
 
     def weights(self) -> FloatArray:
         """γ K⁻¹ mᵀ about their mean over the materials, (d, C), in the rows' own unit."""

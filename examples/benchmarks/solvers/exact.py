@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from flint import fmpz_mat
 
-from examples.benchmarks.solvers.certified import Diagnosis, IntegerSystem, OnSingular, solve_exact
+from examples.benchmarks.solvers.certified import Diagnosis, IntegerSystem, solve_exact
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
 
 __all__ = ["Exact", "IntegerMoments"]
@@ -96,8 +96,6 @@ class Exact(RidgeBase):
     >>> solver.update([[1.0, 1.0], [1e-12, 0.0]], [[3.0], [1e-12]])  # in float64 AᵀA would be singular
     >>> solver.weights().tolist()
     [[1.0], [2.0]]
-    >>> solver.solve()[1].verdict
-    'ill conditioned'
     """
 
     def _begin(self) -> None:
@@ -148,12 +146,8 @@ class Exact(RidgeBase):
         """W of shape (d, C). Raises SingularError where λ = 0 and other weights fit as well."""
         return self.solve()[0]
 
-    def solve(self, on_singular: OnSingular = "raise", *, centred: bool = False) -> tuple[FloatArray, Diagnosis]:
-        """W of shape (d, C) and what is to be said of it; of `centred` rows, so that an intercept is free of λ.
-
-        Where λ = 0 and other weights fit as well SingularError is raised; or, with on_singular="diagnose", the
-        smallest are returned.
-        """
-        solution = solve_exact(self.system(centred=centred), on_singular)
-        self.diagnosis = "" if solution.diagnosis.verdict == "sound" else str(solution.diagnosis)
-        return solution.weights, solution.diagnosis
+    def solve(self, *, centred: bool = False) -> tuple[FloatArray, Diagnosis]:
+        """W of shape (d, C) and what is to be said of it; of `centred` rows, so that an intercept is free of λ."""
+        weights, diagnosis = solve_exact(self.system(centred=centred))
+        self.diagnosis = str(diagnosis)
+        return weights, diagnosis

@@ -32,7 +32,7 @@ BLOCK = 32  # columns that dtpqrt works on at once
 
 
 class RecursiveLeastSquares(RidgeBase):
-    """The paper's recursive least squares, carrying P = (A + λ I)⁻¹, by Sherman & Morrison 1950 and Woodbury 1950; λ > 0.
+    """The paper's recursive least squares, carrying P = (A + λ I)⁻¹ (Sherman & Morrison 1950, Woodbury 1950); λ > 0.
 
     K = P Xᵀ (I + X P Xᵀ)⁻¹,  W ← W + K (Y − X W),  P ← P − K X P, from P = I / λ and W = 0.
     """

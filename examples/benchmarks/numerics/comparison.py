@@ -124,6 +124,6 @@ def _real(seed: int, quick: bool, data: Path | None, missing: dict[str, str]) ->
             missing[name] = "no --data with biotac_slide_20_50 in it"
             continue
         try:
-            yield real_memory(name, data, seed, 64 if quick else 512, 200 if quick else None)
+            yield real_memory(name, data, seed, 64 if quick else 256, 200 if quick else None)
         except DatasetError as error:
             missing[name] = str(error)

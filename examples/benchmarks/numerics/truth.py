@@ -148,7 +148,8 @@ class TrueReadout:
         """ρ by equation 23 of Chen et al. 2010, within limits, of so many touches; 0 where there is no scatter."""
         d = self._scatter.nrows()
         with ctx.workprec(4 * FIRST_BITS):
-            trace, squares = self._scatter.trace(), (self._scatter * self._scatter).trace()
+            entries = self._scatter.entries()
+            trace, squares = self._scatter.trace(), _dot(entries, entries)
             spread, part = squares - trace * trace / d, 1 - arb(2) / d
             if not spread > 0:
                 return largest if trace > 0 else 0.0

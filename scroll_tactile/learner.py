@@ -479,7 +479,8 @@ class TactileLearner:
         with one_thread():
             judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
         order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
-        ranking = list(zip(map(candidates.__getitem__, order), judgement.probability[order].tolist(), strict=True))
+        names = map(candidates.__getitem__, order.tolist())
+        ranking = list(zip(names, judgement.probability[order].tolist(), strict=True))
         known = bool(judgement.novelty <= judgement.calibration.threshold(self._settings.false_alarms))
         tuned = logits is not None
         return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, encoded.seconds, tuned=tuned)
@@ -488,7 +489,7 @@ class TactileLearner:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.
 
         Between two such moments the readouts are those of all that was observed, to rounding; the calibration may rest
-        on an eighth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
+        on a fifth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
 
         Raises CapacityError where the system has no memory left for it; `predict` does, too.
         """

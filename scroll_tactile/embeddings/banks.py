@@ -164,18 +164,20 @@ def _simulated(channels: int, readings: int) -> list[npt.NDArray[np.float32]]:
     Amplitudes are log-uniform from 0.6 % to 50 % of half the range; channels differ and partly move together.
     """
     rng = np.random.default_rng([channels, readings])
-    streams = []
-    for _ in range(SIMULATED):
-        noise = rng.standard_normal((channels, readings + 64))
-        noise += rng.random() * rng.standard_normal(readings + 64)
-        memory = rng.choice([0.0, 0.5, 0.9, 0.97, 0.99], size=channels)
-        fresh = np.sqrt(1 - np.square(memory))
-        for i in range(1, noise.shape[1]):
-            noise[:, i] = memory * noise[:, i - 1] + fresh * noise[:, i]
-        amplitude = 10.0 ** (rng.uniform(-2.2, -0.3) + rng.uniform(-0.5, 0.5, size=(channels, 1)))
-        offset = rng.uniform(-1, 1, size=(channels, 1))
-        streams.append(to_levels(np.clip(noise[:, 64:] * amplitude + offset, -1, 1)))
-    return streams
+    noise = np.empty((SIMULATED, readings + 64, channels))
+    memory, amplitude, offset = (np.empty((SIMULATED, channels)) for _ in range(3))
+    for i in range(SIMULATED):
+        own = rng.standard_normal((channels, readings + 64))
+        own += rng.random() * rng.standard_normal(readings + 64)
+        noise[i] = own.T
+        memory[i] = rng.choice([0.0, 0.5, 0.9, 0.97, 0.99], size=channels)
+        amplitude[i] = 10.0 ** (rng.uniform(-2.2, -0.3) + rng.uniform(-0.5, 0.5, size=channels))
+        offset[i] = rng.uniform(-1, 1, size=channels)
+    fresh = np.sqrt(1 - np.square(memory))
+    for column in range(1, noise.shape[1]):  # all streams at once: a quarter of a second before the first touch
+        noise[:, column] = memory * noise[:, column - 1] + fresh * noise[:, column]
+    levels = to_levels(np.clip(noise[:, 64:] * amplitude[:, None] + offset[:, None], -1, 1))
+    return [np.ascontiguousarray(stream.T) for stream in levels]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
 
 Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is
-fitted, the shrinkage and the calibration, follows when the memory has grown by an eighth: a sixteenth earlier a thread
+fitted, the shrinkage and the calibration, follows when the memory has grown by a quarter: an eighth earlier a thread
 begins to fit it, to the integers. When which of them answers depends on the calls that came and not on how fast that
 thread is, so the same calls give the same answers.
 """
@@ -24,7 +24,7 @@ from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel"]
 
-LAG = 8  # of the touches that a model was fitted to, one in so many may be missing in its calibration
+LAG = 4  # of the touches that a model was fitted to, one in so many may have come since its calibration
 LEAST = 2  # touches, in a small memory
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 

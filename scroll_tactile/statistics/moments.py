@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
 
@@ -22,7 +22,6 @@ FloatArray = npt.NDArray[np.float64]
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
-PIECE = 2**13  # entries of a triangle
 
 
 @lru_cache(maxsize=1)
@@ -62,9 +61,12 @@ def one_thread() -> AbstractContextManager[None]:
     return _LIMIT
 
 
-@lru_cache(maxsize=4)
-def _lower(dimension: int) -> npt.NDArray[np.intp]:
-    return np.flatnonzero(np.tri(dimension, dtype=bool))
+def _rows_of_triangle(dimension: int) -> Iterator[tuple[int, slice]]:
+    """Each row of a lower triangle, and where it lies where they are packed one after another."""
+    first = 0
+    for row in range(dimension):
+        yield row, slice(first, first + row + 1)
+        first += row + 1
 
 
 def require_room(rows: int, more: int) -> None:
@@ -143,12 +145,9 @@ def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) 
     """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
     rows = codes.astype(np.float64)
     with one_thread():
-        product = rows.T @ rows  # of one matrix with itself: numpy takes half of the operations
-    flat, lower = product.reshape(-1), _lower(codes.shape[1])
-    # Piece by piece, in the processor's cache: the whole triangle at once took twice as long, in fresh pages.
-    for first in range(0, len(packed), PIECE):
-        piece = packed[first : first + PIECE]
-        put(piece, np.take(flat, lower[first : first + PIECE]).astype(np.int64), out=piece)
+        product = (rows.T @ rows).astype(np.int64)  # of one matrix with itself: numpy takes half of the operations
+    for row, place in _rows_of_triangle(codes.shape[1]):
+        put(packed[place], product[row, : row + 1], out=packed[place])
 
 
 def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
@@ -162,7 +161,8 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
     dimension = sums.shape[1]
     centred = np.zeros((dimension, dimension), dtype=np.int64)
-    centred.reshape(-1)[_lower(dimension)] = packed
+    for row, place in _rows_of_triangle(dimension):
+        centred[row, : row + 1] = packed[place]
     rounded = np.zeros((dimension, dimension))
     # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
     largest = int(np.abs(sums).max(initial=1))

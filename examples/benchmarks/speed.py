@@ -52,8 +52,7 @@ class Sizes:
 
     touches: of the everyday memory. pairs: of an observation and a prediction. starts: processes that open it anew.
     materials: of the large memory, with so many touches `each`; before_materials: of the one that an older checkout is
-    given, too, none for 0. opening: touches of the memories that are opened; before_opening: the largest for an older
-    checkout.
+    given, too. opening: touches of the memories that are opened; before_opening: the largest for an older checkout.
     """
 
     touches: int = 800
@@ -123,7 +122,7 @@ def run_speed(
         result = {"bench": "speed", **circumstances(seed), "touches": "simulated" if data is None else "BioTac-20"}
         forward = _everyday(bench, data)
         _many(bench, bench.only_now(), bench.sizes.materials)
-        if before is not None and bench.sizes.before_materials:
+        if before is not None:
             _many(bench, sides, bench.sizes.before_materials)
         _opening(bench)
     return result | {"resnet_forward": forward, "records": bench.records}
@@ -396,21 +395,15 @@ def _opening(bench: _Bench) -> None:
         )
         touches = write_touches(bench.folder / "short", SHORT, made, SHORT.readings)
         own = _Bench(sides, bench.folder / f"short-{number}", bench.sizes, bench.seed, bench.note, bench.records)
-        times: dict[str, dict[str, list[float]]] = {
-            case: {name: [] for name in sides} for case in ("open after a close", "predict again", "observe, durable")
-        }
+        taken: dict[str, list[float]] = {name: [] for name in sides}
         for name, checkout in sides.items():
             _filled(checkout, touches, own.folder / name, number)
             for _ in range(bench.sizes.starts):
                 with Worker(checkout, touches) as worker:
-                    times["open after a close"][name].append(worker.wall("open", path=str(own.folder / name)))
+                    taken[name].append(worker.wall("open", path=str(own.folder / name)))
             with Worker(checkout, touches) as worker:
                 worker.call("open", path=str(own.folder / name))
-                worker.call("predict", touch=number)
-                for i in range(REPLAYED):  # how long they take must not depend on how much was observed before
-                    times["predict again"][name].append(worker.wall("predict", touch=number + i))
                 for i in range(REPLAYED):
-                    times["observe, durable"][name].append(worker.wall("observe", touch=number + i))
-        for case, taken in times.items():
-            own.seconds(memory, case, taken, "≤ 1000" if case.startswith("open") else "")
+                    worker.call("observe", touch=number + i)
+        own.seconds(memory, "open after a close", taken, "≤ 1000")
         _open_killed(own, memory, touches, number, REPLAYED)

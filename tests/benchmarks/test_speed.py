@@ -14,7 +14,7 @@ from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from scroll_tactile.errors import InputError
 
-TINY = Sizes(touches=40, pairs=2, starts=1, materials=6, before_materials=0, each=2, opening=(100,), before_opening=0)
+TINY = Sizes(touches=40, pairs=2, starts=2, materials=6, before_materials=6, each=2, opening=(100,), before_opening=100)
 
 
 def test_a_timing_is_the_median_and_the_99th_percentile_of_its_calls():
@@ -40,29 +40,28 @@ def test_alternatives_take_turns_and_all_calls_count(monkeypatch):
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """Every case, tiny; the everyday memory with this checkout beside itself."""
+    """Every case, tiny, with this checkout beside itself."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed, "REPLAYED", 25)
         patch.setattr(speed, "REFRESHES", 2)
         return run_speed(sizes=TINY, before=HERE.parents[1])
 
 
-def test_every_case_is_measured_and_the_everyday_ones_on_both_sides(measured):
+def test_every_case_is_measured_on_both_sides(measured):
     found = {(record["memory"].split(" (")[0], record["case"]): record for record in measured["records"]}
     everyday = "40 touches of 20 materials, BioTac"
     for case, calls in (
         ("observe, durable", 40),
-        ("import torch", 1),
-        ("first predict after opening", 1),
+        ("import torch", 2),
+        ("first predict after opening", 2),
         ("predict again", 200),
         ("predict right after an observe", 2),
         ("a reader's refresh after one observation", 2),
-        ("open, 25 observations after the last close", 1),
+        ("open, 25 observations after the last close", 2),
     ):
         record = found[everyday, case]
         assert (record["calls"], record["before_calls"]) == (calls, calls)
-        assert 0 < record["median"] <= record["largest"]
-        assert record["p99"] is None or record["median"] <= record["p99"] <= record["largest"]
+        assert 0 < record["median"] <= record["p99"] <= record["largest"]
         assert record["times"] == record["before_median"] / record["median"]
         assert record["of_forward"] == record["median"] / measured["resnet_forward"]["median_milliseconds"]
     assert found[everyday, "predict again"]["wrong"] < 0.5

@@ -123,7 +123,7 @@ def _pairs(learner: VectorPeer, test: list[tuple[int, FloatArray, FloatArray]]) 
 
 def _learners(materials: int, pairs: int, seed: int) -> list[tuple[str, str, Callable[[], VectorPeer], int]]:
     """Name, the package that it needs, how it is made, and how many pairs are timed."""
-    few, d = max(2, pairs // 50), AsIs.dimension
+    few, d = max(2, pairs // 5), AsIs.dimension
     return [
         ("ours, durable on disk", "torch", lambda: _Ours(on_disk=True), pairs),
         ("ours, in memory only", "torch", lambda: _Ours(on_disk=False), pairs),

@@ -121,9 +121,11 @@ def run_speed(
         bench = _Bench(sides, Path(folder), sizes or Sizes(), seed, note)
         result = {"bench": "speed", **circumstances(seed), "touches": "simulated" if data is None else "BioTac-20"}
         forward = _everyday(bench, data)
-        _many(bench, bench.only_now(), bench.sizes.materials)
-        if before is not None:
-            _many(bench, sides, bench.sizes.before_materials)
+        counts = {bench.sizes.materials: bench.only_now()}
+        if before is not None and bench.sizes.before_materials:
+            counts[bench.sizes.before_materials] = sides
+        for materials, own in counts.items():
+            _many(bench, own, materials)
         _opening(bench)
     return result | {"resnet_forward": forward, "records": bench.records}
 

@@ -8,7 +8,8 @@ FORMAT.md beside this file describes every byte of it.
         head = store.append("add", "a label", key, arrays={"codes": codes})
         store.commit({"sums": sums}, upto=head.sequence)
 
-`check_store` verifies a whole store; `repair_store` keeps what verifies of a damaged one.
+`Store.backup` copies a store while it is in use; `check_store` verifies a whole one; `repair_store` keeps what
+verifies of a damaged one.
 """
 
 from store.exceptions import (

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from store.exceptions import DamageError, RecordError, StoreError, reported
 from store.files import remove_tree
-from store.groups import PARTIAL, Draft, GroupReader, folder_name, write_group
+from store.groups import PARTIAL, Draft, GroupReader, folder_name, require_known, write_group
 from store.journal import Journal
 from store.records import Generation, GenerationRow
 from store.schema import GENERATIONS
@@ -76,10 +76,14 @@ class Generations:
 
     def _load(self, row: GenerationRow, only: Collection[str] | None = None) -> Generation:
         attributes, content = row.verified(self._journal.path)
-        names = [name for name in content["arrays"] if only is None or name in only]
-        arrays = {}
-        if names or only is None:
-            arrays = GroupReader(self._parent / folder_name(row.number), row.number, content).arrays(names)
+        folder = self._parent / folder_name(row.number)
+        if only is None:
+            arrays = GroupReader(folder, row.number, content).arrays()
+        elif names := sorted(set(only).intersection(content["arrays"])):
+            arrays = GroupReader(folder, row.number, content).arrays(names)
+        else:
+            require_known(folder, content["format"])
+            arrays = {}
         return Generation(row.number, row.upto, attributes, arrays)
 
     def commit(self, draft: Draft, *, base: bool = False) -> int:
@@ -93,7 +97,7 @@ class Generations:
             # When this fails the folder stays, for the next commit or open to remove: what could not be
             # synced may be on the disk all the same, and name it after a crash.
             self._journal.make_current(row, forget={row.number for row in earlier} - kept)
-            self._remove_unnamed()
+            self.remove_unnamed()
             return number
 
     @staticmethod
@@ -170,14 +174,11 @@ class Generations:
         """Wait for the background commit and end its thread."""
         self._worker.shutdown()
 
-    def remove_unfinished(self) -> None:
-        """Remove the folders that the journal does not name: a writer that died left them behind."""
-        with reported(self._parent, "removing unfinished generations"):
-            remove_others(self._parent, [row.number for row in self._journal.generations()])
-
-    def _remove_unnamed(self) -> None:
+    def remove_unnamed(self) -> None:
+        """Remove the folders that the journal does not name: what was replaced, and what a writer that died left."""
         try:
-            self.remove_unfinished()
+            with reported(self._parent, "removing generations"):
+                remove_others(self._parent, self.named())
         except StoreError as error:
             # The commit itself stands; the next one, or the next open, removes what is left.
             logger.warning("%s: old generations could not be removed: %s", self._parent, error)

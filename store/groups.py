@@ -20,7 +20,7 @@ from store.records import JSON, from_json
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["PARTIAL", "Draft", "GroupReader", "folder_name", "read_own_description", "write_group"]
+__all__ = ["PARTIAL", "Draft", "GroupReader", "folder_name", "read_own_description", "require_known", "write_group"]
 
 GROUP_VERSION = 1
 PARTIAL = ".partial"
@@ -128,7 +128,7 @@ class GroupReader:
     """
 
     def __init__(self, path: Path, number: int, content: Mapping[str, Any]) -> None:
-        _require_known(path, content["format"])
+        require_known(path, content["format"])
         import zarr
         from zarr.storage import LocalStore
 
@@ -209,11 +209,12 @@ def read_own_description(path: Path) -> dict[str, Any]:
         raise DamageError(
             f"what {header} says of its generation is not what was written: its sha256 differs", path=header
         )
-    _require_known(path, known["format"])
+    require_known(path, known["format"])
     return dict(known)
 
 
-def _require_known(path: Path, version: int) -> None:
+def require_known(path: Path, version: int) -> None:
+    """Raise VersionError where a generation's format is newer than this release reads."""
     if version > GROUP_VERSION:
         raise VersionError(
             f"{path} is written in format {version}; this release reads generations up to format "

@@ -93,7 +93,7 @@ class Store:
             self.identity = self._journal.identity
             self._generations = Generations(folder, self._journal)
             if mode == "write":
-                self._generations.remove_unfinished()
+                self._generations.remove_unnamed()
             undo.pop_all()
 
     def _opened(self, journal: Path) -> Journal:

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import store
-from store import Head, Record, RecordError, Store
+from store import Head, Record, RecordError, Store, VersionError
+from store.records import GenerationRow
 
 DTYPES = ["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U1", "<U7"]
 arrays = st.dictionaries(
@@ -218,3 +219,15 @@ def test_the_attributes_of_a_generation_or_some_of_its_arrays_are_read_without_t
         shutil.rmtree(tmp_path / "generations" / "00000001")
         found = opened.latest(only=())
         assert (found.number, found.upto, found.attributes, found.arrays) == (1, 0, {"made": "now"}, {})
+
+
+@pytest.mark.parametrize("only", [None, (), ["x"]])
+def test_a_generation_of_a_newer_format_is_refused_also_for_its_attributes(tmp_path, only):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.commit({"x": np.arange(3)}, upto=0)
+        (row,) = opened._journal.generations()
+        _, content = row.verified(tmp_path)
+        newer = GenerationRow.of(2, 0, 0, row.time, "{}", content | {"format": 2})
+        opened._journal.make_current(newer, forget=())
+        with pytest.raises(VersionError, match=r"format 2; .* upgrade"):
+            opened.latest(only=only)

@@ -20,7 +20,7 @@ from scroll_tactile.memory.rows import Arrays, Codes, Readings, unpack_readings
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import Sample, Stages
+from scroll_tactile.statistics.sample import Sample, SampledTouch, Stages
 
 __all__ = [
     "CANDIDATES",
@@ -121,8 +121,8 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
 class Exemplar:
     """A stream with its readings, and what herding needs of it.
 
-    packed: its readings as arrays of a journal row. code: the last of its rows of codes at its widest scale, int32 of
-    shape (d,): the mean of all that judges there. scale: that scale.
+    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest scale, int32
+    of shape (d,). scale: that scale.
     """
 
     material: str
@@ -134,8 +134,7 @@ class Exemplar:
     @classmethod
     def of(cls, material: str, key: bytes, packed: Arrays, stages: Stages, codes: Codes) -> Exemplar:
         """The exemplar of a stream; stages: those that it reached. codes: its rows by scale, its own first."""
-        scale = max(stages[-1])
-        return cls(material, key, packed, codes[scale][sum(scale in stage for stage in stages) - 1], scale)
+        return cls(material, key, packed, SampledTouch.of(stages, codes).rows[-1], max(stages[-1]))
 
     @property
     def readings(self) -> Readings:

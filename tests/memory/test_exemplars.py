@@ -273,7 +273,7 @@ def test_what_0_1_noted_of_streams_dropped_for_their_bytes_is_passed_over():
 def test_an_exemplars_code_is_the_last_of_its_own_at_its_widest_scale():
     narrow, wide = Scale("window", 5), Scale("window", 20)
     codes = {narrow: np.arange(8, dtype=np.int32).reshape(4, 2), wide: np.array([[1, 2], [3, 4], [8, 9]], np.int32)}
-    stages = [{narrow: [0]}, {narrow: [0], wide: [0]}, {narrow: [0], wide: [0, 1]}]  # the last row is of a copy
+    stages = [{narrow: [[0]]}, {narrow: [[0]], wide: [[0]]}, {narrow: [[0]], wide: [[0, 1]]}]  # and a row of a copy
     one = Exemplar.of("wool", b"k", pack_readings(np.zeros((30, 4), np.float32)), stages, codes)
     assert (one.scale, one.code.tolist(), one.code.dtype) == (wide, [3, 4], np.int32)
 

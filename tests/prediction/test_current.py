@@ -22,6 +22,7 @@ from scroll_tactile.errors import CapacityError, InputError
 from scroll_tactile.prediction import current
 from scroll_tactile.prediction.model import Draft, Model
 from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.system import System
 
 OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
 PROBES = (("a", 50, 60), ("b", 51, 25), ("c", 52, 6))
@@ -57,7 +58,7 @@ def require_followed(learner):
         names = statistics.names(scale)
         counts = [readout.counts[readout.places[name]] for name in names]
         assert counts == statistics.counts(scale, names).tolist()
-        assert readout.rows == sum(counts)
+        assert readout.counts.sum() == sum(counts)
 
 
 def slowly(monkeypatch, seconds):
@@ -155,7 +156,7 @@ def failing(monkeypatch, what, name, error):
 
 
 @pytest.mark.parametrize(
-    ("what", "name"), [(Draft, "of"), (Draft, "fit"), (Model, "follow"), (Model, "judge"), (Readout, "solve")]
+    ("what", "name"), [(Draft, "of"), (Draft, "fit"), (Model, "follow"), (Model, "judge"), (System, "solve")]
 )
 def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, monkeypatch, what, name):
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:

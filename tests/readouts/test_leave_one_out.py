@@ -1,40 +1,96 @@
-"""A row taken out of the statistics leaves the readout that never observed it."""
+"""A touch taken out of a readout in one product, against one that never observed it, in fifty digits."""
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from readouts.dense import Dense, require_near
 
-from scroll_tactile.readouts.leave_one_out import leave_one_out_scores
-from scroll_tactile.readouts.readout import fit_readout
-from scroll_tactile.readouts.shrinkage import task_of
-from scroll_tactile.statistics.moments import within_scatter
+from scroll_tactile.readouts.leave_one_out import left_out
+from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
-SCALE = 9
+SCALE, WIDTH = 7, 4
+STAGES = [[SCALE]] * 3
 
 
-def statistics_of(rows, materials):
-    statistics = Statistics(rows.shape[1], [SCALE])
-    for at, (row, material) in enumerate(zip(rows, materials, strict=True)):
-        statistics.add(material, at % 3, {SCALE: row[None]})
-    return statistics
+def touches_of(kinds, seed, offset):
+    """Touches (material, key, rows, copies): `copies` times its rows are in the statistics, its own first."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(9, WIDTH)) * 40_000 + offset
+    touches = []
+    for number, (material, count, copies) in enumerate(kinds):
+        rows = np.rint(means[material] + rng.normal(size=(count, WIDTH)) * 20_000).astype(np.int32)
+        touches.append(("abcdefghi"[material], bytes([number]) * 32, rows, copies))
+    return touches
 
 
-@pytest.mark.parametrize("penalty", [0.01, 1.0])
-def test_it_is_as_if_the_row_had_never_been_observed(penalty):
-    rng = np.random.default_rng(0)
-    materials = [name for name in "abc" for _ in range(4)] + ["d", "d"]
-    shifts = {name: rng.normal(0, 3e5, 8) for name in "abcd"}
-    rows = np.rint([rng.normal(0, 2e5, 8) + shifts[name] for name in materials]).astype(np.int32)
-    statistics = statistics_of(rows, materials)
-    readout = fit_readout(task_of(statistics, SCALE), penalty)
-    places = ["abcd".index(name) for name in materials]
-    found = leave_one_out_scores(statistics, SCALE, readout, rows.astype(np.float64), places)
-    for out, row in enumerate(rows):
-        left = statistics_of(np.delete(rows, out, axis=0), materials[:out] + materials[out + 1 :])
-        counts, sums = left.totals(SCALE)
-        system = within_scatter(left.total_second(SCALE), counts, sums)
-        system = np.triu(system) + np.triu(system, 1).T + np.diag(readout.penalties)
-        means = sums / counts[:, None] - readout.center
-        solved = np.linalg.solve(system, means.T) * len(rows)
-        scores = (row - readout.center) @ solved - np.einsum("cd,dc->c", means, solved) / 2
-        np.testing.assert_allclose(found[out], scores, rtol=1e-9, atol=1e-9)
+def learned(touches, unsampled=()):
+    statistics, sample = Statistics(WIDTH, [SCALE]), TouchSample()
+    for material, key, rows, copies in touches:
+        codes = {SCALE: np.concatenate([rows] * copies)}
+        statistics.add(material, codes)
+        if material not in unsampled:
+            sample.add(material, key, SampledTouch.of([{SCALE: [[i]]} for i in range(len(rows))], codes))
+    return statistics, sample
+
+
+def groups_of(touches):
+    groups = {}
+    for material, _, rows, copies in touches:
+        groups.setdefault(material, []).extend((row.tolist(), copies) for row in rows)
+    return groups
+
+
+# Of a touch: material, rows, and how often they are there.
+KINDS = st.lists(st.tuples(st.integers(0, 4), st.integers(1, 3), st.integers(1, 2)), min_size=2, max_size=9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), st.sampled_from(["lda", "ridge"]), st.booleans())
+def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind, others):
+    """With the same P and γ. others: some materials are of no sampled touch, as where there are very many."""
+    touches = touches_of(kinds, seed, offset)
+    unsampled = {"d", "e"} if others and kind == "lda" else set()
+    if not {material for material, *_ in touches} - unsampled:
+        return
+    statistics, sample = learned(touches, unsampled)
+    reference = [name for name in statistics.names(SCALE) if name not in unsampled]
+    task = Task.of(statistics, SCALE, reference)
+    readout = Readout(task, statistics)
+    found = left_out(readout, task, sample, STAGES, kind)
+    assert found.names == reference
+    total = Fraction(int(statistics.second(SCALE).rows))
+    excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
+    places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
+    judged = set()
+    for i, (material, key, rows, _) in enumerate(touches):
+        rest = [other for j, other in enumerate(touches) if i != j]
+        if material in unsampled or material not in {other for other, *_ in rest}:
+            continue
+        dense = Dense(groups_of(rest), readout.penalty, readout.share, reference, total, excess)
+        for stage, row in enumerate(rows):
+            judged.add((places[material, key], stage))
+            place = found.rows[places[material, key], stage]
+            scores = dense.lda(row, reference, readout.origin) if kind == "lda" else dense.ridge(row, reference)
+            require_near(found.scores[place], scores)
+            require_near(found.distances[place], dense.distances(row, reference))
+    assert found.rows.keys() == judged
+    assert sorted(found.rows.values()) == list(range(len(found.scores)))
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(kind):
+    touches = touches_of([(0, 3, 1), (0, 1, 1), (1, 2, 1)], 0, 0)
+    statistics, sample = learned(touches)
+    task = Task.of(statistics, SCALE, ["a", "b"])
+    found = left_out(Readout(task, statistics), task, sample, STAGES, kind)
+    assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
+    assert found.scores.shape == found.z.shape == found.distances.shape == (4, 2)
+    alone, none = learned(touches[2:])
+    task = Task.of(alone, SCALE, ["b"])
+    empty = left_out(Readout(task, alone), task, none, STAGES, kind)
+    assert (empty.rows, empty.scores.shape) == ({}, (0, 1))

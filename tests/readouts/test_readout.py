@@ -1,205 +1,206 @@
-"""Readouts against the textbook's dense formulas, in fifty digits."""
+"""Readouts, solved and followed, against the textbook's dense formulas in fifty digits."""
 
-from fractions import Fraction
+import copy
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
-from scipy.special import softmax
+from readouts.dense import Dense, groups_of, require_near
 
-from examples.benchmarks.solvers.exact import Exact
-from scroll_tactile.readouts.readout import Task, centred_means, fit_readout
-from scroll_tactile.statistics.moments import SecondMoment, within_scatter
+from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.statistics.statistics import Statistics
 
-EDGE = 2**20
+EDGE, SCALE, WIDTH = 2**20, 7, 5
 
 
-def classes(sizes, dimension=4, seed=0, offset=0, spread=EDGE // 20):
-    rng = np.random.default_rng([seed, *sizes])
-    mixing = rng.normal(size=(dimension, dimension))
-    groups = []
-    for size in sizes:
-        mean = offset + rng.normal(size=dimension) * spread
-        rows = np.rint(mean + rng.normal(size=(size, dimension)) @ mixing * spread)
-        groups.append(np.clip(rows, -EDGE, EDGE).astype(np.int32))
-    return groups
+def touch(material, seed, offset=0, spread=20_000, rows=None):
+    """A touch of a material: its rows about a mean of the material's own."""
+    rng = np.random.default_rng([ord(material), seed])
+    mean = np.random.default_rng(ord(material)).normal(size=WIDTH) * 60_000
+    count = int(rng.integers(1, 4)) if rows is None else rows
+    mixing = np.random.default_rng(9).normal(size=(WIDTH, WIDTH))
+    found = offset + mean + rng.normal(size=(count, WIDTH)) @ mixing * spread
+    return material, np.clip(np.rint(found), -EDGE, EDGE).astype(np.int32)
 
 
-def task_of(groups):
-    moment = SecondMoment(groups[0].shape[1])
-    for rows in groups:
-        moment.add(rows)
-    counts = np.array([len(rows) for rows in groups])
-    sums = np.stack([rows.sum(axis=0, dtype=np.int64) for rows in groups])
-    return Task.of(within_scatter(moment.packed(), counts, sums), counts, sums)
+def statistics_of(touches):
+    statistics = Statistics(WIDTH, [SCALE])
+    for material, rows in touches:
+        statistics.add(material, {SCALE: rows})
+    return statistics
 
 
-class Dense:
-    """The same answers from the rows themselves, with matrices of mpmath's numbers."""
+def readout_of(statistics, reference=None):
+    return Readout(Task.of(statistics, SCALE, reference or statistics.names(SCALE)), statistics)
 
-    def __init__(self, groups, penalty):
-        with mpmath.workdps(50):
-            rows = mpmath.matrix(np.concatenate(groups).tolist())
-            self.width, total = rows.cols, rows.rows
-            self.center = [mpmath.fsum(rows[:, j]) / total for j in range(self.width)]
-            variances = [
-                mpmath.fsum((rows[i, j] - self.center[j]) ** 2 for i in range(total)) / total for j in range(self.width)
-            ]
-            self.scale = [mpmath.sqrt(v) if v else mpmath.mpf(1) for v in variances]
-            x = mpmath.matrix(total, self.width)
-            for i in range(total):
-                for j in range(self.width):
-                    x[i, j] = (rows[i, j] - self.center[j]) / self.scale[j]
-            labels = [y for y, group in enumerate(groups) for _ in group]
-            self.shares = [mpmath.mpf(len(group)) / total for group in groups]
-            targets = mpmath.matrix(total, len(groups))
-            for i, y in enumerate(labels):
-                for k in range(len(groups)):
-                    targets[i, k] = (1 if k == y else 0) - self.shares[k]
-            self.means = []
-            first = 0
-            centred = x.copy()
-            for group in groups:
-                mean = [
-                    mpmath.fsum(x[i, j] for i in range(first, first + len(group))) / len(group)
-                    for j in range(self.width)
-                ]
-                for i in range(first, first + len(group)):
-                    for j in range(self.width):
-                        centred[i, j] -= mean[j]
-                self.means.append(mpmath.matrix(mean))
-                first += len(group)
-            diagonal = penalty * mpmath.eye(self.width)
-            self.within = centred.T * centred / total + diagonal
-            self.total = x.T * x / total + diagonal
-            self.regression = mpmath.inverse(self.total) * (x.T * targets / total)
 
-    def scaled(self, x):
-        return mpmath.matrix([(int(v) - c) / s for v, c, s in zip(x, self.center, self.scale, strict=True)])
-
-    def ridge(self, x):
-        with mpmath.workdps(50):
-            found = self.scaled(x).T * self.regression
-            return [float(share + found[0, k]) for k, share in enumerate(self.shares)]
-
-    def squared(self, system, x):
-        return (x.T * mpmath.lu_solve(system, x))[0]
-
-    def distances(self, x):
-        with mpmath.workdps(50):
-            return [self.squared(self.within, self.scaled(x) - mean) for mean in self.means]
-
-    def lda(self, x):
-        """Scores less the first one's: what all classes share cancels."""
-        near = self.distances(x)
-        return [float((near[0] - one) / 2) for one in near]
-
-    def novelty(self, x, candidates=None):
-        with mpmath.workdps(50):
-            near = self.distances(x)
-            nearest = min(near[y] for y in (range(len(near)) if candidates is None else candidates))
-            return float(nearest - self.squared(self.total, self.scaled(x)))
+def require_textbook(readout, touches, probes, tolerance=1e-9):
+    names = sorted({material for material, _ in touches})
+    reference = [readout.names[place] for place in readout.reference]
+    dense = Dense(groups_of(touches), readout.penalty, readout.share, reference)
+    places = [readout.places[name] for name in names]
+    known = [readout.places[name] for name in reference]
+    for row in probes:
+        codes = row.astype(np.float64)
+        require_near(readout.scores(codes, places, "lda"), dense.lda(row, names, readout.origin), tolerance)
+        near = dense.distances(row, names)
+        size = {"abs": tolerance * max(1.0, dense.length(row))}
+        assert readout.novelty(codes, places) == pytest.approx(min(near), **size)
+        assert readout.novelty(codes, places[1:] or places) == pytest.approx(min(near[1:] or near), **size)
+        if len(reference) == len(names):
+            require_near(readout.scores(codes, known, "ridge"), dense.ridge(row, reference), tolerance)
+        for kind in ("lda", "ridge") if len(reference) == len(names) else ("lda",):
+            weights, offsets = readout.linear(names, kind)
+            require_near((codes - readout.origin) @ weights + offsets, readout.scores(codes, places, kind), tolerance)
 
 
 CASES = {
-    "ordinary": classes([12, 9, 15]),
-    "two classes": classes([5, 30]),
-    "single rows": classes([1, 1, 1, 2]),
-    "fewer rows than features": classes([2, 1], dimension=6),
-    "far from zero": classes([10, 10, 10], offset=EDGE * 0.9, spread=200),
-    "hardly any spread": classes([10, 10], offset=EDGE // 2, spread=2),
+    "ordinary": [touch("abc"[i % 3], i) for i in range(20)],
+    "two materials": [touch("ab"[i > 3], i) for i in range(9)],
+    "one material": [touch("a", i) for i in range(6)],
+    "one touch each": [touch(name, 0) for name in "abcd"],
+    "one row each": [touch(name, 0, rows=1) for name in "abcd"],
+    "one row": [touch("a", 0, rows=1)],
+    "fewer rows than features": [touch("a", 0, rows=1), touch("b", 0, rows=2), touch("b", 1, rows=1)],
+    "mean far from zero": [touch("abc"[i % 3], i, 0.9 * EDGE, 50) for i in range(12)],
+    "hardly any spread": [touch("ab"[i % 2], i, 0, 1) for i in range(10)],
 }
+PROBES = [touch("a", 50, rows=1)[1][0], touch("c", 51, rows=1)[1][0], np.full(WIDTH, EDGE), np.zeros(WIDTH, np.int32)]
 
 
-@pytest.mark.parametrize("penalty", [1e-4, 1e-2, 1.0])
-@pytest.mark.parametrize("groups", CASES.values(), ids=CASES)
-def test_all_answers_are_the_textbooks(groups, penalty):
-    readout = fit_readout(task_of(groups), penalty)
-    dense = Dense(groups, penalty)
-    rng = np.random.default_rng(1)
-    points = [groups[0][0], groups[-1][-1], np.rint(np.mean(groups[1], axis=0)).astype(np.int32)]
-    points.append(np.clip(points[0] + rng.integers(-300, 300, len(points[0])), -EDGE, EDGE))
-    for x in points:
-        z = readout.project(x)
-        scores = readout.scores(z, "lda")
-        close = {"rel": 1e-8, "abs": 1e-8 * (1 + np.abs(scores).max())}
-        assert readout.scores(z, "ridge").tolist() == pytest.approx(dense.ridge(x), rel=1e-8, abs=1e-8)
-        assert (scores - scores[0]).tolist() == pytest.approx(dense.lda(x), **close)
-        assert float(readout.novelty(z)) == pytest.approx(dense.novelty(x), **close)
-        assert float(readout.novelty(z, np.array([1]))) == pytest.approx(dense.novelty(x, [1]), **close)
+@pytest.mark.parametrize("touches", CASES.values(), ids=CASES)
+def test_all_answers_are_the_textbooks(touches):
+    require_textbook(readout_of(statistics_of(touches)), touches, [*PROBES, touches[0][1][0]])
 
 
-FELT = st.lists(
-    hnp.arrays(np.int32, st.tuples(st.integers(1, 6), st.just(3)), elements=st.integers(-EDGE, EDGE)),
-    min_size=2,
-    max_size=5,
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 9), st.integers(1, 3), st.integers(1, 9))
+def test_of_a_reference_and_materials_held_when_asked_for(seed, materials, each, reference):
+    touches = [touch("abcdefghi"[i % materials], seed + i) for i in range(materials * each)]
+    names = sorted({name for name, _ in touches})[: min(reference, materials)]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
+        monkeypatch.setattr("scroll_tactile.readouts.readout.MOST_HELD", 5)
+        readout = readout_of(statistics_of(touches), names)
+        few = sorted({name for name, _ in touches})[-3:]
+        dense = Dense(groups_of(touches), readout.penalty, readout.share, names)
+        for row in PROBES:
+            found = readout.scores(row.astype(float), [readout.places[name] for name in few], "lda")
+            require_near(found, dense.lda(row, few, readout.origin))
+
+
+# A touch that comes, of a material and a number; or one that goes, by its place among those that are there.
+CHANGES = st.lists(
+    st.lists(
+        st.tuples(st.sampled_from("abcdef"), st.integers(0, 10**6)) | st.integers(0, 10**6), min_size=1, max_size=4
+    ),
+    max_size=8,
 )
 
 
-@settings(max_examples=40, deadline=None)
-@given(FELT, st.sampled_from([1e-3, 1.0, 1e6]))
-def test_targets_of_plus_and_minus_one_are_those_of_0_and_1_at_temperature_2(groups, penalty):
-    rows, places = np.concatenate(groups) / EDGE, np.repeat(np.arange(len(groups)), [len(one) for one in groups])
-    targets = np.eye(len(groups))[places]
-    scores = []
-    for wanted in (targets, 2 * targets - 1):
-        solver = Exact()
-        solver.start(3, len(groups), penalty)
-        solver.update(rows, wanted)
-        weights, _ = solver.solve(centred=True)
-        scores.append((rows - rows.mean(axis=0)) @ weights + wanted.mean(axis=0))
-    assert softmax(scores[0], axis=1) == pytest.approx(softmax(scores[1] / 2, axis=1), rel=1e-12, abs=1e-15)
+@settings(max_examples=30, deadline=None)
+@given(CHANGES, st.sampled_from([0, 0.9 * EDGE]), st.booleans())
+def test_followed_it_is_the_textbooks_of_what_is_there(batches, offset, lazily):
+    """With the same P and ρ; where it cannot follow it says so, and is solved again."""
+    touches = [touch("abc"[i % 3], i, offset) for i in range(15)]
+    statistics = statistics_of(touches)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        if lazily:
+            monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 1)
+        reference = ["a", "b"] if lazily else None
+        readout = readout_of(statistics, reference)
+        for batch in batches:
+            changes = []
+            for change in batch:
+                if isinstance(change, int) and len(touches) > 1:
+                    name, rows = touches.pop(change % len(touches))
+                    statistics.remove(name, {SCALE: rows})
+                    changes.append((name, rows, -1))
+                elif not isinstance(change, int):
+                    touches.append(touch(*change, offset))
+                    statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
+                    changes.append((*touches[-1], 1))
+            gone = any(name not in statistics.names(SCALE) for name, *_ in changes)
+            followed = readout.follow(changes)
+            assert not (gone and followed)
+            if not followed:
+                there = statistics.names(SCALE)
+                readout = readout_of(statistics, [name for name in reference or there if name in there] or there[:1])
+        monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 1024)
+        require_textbook(readout, touches, PROBES[:2])
 
 
-def test_class_means_keep_the_digits_of_their_distance():
-    counts = np.array([3, 7, 1_000_003])
-    sums = np.array([[3 * EDGE - 1], [7 * EDGE - 3], [1_000_003 * EDGE - 400_001]])
-    center, means = centred_means(counts, sums)
-    exact = [Fraction(int(total), int(count)) for (total,), count in zip(sums, counts, strict=True)]
-    assert float(center[0]) == pytest.approx(sums.sum() / counts.sum(), rel=1e-15)
-    rounding = 4 * EDGE * float(np.finfo(np.longdouble).eps) + 2.0**-52  # of the means, and of what is left of them
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        assert abs(Fraction(means[i, 0]) - Fraction(means[j, 0]) - (exact[i] - exact[j])) <= rounding
+def test_following_stays_exact_for_as_long_as_it_follows():
+    touches = [touch("abc"[i % 3], i, 0.9 * EDGE) for i in range(15)]
+    statistics = statistics_of(touches)
+    readout, followed = readout_of(statistics), 0
+    for i in range(200):
+        touches.append(touch("abc"[i % 3], 100 + i, 0.9 * EDGE, rows=1))
+        statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
+        if readout.follow([(*touches[-1], 1)]):
+            followed += 1
+            continue
+        break
+    assert followed == 32  # all the columns that there is room for
+    assert readout.crowded
+    require_textbook(readout, touches[:-1], PROBES[:2])
+    fresh = readout_of(statistics)
+    assert not fresh.crowded
+    require_textbook(fresh, touches, PROBES[:2])
 
 
-@pytest.mark.parametrize("value", [0, EDGE, 333_333, -777_777])
-def test_a_constant_feature_says_nothing(value):
-    groups = classes([7, 8, 9], dimension=3)
-    wider = [np.insert(rows, 1, value, axis=1) for rows in groups]
-    without, readout = fit_readout(task_of(groups), 0.01), fit_readout(task_of(wider), 0.01)
-    assert not readout.weights[1].any()
-    assert np.isfinite(readout.weights).all()
-    for x, row in zip(groups[0], wider[0], strict=True):
-        longer = row.copy()
-        longer[1] = -5000  # a value never observed there
-        assert np.allclose(without.project(x), readout.project(longer), rtol=1e-9, atol=1e-9)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [("a", touch("a", 0, rows=40)[1], 1)],  # more columns than there is room for
+        [(*touch("a", 91, spread=9, rows=3), 1), (*touch("a", 90, spread=10**6, rows=3), 1)],  # much louder than others
+        [(*touch("d", 0), -1)],  # never observed
+        [(*touch("a", i, spread=300), -1) for i in (0, 3)],  # all that there was of it
+    ],
+)
+def test_where_it_cannot_follow_it_says_so(changes):
+    statistics = statistics_of([touch("abc"[i % 3], i, spread=300) for i in range(6)])
+    assert not readout_of(statistics).follow(changes)
+    assert readout_of(statistics).follow([])
 
 
-def test_all_features_constant_leave_the_shares():
-    groups = [np.full((3, 4), 77, np.int32), np.full((1, 4), 77, np.int32)]
-    readout = fit_readout(task_of(groups), 0.01)
-    z = readout.project(np.array([1, 2, 3, 4]))
-    assert readout.scores(z, "ridge").tolist() == [0.75, 0.25]
-    assert readout.scores(z, "lda").tolist() == [0, 0]
+def test_a_material_that_is_new_is_known_at_once_and_belongs_to_the_reference_where_all_do():
+    touches = [touch("abc"[i % 3], i) for i in range(12)]
+    statistics = statistics_of(touches)
+    whole, part = readout_of(statistics), readout_of(statistics, ["a", "b"])
+    touches.append(touch("z", 0))
+    statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
+    assert whole.follow([(*touches[-1], 1)])
+    assert part.follow([(*touches[-1], 1)])
+    assert [readout.names for readout in (whole, part)] == [[*"abcz"]] * 2
+    assert [readout.reference.tolist() for readout in (whole, part)] == [[0, 1, 2, 3], [0, 1]]
+    require_textbook(whole, touches, PROBES[:2])
+    require_textbook(part, touches, PROBES[:2])
 
 
-@pytest.mark.parametrize("size", [1, 2, 20])
-def test_one_class_is_always_the_answer(size):
-    readout = fit_readout(task_of(classes([size])), 0.01)
-    for x in (np.zeros(4), np.full(4, EDGE)):
-        z = readout.project(x)
-        assert readout.scores(z, "ridge").tolist() == pytest.approx([1])
-        assert np.isfinite(readout.scores(z, "lda")).all()
-        assert np.isfinite(readout.novelty(z))
-
-
-def test_a_penalty_too_small_is_named_and_the_task_is_left_as_it_was():
-    task = task_of(CASES["fewer rows than features"])
-    before = task.covariance.tobytes()
-    with pytest.raises(np.linalg.LinAlgError, match="too small"):
-        fit_readout(task, -1.0)
-    fit_readout(task, 0.1)
-    assert task.covariance.tobytes() == before
+@pytest.mark.parametrize("followed", [False, True])
+@pytest.mark.parametrize("materials", [4, 400])
+def test_a_coarse_comparison_keeps_its_bounds(monkeypatch, followed, materials):
+    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
+    rng = np.random.default_rng(0)
+    names = [f"{i:03d}" for i in range(materials)]
+    statistics = Statistics(WIDTH, [SCALE])
+    for name in names * 2:
+        statistics.add(name, {SCALE: rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)})
+    readout = readout_of(statistics, names[:2])
+    probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
+    readout.coarse(probe)
+    if followed:
+        for name in ("000", names[-1], "new", "new"):
+            rows = rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)
+            statistics.add(name, {SCALE: rows})
+            assert readout.follow([(name, rows, 1)])
+    scores, errors = readout.coarse(probe)
+    exact = copy.deepcopy(readout).scores(probe, range(len(readout.names)), "lda")
+    assert (np.abs(scores - exact) <= errors).all()
+    assert errors.max() <= 1e-3 * np.abs(exact).max()
+    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 10**6)
+    plain = readout.novelty(probe, np.arange(len(readout.names)))
+    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
+    assert readout.novelty(probe, np.arange(len(readout.names))) == pytest.approx(plain, rel=1e-12)

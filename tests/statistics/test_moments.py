@@ -92,11 +92,9 @@ def test_a_full_moment_refuses_before_anything_is_added():
 
 def exact_scatter(groups):
     """Σ over classes of Σ (x − mean)(x − mean)ᵀ, as fractions."""
-    width = next(len(rows[0]) for rows in groups if len(rows))
+    width = len(groups[0][0])
     total = [[Fraction(0)] * width for _ in range(width)]
     for rows in groups:
-        if not len(rows):
-            continue
         table = [[int(value) for value in row] for row in rows]
         sums = [sum(column) for column in zip(*table, strict=True)]
         for i in range(width):
@@ -107,24 +105,24 @@ def exact_scatter(groups):
 
 
 def compare(groups, *, relative=1e-14):
-    width = next(rows.shape[1] for rows in groups if len(rows))
+    width = groups[0].shape[1]
     moment = SecondMoment(width)
     for rows in groups:
         moment.add(rows)
     counts = np.array([len(rows) for rows in groups])
-    sums = np.stack([rows.sum(axis=0, dtype=np.int64) if len(rows) else np.zeros(width, np.int64) for rows in groups])
+    sums = np.stack([rows.sum(axis=0, dtype=np.int64) for rows in groups])
     before = moment.packed().copy()
-    found = np.triu(within_scatter(moment.packed(), counts, sums))
+    found = np.tril(within_scatter(moment.packed(), counts, sums))
     assert np.array_equal(moment.packed(), before)
     exact = exact_scatter(groups)
     for i in range(width):
         for j in range(i + 1):
             # An entry's rounding is measured against the features' own scatter.
             size = float(exact[i][i] * exact[j][j]) ** 0.5
-            assert abs(Fraction(float(found[j, i])) - exact[i][j]) <= Fraction(relative * size), (i, j)
+            assert abs(Fraction(float(found[i, j])) - exact[i][j]) <= Fraction(relative * size), (i, j)
 
 
-@pytest.mark.parametrize("sizes", [[5], [40, 30], [1, 2, 3], [0, 7, 0, 9], [300, 1]])
+@pytest.mark.parametrize("sizes", [[5], [40, 30], [1, 2, 3], [300, 1]])
 def test_the_scatter_of_ordinary_classes(sizes):
     compare([codes(size, 5, seed) for seed, size in enumerate(sizes)])
 
@@ -141,7 +139,7 @@ def test_single_rows_and_constant_classes_have_no_scatter_at_all():
         moment = added(*groups)
         counts = np.array([len(rows) for rows in groups])
         sums = np.stack([rows.sum(axis=0, dtype=np.int64) for rows in groups])
-        assert not np.triu(within_scatter(moment.packed(), counts, sums)).any()
+        assert not np.tril(within_scatter(moment.packed(), counts, sums)).any()
 
 
 def test_the_scatter_of_a_class_near_capacity():
@@ -149,7 +147,7 @@ def test_the_scatter_of_a_class_near_capacity():
     many = 2**22 - 1
     low, high = EDGE - 1, EDGE
     packed = np.array([many * (low**2 + high**2)], dtype=np.int64)
-    found = np.triu(within_scatter(packed, np.array([2 * many]), np.array([[many * (low + high)]])))
+    found = np.tril(within_scatter(packed, np.array([2 * many]), np.array([[many * (low + high)]])))
     assert found[0, 0] == pytest.approx(many / 2, rel=1e-14)
 
 
@@ -163,6 +161,6 @@ def test_a_large_dimension_and_read_only_rows():
 
 def test_the_scatter_of_more_classes_than_one_block():
     rng = np.random.default_rng(0)
-    compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(0, 4, size=1100))])
+    compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(1, 5, size=1100))])
     # At the bound, where the limbs are largest.
     compare([codes(2, 2, seed, EDGE - 3, EDGE) for seed in range(2100)])

@@ -1,6 +1,8 @@
 """Samples: bounded, even over the materials, and functions of what was observed, not of the order."""
 
 from collections import Counter
+from fractions import Fraction
+from math import floor
 
 import numpy as np
 import pytest
@@ -8,16 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.statistics.sample import CAPACITY, TouchSample, WindowSums
+from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.sample import CAPACITY, SampledTouch, TouchSample, stage_rows
 
 DIMENSION = 2
 
 
-def sums_of(material, key):
-    """Sums whose content tells which touch they are of."""
+def touch_of(material, key):
+    """Rows whose content tells which touch they are of."""
     stages = len(key) % 2 + 1
-    sums = np.full((stages, DIMENSION), 1000 * ord(material[0]) + key[0], dtype=np.int32)
-    return WindowSums(sums, np.array([(stage, 0, stage + 1) for stage in range(stages)]))
+    rows = np.full((stages, DIMENSION), 1000 * ord(material[0]) + key[0], dtype=np.int32)
+    return SampledTouch(rows, np.array([(stage, 0, stage + 1) for stage in range(stages)]))
 
 
 def sample_of(streams, capacity=6):
@@ -25,14 +28,14 @@ def sample_of(streams, capacity=6):
     for material, key in streams:
         before, wanted = content(sample), sample.wants(material, key)
         assert content(sample) == before
-        sample.add(material, key, sums_of(material, key))
+        sample.add(material, key, touch_of(material, key))
         assert (content(sample) != before) == wanted
         assert not (wanted and not sample.holds(material, key))
     return sample
 
 
 def content(sample):
-    return [(material, key, sums.sums.tobytes(), sums.pairs.tobytes()) for material, key, sums in sample]
+    return [(material, key, touch.rows.tobytes(), touch.pairs.tobytes()) for material, key, touch in sample]
 
 
 def expected(streams, capacity=6):
@@ -67,7 +70,7 @@ def test_it_is_filled_again_from_streams_of_which_only_those_that_stay_are_made(
 
     def make(material, key, sequence):
         made.append((material, key, sequence))
-        return sums_of(material, key)
+        return touch_of(material, key)
 
     kept = [(material, key) for material, key, _ in sample]
     sample.refill([(material, key, sequence) for sequence, (material, key) in enumerate(behind)], make)
@@ -82,7 +85,7 @@ def test_what_a_store_keeps_is_all_of_it(before, after):
     sample = sample_of(before, CAPACITY)
     again = TouchSample.from_arrays(*sample.to_arrays())
     for part in (sample, again):
-        part.add(*after, sums_of(*after))
+        part.add(*after, touch_of(*after))
     assert content(again) == content(sample) == content(sample_of([*before, after], CAPACITY))
 
 
@@ -92,12 +95,56 @@ def test_a_sample_of_nothing_is_refused(capacity):
         TouchSample(capacity)
 
 
-def test_a_touch_holds_the_sums_of_each_stages_windows():
-    codes = {5: np.arange(12, dtype=np.int32).reshape(4, 3), 20: np.full((1, 3), 2**20, dtype=np.int32)}
-    sums = WindowSums.of([{5: [0]}, {5: [0, 2, 3], 20: [0]}], codes)
-    assert [mean.tolist() for mean in sums.means(0)] == [[0, 1, 2]]
-    assert [mean.tolist() for mean in sums.means(1)] == [[5, 6, 7], [2**20] * 3]
-    assert (sums.means(2), sums.windows(0), sums.windows(1), sums.windows(2)) == (None, [1], [3, 1], [])
+# Of each stage: the places of windows, in groups, at each of two scales; a scale judges there or does not.
+stages = st.lists(
+    st.dictionaries(
+        st.sampled_from([5, 20]),
+        st.lists(st.lists(st.integers(0, 7), min_size=1, max_size=5), min_size=1, max_size=3),
+        min_size=1,
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def rounded(rows):
+    """The mean of rows, halves upward, in exact fractions."""
+    return [floor(Fraction(sum(column), len(rows)) + Fraction(1, 2)) for column in zip(*rows.tolist(), strict=True)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(stages, st.integers(0, 999), st.integers(0, 3))
+def test_a_touch_is_a_row_a_group_the_rounded_mean_of_its_windows(stages, seed, copies):
+    rng = np.random.default_rng(seed)
+    windows = {scale: rng.integers(-(2**20), 2**20, (8, 3), dtype=np.int32, endpoint=True) for scale in (5, 20)}
+    learned = stage_rows(stages, windows)
+    for scale, rows in learned.items():
+        groups = [group for stage in stages for group in stage.get(scale, [])]
+        assert rows.dtype == np.int32
+        assert rows.tolist() == [rounded(windows[scale][group]) for group in groups]
+    assert set(learned) == {scale for stage in stages for scale in stage}
+    # Its copies' rows stand behind its own.
+    codes = {scale: np.concatenate([rows, *[rows[::-1] // 2] * copies]) for scale, rows in learned.items()}
+    touch, used = SampledTouch.of(stages, codes), dict.fromkeys(learned, 0)
+    for number, stage in enumerate(stages):
+        expected = []
+        for place, scale in enumerate(sorted(stage)):
+            first, used[scale] = used[scale], used[scale] + len(stage[scale])
+            expected.append(rounded(learned[scale][first : used[scale]]))
+            assert [number, place, len(codes[scale])] in touch.pairs.tolist()
+        assert touch.at(number).tolist() == expected
+    assert touch.at(len(stages)).shape == (0, 3)
+
+
+def test_halves_go_upward_whatever_the_sign():
+    assert mean_code(np.array([3, -3, 5, -5, 1, -1]), 2).tolist() == [2, -1, 3, -2, 1, 0]
+
+
+def test_the_sums_that_an_earlier_version_kept_become_rows():
+    pairs = np.array([[0, 0, 2], [1, 0, 3], [1, 1, 1]])
+    touch = SampledTouch.of_sums(np.array([[3, -3], [10, 11], [7, -7]], np.int32), pairs)
+    assert touch.rows.tolist() == [[2, -1], [3, 4], [7, -7]]
+    assert touch.at(1).tolist() == [[3, 4], [7, -7]]
 
 
 @pytest.mark.parametrize("materials", [1, 7, 400])
@@ -106,7 +153,7 @@ def test_the_usual_capacity_is_shared_evenly(materials):
     sample = TouchSample()
     for i in range(1200):
         key = rng.bytes(32)
-        sample.add(str(i % materials), key, sums_of("m", key))
+        sample.add(str(i % materials), key, touch_of("m", key))
     assert len(sample) == CAPACITY
     places = Counter(material for material, *_ in sample).values()
     assert max(places) - min(places) <= 1

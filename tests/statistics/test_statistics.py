@@ -8,19 +8,19 @@ from hypothesis import strategies as st
 from scroll_tactile.errors import CapacityError, InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
-from scroll_tactile.statistics.statistics import FOLDS, Statistics, fold_of
+from scroll_tactile.statistics.statistics import Statistics
 
 DIMENSION, SCALES = 3, (5, 20)
 
 
 def touch(seed):
-    """Material, fold and codes: windows at the short scale, and at the long one too for some."""
+    """Material and codes: rows at the short scale, and at the long one too for some."""
     rng = np.random.default_rng(seed)
     material = "abcdefghijkl"[rng.integers(12)]
     codes = {5: rng.integers(-(2**BITS), 2**BITS, size=(rng.integers(1, 5), DIMENSION), dtype=np.int32, endpoint=True)}
     if rng.random() < 0.5:
         codes[20] = rng.integers(-(2**BITS), 2**BITS, size=(2, DIMENSION), dtype=np.int32)
-    return material, int(rng.integers(FOLDS)), codes
+    return material, codes
 
 
 def of(touches):
@@ -39,10 +39,8 @@ def same(left, right):
         names = left.names(scale)
         assert left.counts(scale, names).tobytes() == right.counts(scale, names).tobytes()
         assert left.sums(scale, names).tobytes() == right.sums(scale, names).tobytes()
-        assert left.total_second(scale).tobytes() == right.total_second(scale).tobytes()
-        for fold in range(FOLDS):
-            assert left.second(scale, fold).rows == right.second(scale, fold).rows
-            assert left.second(scale, fold).packed().tobytes() == right.second(scale, fold).packed().tobytes()
+        assert left.second(scale).rows == right.second(scale).rows
+        assert left.second(scale).packed().tobytes() == right.second(scale).packed().tobytes()
 
 
 touches = st.lists(st.integers(0, 40), max_size=25)
@@ -112,17 +110,16 @@ def test_what_a_store_keeps_is_all_of_it(observed):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda s: s.add("wool", 1, {5: np.zeros((1, 3), np.int32)}),
-        lambda s: s.add("wool", 0, {5: np.array([[0, 0, 1]], np.int32)}),
-        lambda s: s.add("felt", 0, {5: np.zeros((1, 3), np.int32)}),
-        lambda s: s.add("wool", 0, {20: np.zeros((1, 3), np.int32)}),
-        lambda s: s.add("wool", 0, {5: np.zeros((2, 3), np.int32)}),
+        lambda s: s.add("wool", {5: np.array([[0, 0, 1]], np.int32)}),
+        lambda s: s.add("felt", {5: np.zeros((1, 3), np.int32)}),
+        lambda s: s.add("wool", {20: np.zeros((1, 3), np.int32)}),
+        lambda s: s.add("wool", {5: np.zeros((2, 3), np.int32)}),
         lambda s: None,
     ],
 )
 def test_any_difference_shows_in_the_digest(change):
     base = of([])
-    base.add("wool", 0, {5: np.zeros((1, 3), np.int32)})
+    base.add("wool", {5: np.zeros((1, 3), np.int32)})
     changed = of([])
     change(changed)
     assert base != changed
@@ -131,7 +128,7 @@ def test_any_difference_shows_in_the_digest(change):
 
 
 def test_what_is_not_contained_cannot_be_taken_out():
-    wool = ("wool", 0, {5: np.ones((2, 3), np.int32)})
+    wool = ("wool", {5: np.ones((2, 3), np.int32)})
     small, large = of([]), of([])
     small.add(*wool)
     large.add(*wool)
@@ -156,33 +153,32 @@ def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
     whole, part = of([]), of([])
     for statistics, touches in ((whole, ours), (part, theirs)):
         for rows in touches:
-            statistics.add("wool", 0, {5: np.array(rows, np.int32)})
+            statistics.add("wool", {5: np.array(rows, np.int32)})
     with pytest.raises(InputError, match="contain"):
         whole - part
 
 
 def test_only_what_was_observed_can_be_removed():
     statistics = of([])
-    statistics.add("wool", 1, {5: np.ones((1, 3), np.int32)})
-    for material, fold in (("felt", 1), ("wool", 0)):
-        with pytest.raises(UnknownMaterialError):
-            statistics.remove(material, fold, {5: np.ones((1, 3), np.int32)})
-    statistics.remove("wool", 1, {5: np.ones((1, 3), np.int32)})
+    statistics.add("wool", {5: np.ones((1, 3), np.int32)})
     with pytest.raises(UnknownMaterialError):
-        statistics.remove("wool", 1, {5: np.ones((1, 3), np.int32)})
+        statistics.remove("felt", {5: np.ones((1, 3), np.int32)})
+    statistics.remove("wool", {5: np.ones((1, 3), np.int32)})
+    with pytest.raises(UnknownMaterialError):
+        statistics.remove("wool", {5: np.ones((1, 3), np.int32)})
     same(statistics, of([]))
 
 
 def test_touches_of_other_lengths_are_distinguished():
     codes = {5: np.ones((2, 3), np.int32)}
     shorter, longer = of([]), of([])
-    shorter.add("wool", 0, codes, 40)
-    longer.add("wool", 0, codes, 50)
+    shorter.add("wool", codes, 40)
+    longer.add("wool", codes, 50)
     # All counts and sums agree; only the lengths do not.
     assert shorter != longer
     before = shorter.digest()
     with pytest.raises(UnknownMaterialError, match="50 columns"):
-        shorter.remove("wool", 0, codes, 50)
+        shorter.remove("wool", codes, 50)
     with pytest.raises(InputError, match="contain"):
         shorter - longer
     assert shorter.digest() == before
@@ -191,10 +187,10 @@ def test_touches_of_other_lengths_are_distinguished():
     assert (joint - longer).longest == 40
     arrays, names = joint.to_arrays()
     assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).longest == 50
-    joint.remove("wool", 0, codes, 50)
+    joint.remove("wool", codes, 50)
     same(joint, shorter)
     assert joint.longest == 40
-    joint.remove("wool", 0, codes, 40)
+    joint.remove("wool", codes, 40)
     assert joint.longest == 0
 
 
@@ -210,48 +206,61 @@ def test_statistics_of_other_shapes_do_not_mix():
         hash(of([]))
 
 
-def filled(rows, fold, scale=20):
+def filled(rows, scale=20):
     """Statistics that seem to hold so many rows of zeros at a scale already."""
     statistics = of([])
-    statistics.add("wool", fold, {5: np.zeros((1, 3), np.int32), scale: np.zeros((1, 3), np.int32)})
-    statistics._rows[scale][0, fold] = rows
-    statistics._seconds[scale][fold] = SecondMoment.of(np.zeros(6, np.int64), rows, DIMENSION)
+    statistics.add("wool", {5: np.zeros((1, 3), np.int32), scale: np.zeros((1, 3), np.int32)})
+    statistics._rows[scale][0] = rows
+    statistics._seconds[scale] = SecondMoment.of(np.zeros(6, np.int64), rows, DIMENSION)
     return statistics
 
 
-@pytest.mark.parametrize(("full", "fold"), [(0, 0), (0, 2), (1, 0), (2, 1)])
-def test_full_statistics_refuse_before_anything_is_added(full, fold):
-    """The sum over the folds has to fit int64 as well, not only each fold's own."""
-    statistics = filled(MOST_ROWS - 1, full)
+def test_full_statistics_refuse_before_anything_is_added():
+    statistics = filled(MOST_ROWS - 1)
     before = statistics.digest()
     codes = {5: np.ones((3, 3), np.int32), 20: np.ones((2, 3), np.int32)}
     with pytest.raises(CapacityError, match="exact"):
-        statistics.add("felt", fold, codes)
+        statistics.add("felt", codes)
     assert statistics.digest() == before
     assert statistics.materials == {"wool": 1}
-    assert [statistics.second(5, other).rows for other in range(FOLDS)] == [
-        int(other == full) for other in range(FOLDS)
-    ]
-    statistics.add("felt", fold, {5: codes[5], 20: codes[20][:1]})
+    assert statistics.second(5).rows == 1
+    statistics.add("felt", {5: codes[5], 20: codes[20][:1]})
     assert statistics.materials == {"felt": 1, "wool": 1}
 
 
 def test_full_statistics_do_not_merge():
     half = MOST_ROWS // 2 + 1
     with pytest.raises(CapacityError, match="exact"):
-        filled(half, 0) + filled(half, 1)
+        filled(half) + filled(half)
 
 
-@given(st.binary(min_size=32, max_size=32))
-def test_a_fold_is_a_function_of_the_key(key):
-    assert fold_of(key) == sum(byte << 8 * at for at, byte in enumerate(key[:8])) % FOLDS
+@few
+@given(touches, touches, touches)
+def test_three_folds_of_an_earlier_version_add_up(a, b, c):
+    """It kept rows and sums of each fold on an axis of their own, and a second moment for each."""
+    parts = [of(a), of(b), of(c)]
+    whole, names = of(a + b + c).to_arrays()
+
+    def by_fold(kept, *shape):
+        """What is kept of each material, shape (materials, folds, …)."""
+        found = [[kept(part, name) if name in part.materials else np.zeros(shape) for part in parts] for name in names]
+        return np.array(found, np.int64).reshape(len(names), 3, *shape)
+
+    arrays = {"lengths": whole["lengths"], "observations": by_fold(lambda part, name: part.materials[name])}
+    for scale in SCALES:
+        arrays[f"rows-{scale}"] = by_fold(lambda part, name, at=scale: part.counts(at, [name])[0])
+        arrays[f"sums-{scale}"] = by_fold(lambda part, name, at=scale: part.sums(at, [name])[0], DIMENSION)
+        for fold, part in enumerate(parts):
+            if part.second(scale).rows:
+                arrays[f"second-{scale}-{fold}"] = part.second(scale).packed()
+    same(Statistics.from_arrays(DIMENSION, SCALES, arrays, names), of(a + b + c))
 
 
 def test_fewer_touches_of_as_many_rows_do_not_contain_more():
     whole, part = of([]), of([])
-    whole.add("wool", 0, {5: np.ones((2, 3), np.int32)})
-    whole.add("felt", 0, {5: np.ones((1, 3), np.int32)})
+    whole.add("wool", {5: np.ones((2, 3), np.int32)})
+    whole.add("felt", {5: np.ones((1, 3), np.int32)})
     for _ in range(2):
-        part.add("wool", 0, {5: np.ones((1, 3), np.int32)})
+        part.add("wool", {5: np.ones((1, 3), np.int32)})
     with pytest.raises(InputError, match="contain"):
         whole - part

@@ -42,12 +42,8 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 """A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
-LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
-LEAST_RANK = 32
-# Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much louder
-# than all before, or one retracted on which the scatter rests, have K inverted again, that scores keep their 1e-9.
-LARGEST_CONDITION = 256.0
-FEW = 8  # rows that are solved for one by one: half of the time of a product of matrices
+FIRST_KNOWN = 256  # materials
+MOST_HELD = 4 * EAGER  # then those that were asked for are let go
 
 
 @dataclass(frozen=True)
@@ -122,17 +118,13 @@ class Readout:
         # Of single touches there is no scatter: then the nearest mean answers.
         spread = trace / dimension * self.share / (1 - self.share)
         self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
-        scatter[np.diag_indices(dimension)] += self.penalty
-        room = max(LEAST_RANK, dimension // LARGEST_RANK)
-        self._rank = 0
-        self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
-        self._inner = np.empty((room, room))  # E
-        self._largest = 1.0  # entry of what E is the inverse of
-        self._held: dict[int, int] = {}  # place → row of the next three
-        self._means = np.empty((0, dimension))
-        self._solved = np.empty((0, dimension))  # K⁻¹ m
-        self._crossed = np.empty((room, 0))  # U K⁻¹ m
-        self._derived: _Derived | None = None
+        matrix[np.diag_indices(dimension)] += self.penalty
+        self._held: dict[int, int] = {}  # place → row of these
+        self._means = self._solved = np.empty((0, dimension))  # m about the origin, and K⁻¹ m
+        self._sizes = np.empty(0)  # mᵀ K⁻¹ m
+        self._derived: Derived | None = None
+        self._coarse: Coarse | None = None
+        self._compared: tuple[FloatArray, FloatArray, FloatArray] | None = None
         with one_thread():
             self.system = System(matrix)
             self._hold(places, means)
@@ -186,8 +178,10 @@ class Readout:
         self._means, self._solved, self._sizes = self._means[:count], self._solved[:count], self._sizes[:count]
 
     def follow(self, changes: Sequence[Change]) -> bool:
-        """Take in touches, in the order they came, that the statistics have already; False where it has to be solved
-        again: they are too many, they outweigh what it was solved from, or a material went.
+        """Take in touches, in the order they came, that the statistics have already.
+
+        Returns False where all has to be solved again: they are too many, outweigh what it was solved from, or a
+        material went.
         """
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
@@ -199,19 +193,8 @@ class Readout:
                 before = 0.0 if place is None else self.counts[place]
                 if sign < 0 and before <= len(rows):
                     return False
-                if place is None:
-                    place = self._new_place(material)
-                self._follow(place, rows - self.origin, sign, before)
-        self._derived = None
-        return bool(self._largest * np.abs(self.inner()).max(initial=0.0) <= LARGEST_CONDITION)
-
-    def _new_place(self, material: str) -> int:
-        place = self.places[material] = len(self.names)
-        if len(self.reference) == place:  # all materials, and this one too
-            self.reference = np.append(self.reference, place)
-        self.names.append(material)
-        self.counts = np.append(self.counts, 0.0)
-        return place
+                self._follow(self._new_place(material) if place is None else place, rows - self.origin, sign, before)
+        return self.system.sound
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
@@ -251,19 +234,17 @@ class Readout:
         if self._coarse is not None:
             self._coarse.put(place, self._means[held], self._sizes[held])
 
-    def _border(self, cross: FloatArray, sign: int) -> None:
-        """Border E, the inverse of D + U K⁻¹ Uᵀ, by the last columns of that matrix without D, shape (r + k, k)."""
-        first, last = self._rank, len(cross)
-        self._largest = max(self._largest, float(np.abs(cross).max(initial=0.0)))
-        inner, above = self._inner[:first, :first], cross[:first]
-        onto = inner @ above
-        corner = np.linalg.inv(cross[first:] + sign * np.eye(last - first) - above.T @ onto)
-        corner = (corner + corner.T) / 2
-        beside = -onto @ corner
-        inner -= beside @ onto.T
-        self._inner[:first, first:last], self._inner[first:last, :first] = beside, beside.T
-        self._inner[first:last, first:last] = corner
-        self._rank = last
+    def _border(self, columns: FloatArray, sign: int) -> FloatArray:
+        """Take columns into K; returns K⁻¹ times them, shape (k, d)."""
+        if not len(columns):
+            return columns
+        leaving, corner = self.system.border(columns, sign)
+        onto = self._means @ leaving.T
+        self._solved -= (onto @ corner) @ leaving
+        self._sizes -= np.einsum("hk,kl,hl->h", onto, corner, onto)
+        if self._coarse is not None:
+            self._coarse.border(leaving, corner)
+        return np.asarray(leaving - (columns @ leaving.T) @ corner @ leaving)
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""

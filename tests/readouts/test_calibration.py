@@ -24,8 +24,8 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
     for i in range(touches):
         material, key = i % materials, rng.bytes(32)
         codes = {
-            scale: np.rint(means[place, material] + rng.normal(size=(2 - place, DIMENSION)) * noises[place]).astype(np.int32)
-            for place, scale in enumerate(SCALES)
+            scale: np.rint(means[place, material] + rng.normal(size=(2 - place, DIMENSION)) * noise).astype(np.int32)
+            for place, (scale, noise) in enumerate(zip(SCALES, noises, strict=True))
         }
         statistics.add(str(material), codes)
         pool.add(str(material), key, SampledTouch.of(REACHED, codes))
@@ -34,9 +34,8 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
 
 def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
-    tasks = {scale: Task.of(statistics, scale, statistics.names(scale)) for scale in scales}
-    readouts = {scale: Readout(task, statistics) for scale, task in tasks.items()}
-    return calibrate(pool, stages, tasks, readouts, kind)[0]
+    tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
+    return calibrate(pool, stages, {task.scale: Readout(task, statistics) for task in tasks}, kind)[0]
 
 
 def calibrated(kind="lda", **settings):

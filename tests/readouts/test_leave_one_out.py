@@ -61,7 +61,7 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     reference = [name for name in statistics.names(SCALE) if name not in unsampled]
     task = Task.of(statistics, SCALE, reference)
     readout = Readout(task, statistics)
-    found = left_out(readout, task, sample, STAGES, kind)
+    found = left_out(readout, sample, STAGES, kind)
     assert found.names == reference
     total = Fraction(int(statistics.second(SCALE).rows))
     excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
@@ -87,10 +87,10 @@ def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(k
     touches = touches_of([(0, 3, 1), (0, 1, 1), (1, 2, 1)], 0, 0)
     statistics, sample = learned(touches)
     task = Task.of(statistics, SCALE, ["a", "b"])
-    found = left_out(Readout(task, statistics), task, sample, STAGES, kind)
+    found = left_out(Readout(task, statistics), sample, STAGES, kind)
     assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
     assert found.scores.shape == found.z.shape == found.distances.shape == (4, 2)
     alone, none = learned(touches[2:])
     task = Task.of(alone, SCALE, ["b"])
-    empty = left_out(Readout(task, alone), task, none, STAGES, kind)
+    empty = left_out(Readout(task, alone), none, STAGES, kind)
     assert (empty.rows, empty.scores.shape) == ({}, (0, 1))

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from examples.benchmarks.solvers.certified import FIRST_BITS
-from examples.benchmarks.solvers.exact import EMPTY, Exact, Exact20, Exact24, IntegerMoments
+from examples.benchmarks.solvers.exact import EMPTY, Exact, IntegerMoments
 from examples.benchmarks.solvers.solver_protocol import SingularError
-from scroll_tactile.errors import InputError
 
 doubles = st.floats(allow_nan=False, allow_infinity=False)
 moderate = st.floats(-1e6, 1e6, allow_subnormal=False)
@@ -74,67 +73,14 @@ def test_any_order_and_split_gives_the_same_bytes(rows, random, cuts):
     assert found.digest() == moments(rows).digest()
 
 
-@few
-@given(tables(3), tables(3), tables(3))
-def test_sums_add_up_in_bytes(a, b, c):
-    both = moments(a) + moments(b)
-    assert both.digest() == moments(np.concatenate([a, b])).digest() == (moments(b) + moments(a)).digest()
-    assert (both + moments(c)).digest() == (moments(a) + (moments(b) + moments(c))).digest()
-    assert (moments(a) + moments()).digest() == moments(a).digest()
-
-
-# Grids
-
-
-@pytest.mark.parametrize(("kind", "bits"), [(Exact20, 20), (Exact24, 24)])
-def test_a_grid_rounds_to_its_bits(kind, bits):
-    rng = np.random.default_rng(bits)
-    rows, targets = rng.uniform(-3, 3, size=(60, 4)), rng.normal(size=(60, 2))
-    bounds = np.array([3, 3.5, 4, 100])
-    gridded, exact = kind(bounds), Exact()
-    for solver in (gridded, exact):
-        solver.start(4, 2, 0.01)
-    gridded.update(rows, targets)
-    unit = np.array([4, 4, 4, 128]) * 2.0**-bits
-    exact.update(np.rint(rows / unit) * unit, targets)
-    assert np.array_equal(gridded.weights(), exact.weights())
-    assert gridded.diagnosis.startswith("rounded")
-    assert exact.diagnosis == ""
-
-
-@pytest.mark.parametrize(("kind", "bits"), [(Exact20, 20), (Exact24, 24)])
-def test_the_error_that_a_grid_is_expected_to_make_is_about_what_it_makes(kind, bits):
-    rng = np.random.default_rng(bits)
-    rows, targets = rng.uniform(-1, 1, size=(300, 10)), rng.normal(size=(300, 2))
-    gridded, exact = kind(), Exact()
-    for solver in (gridded, exact):
-        solver.start(10, 2, 1e-3)
-        solver.update(rows, targets)
-    found, diagnosis = gridded.solve()
-    true = exact.weights()
-    made = np.linalg.norm(found - true) / np.linalg.norm(true)
-    assert diagnosis.rounding / 3 < made < 3 * diagnosis.rounding
-
-
-def test_a_value_beyond_the_bound_is_refused_naming_row_and_column():
-    solver = Exact20([1.0, 2.0])
-    solver.start(2, 1, 0.1)
-    solver.update([[1.0, 2.0]], [[1]])
-    before = solver.digest()
-    with pytest.raises(InputError, match=r"at most 2 in column 1; row 2 has -2\.5"):
-        solver.update([[1.0, 2.0], [0, 0], [0, -2.5]], np.ones((3, 1)))
-    assert solver.digest() == before
-    assert solver.rows == 1
-
-
 # The solve
 
 
-def solved(rows, targets, penalty=0.0, on_singular="raise"):
+def solved(rows, targets, penalty=0.0):
     solver = Exact()
     solver.start(rows.shape[1], targets.shape[1], penalty)
     solver.update(rows, targets)
-    return solver.solve(on_singular)
+    return solver.solve()
 
 
 def truth(rows, targets, penalty):
@@ -185,7 +131,6 @@ def test_every_weight_is_right_to_its_last_bit_or_two(rows, penalty):
     targets = np.random.default_rng(6).normal(size=(len(rows), 1))
     found, diagnosis = solved(rows, targets, penalty)
     assert diagnosis.error_bound < 2.0**-52
-    assert diagnosis.rank == rows.shape[1]
     with mpmath.workdps(1500):
         for weight, true in zip(found[:, 0], truth(rows, targets, penalty), strict=True):
             assert abs(mpmath.mpf(float(weight)) - true) <= abs(true) * mpmath.mpf(2) ** -52
@@ -195,21 +140,8 @@ def test_an_arithmetic_that_does_not_do_is_left_for_a_better_one():
     _, sound = solved(GAUSSIAN, np.ones((30, 1)))
     _, diagnosis = solved(laeuchli(1e-30), np.ones((7, 1)))
     assert sound.bits == FIRST_BITS < diagnosis.bits
-    assert diagnosis.verdict == "ill conditioned"
+    assert str(diagnosis).startswith("ill conditioned")
     assert 1e59 < diagnosis.condition < 1e62
-
-
-def test_an_ill_conditioned_system_names_the_direction_it_determines_least():
-    rows = np.c_[GAUSSIAN[:, :3], GAUSSIAN[:, 1] * (1 + 2.0**-45 * GAUSSIAN[:, 7])]
-    _, diagnosis = solved(rows, np.ones((30, 1)), 1e-30)
-    assert diagnosis.columns == (1, 3)
-    direction = diagnosis.directions[:, 0]
-    assert np.allclose(np.abs(direction), [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
-    assert direction[1] * direction[3] < 0
-    assert "columns 1, 3" in str(diagnosis)
-
-
-# Singular systems
 
 
 def dependent():
@@ -219,47 +151,17 @@ def dependent():
     return rows
 
 
-def test_a_singular_system_is_refused_naming_what_depends_on_what():
-    with pytest.raises(SingularError, match=r"rank 6 of 8; column \d is .*Give a larger λ"):
-        solved(dependent(), np.ones((30, 1)))
-
-
-def test_or_the_smallest_solution_is_given_with_a_diagnosis():
-    rows, targets = dependent(), np.random.default_rng(1).normal(size=(30, 2))
-    found, diagnosis = solved(rows, targets, on_singular="diagnose")
-    assert np.allclose(found, np.linalg.pinv(rows) @ targets, rtol=1e-11, atol=1e-15)
-    assert diagnosis.verdict == "singular"
-    assert (diagnosis.rank, diagnosis.dimension) == (6, 8)
-    assert diagnosis.columns == (0, 3, 5, 6)
-    assert diagnosis.directions.shape == (8, 2)
-    assert np.abs(rows @ diagnosis.directions).max() < 1e-10
-    assert np.allclose(diagnosis.directions.T @ diagnosis.directions, np.eye(2))
-
-
-@pytest.mark.parametrize("rows", [np.zeros((3, 2)), np.zeros((0, 2))], ids=["zeros", "none"])
-def test_nothing_determined_at_all(rows):
-    targets = np.ones((len(rows), 1))
-    with pytest.raises(SingularError, match="column 0 is zero in every row"):
-        solved(rows, targets)
-    found, diagnosis = solved(rows, targets, on_singular="diagnose")
-    assert not found.any()
-    assert (diagnosis.rank, diagnosis.columns) == (0, (0, 1))
-
-
-@few
-@given(st.integers(0, 6), st.integers(0, 99))
-def test_the_rank_is_exact(rank, seed):
-    rng = np.random.default_rng([rank, seed])
-    rows = (rng.integers(-9, 9, size=(9, rank)) @ rng.integers(-9, 9, size=(rank, 6))).astype(float)
-    _, diagnosis = solved(rows, np.ones((9, 1)), on_singular="diagnose")
-    assert diagnosis.rank == np.linalg.matrix_rank(rows)
+@pytest.mark.parametrize(
+    ("rows", "rank"), [(dependent(), "6 of 8"), (np.zeros((3, 2)), "0 of 2"), (np.zeros((0, 2)), "0 of 2")]
+)
+def test_a_singular_system_is_refused_with_its_exact_rank(rows, rank):
+    with pytest.raises(SingularError, match=rf"rank {rank}\. Give a larger λ"):
+        solved(rows, np.ones((len(rows), 1)))
 
 
 def test_weights_too_large_for_a_double_are_not_passed_off():
-    rows = np.array([[5e-324], [0.0]])
     with pytest.raises(SingularError, match="exceed"):
-        solved(rows, np.ones((2, 1)))
-    assert solved(rows, np.ones((2, 1)), on_singular="diagnose")[1].verdict == "out of range"
+        solved(np.array([[5e-324], [0.0]]), np.ones((2, 1)))
 
 
 # Centring
@@ -286,40 +188,6 @@ def test_centred_weights_do_not_cancel(offset):
     found, diagnosis = solver.solve(centred=True)
     assert np.allclose(found[:, 0], centred_truth(rows, targets, 0.25), rtol=1e-15, atol=0)
     assert diagnosis.condition < 100
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e6, -1e9])
-def test_the_scatter_does_not_cancel(offset):
-    rows, labels = offset + GAUSSIAN, np.arange(30) % 3
-    solver = Exact()
-    solver.start(8, 4, 0.0)
-    solver.update(rows, np.eye(4)[labels])  # a class without rows has no scatter
-    exact = rows.astype(np.longdouble)
-    for groups, found in (
-        ([labels >= 0], solver.scatter()),
-        ([labels == y for y in range(3)], solver.scatter(within=True)),
-    ):
-        about = [exact[group] - exact[group].mean(axis=0) for group in groups]
-        true = sum(part.T @ part for part in about)
-        assert np.abs(found - true).max() <= 1e-15 * np.abs(true).max()
-        assert np.array_equal(found, found.T)
-
-
-# Merging
-
-
-def test_two_halves_are_the_whole():
-    targets = np.eye(3)[np.arange(30) % 3]
-    halves = []
-    for some in (slice(0, 11), slice(11, 30), slice(0, 30)):
-        solver = Exact()
-        solver.start(8, 3, 1e-3)
-        solver.update(GAUSSIAN[some], targets[some])
-        halves.append(solver)
-    joint = halves[0] + halves[1]
-    assert joint.rows == 30
-    assert joint.digest() == halves[2].digest()
-    assert joint.weights().tobytes() == halves[2].weights().tobytes()
 
 
 # Schedules

@@ -61,10 +61,9 @@ def name_of(place: int) -> str:
     return f"{place:05d}"
 
 
-def solved(statistics: Statistics) -> tuple[Task, Readout]:
-    """The readout of statistics, all materials its reference, and what it was solved from."""
-    task = Task.of(statistics, SCALE, statistics.names(SCALE))
-    return task, Readout(task, statistics)
+def solved(statistics: Statistics) -> Readout:
+    """The readout of statistics, all materials its reference."""
+    return Readout(Task.of(statistics, SCALE, statistics.names(SCALE)), statistics)
 
 
 def asked(readout: Readout, codes: npt.NDArray[np.integer]) -> Answers:
@@ -95,12 +94,12 @@ def measure_learned(memory: Memory) -> list[Record]:
     statistics = taught(memory, len(memory.places))
     statistics.second(SCALE).packed()
     summed = time.process_time()
-    task, readout = solved(statistics)
+    readout = solved(statistics)
     done = time.process_time()
     truth = truth_of(memory, memory.codes, readout)
     true = truth.answers(evaluated)
     free = truth_of(memory, memory.units, readout)
-    solution = readout.gamma * readout.means_of(readout.held(readout.reference))[1].T
+    solution = readout.gamma * readout.means_solved()[1].T
     weights = solution - solution.mean(axis=1, keepdims=True)
     share = truth.share(len(memory.places), LEAST, LARGEST)
     base = {"case": memory.name, "family": memory.family, "penalty": readout.penalty}
@@ -110,7 +109,7 @@ def measure_learned(memory: Memory) -> list[Record]:
         **compared(asked(readout, evaluated), true),
         "weights_error": _norm_error(weights, truth.weights()),
         "share_error": abs(readout.share - share) / (share or 1.0),
-        "left_out_error": _left_out_error(memory, task, readout),
+        "left_out_error": _left_out_error(memory, readout),
         "seconds_per_row": (summed - begun) / memory.row_places.size,
         "solve_seconds": done - summed,
     }
@@ -149,7 +148,7 @@ def _followed(memory: Memory, evaluated: npt.NDArray[np.int64]) -> Record:
     # As many touches as a readout follows, less three changes behind them.
     early = len(touches) - min(len(touches) // 2, max(32, dimension // 4) // rows - 3)
     statistics = taught(memory, early)
-    _, readout = solved(statistics)
+    readout = solved(statistics)
     extra = np.repeat(evaluated[:1], rows, axis=0).astype(np.int32)
     changes: list[Change] = [*touches[early:], (name_of(0), extra, 1), (name_of(0), extra, -1)]
     compared_after = {len(touches) - early: slice(None), len(changes): slice(None)}
@@ -180,10 +179,10 @@ def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
     """Bring a change into the statistics and the readout; one solved again where it cannot follow."""
     name, rows, sign = change
     (statistics.add if sign > 0 else statistics.remove)(name, {SCALE: rows}, 1)
-    return readout if readout.follow([change]) else solved(statistics)[1]
+    return readout if readout.follow([change]) else solved(statistics)
 
 
-def _left_out_error(memory: Memory, task: Task, readout: Readout) -> float | None:
+def _left_out_error(memory: Memory, readout: Readout) -> float | None:
     """The largest error of scores and distances of touches left out, against readouts of the others; None if many."""
     rows, dimension = memory.codes.shape[1:]
     if dimension > MOST_DENSE or len(memory.places) > 1000:
@@ -192,7 +191,7 @@ def _left_out_error(memory: Memory, task: Task, readout: Readout) -> float | Non
     pairs = np.array([(stage, 0, rows) for stage in range(rows)])
     for i, (place, codes) in enumerate(zip(memory.places.tolist(), memory.codes, strict=True)):
         sample.add(name_of(place), i.to_bytes(4, "big"), SampledTouch(codes, pairs))
-    apart = {kind: left_out(readout, task, sample, stages, kind) for kind in ("lda", "ridge")}
+    apart = {kind: left_out(readout, sample, stages, kind) for kind in ("lda", "ridge")}
     worst = 0.0
     for number, (_, key, _) in list(enumerate(sample))[:LEFT_OUT]:
         if (number, 0) not in apart["lda"].rows:

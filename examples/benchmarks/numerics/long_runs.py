@@ -45,7 +45,7 @@ def run_drift(seed: int, dimension: int, count: int, note: Note) -> Iterator[Rec
     statistics = Statistics(dimension, [SCALE])
     for name, row, _ in touches:
         statistics.add(name, {SCALE: row}, 1)
-    _, readout = solved(statistics)
+    readout = solved(statistics)
     worst: Record = {"solved_again": 0}
     spent, evaluated = 0.0, codes[:JUDGED].astype(np.int64)
 

@@ -12,6 +12,11 @@ rows and means about a fixed origin, and with p_y the shares of the reference ma
 - relative Mahalanobis distance (Ren et al. 2021, arXiv 2106.09022), the distance to the nearest class less that to the
   whole, whose covariance is Σ + (1 − ρ) Mᵀ P M:  −2 max_y s_y(lda) + zᵀ H z    (Woodbury; xᵀ Σ⁻¹ x cancels).
 
+Materials much further apart than they scatter make G and z as large as the digits of H z and zᵀ H z are small. So both
+are taken about the nearest of the reference materials, n: with v the z of x − m_n, less 1 / ((1 − ρ) p_n) at n, about
+its mean, the scores are e_n + H v and the distance is −2 (max_y s_y − s_n) + vᵀ H v − (1 / p_n − 1) / (1 − ρ), as
+H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
+
 `System` follows K⁻¹ as touches come and go; means and what is solved for them follow with it.
 """
 
@@ -259,7 +264,9 @@ class Readout:
     def scores(self, codes: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
         """The scores of the materials at some places, not too many to hold, for codes of shape (d,), shape (k,)."""
         if kind == "ridge":
-            scores = self.shares + self.derived().background @ self.centred(codes)
+            near, beyond = self._beyond_nearest(codes)
+            scores = self.derived().background @ beyond
+            scores[near] += 1.0
             return np.asarray(scores[self.held(places)])
         return np.asarray(self.gamma * self._scores(codes, self.held(places)))
 
@@ -286,11 +293,19 @@ class Readout:
 
     def novelty(self, codes: FloatArray, places: Sequence[int] | Places) -> float:
         """Relative Mahalanobis distance of codes (d,); the materials at `places` are those that may be the nearest."""
-        derived, about = self.derived(), self._reference_z(codes)
-        nearest = self.gamma * float(self._scores(codes, self.held(self._likeliest(codes, np.asarray(places)))).max())
-        centre = self.shares @ about
-        z = about - centre - derived.towards
-        return float(-2.0 * nearest + 2.0 * centre - derived.size + z @ derived.background @ z)
+        near, beyond = self._beyond_nearest(codes)
+        nearest = self._scores(codes, self.held(self._likeliest(codes, np.asarray(places)))).max()
+        ahead = self.gamma * float(nearest - self._scores(codes, np.array([near]))[0])
+        weighed = beyond @ self.derived().background @ beyond
+        return float(weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
+
+    def _beyond_nearest(self, codes: FloatArray) -> tuple[int, FloatArray]:
+        """The nearest of the reference materials, by its place among them, and v, shape (R,)."""
+        count, row = len(self.reference), codes - self.origin
+        near = int((self._solved[:count] @ row - self._sizes[:count] / 2).argmax())
+        beyond = self.gamma * (self._solved[:count] @ (row - self._means[near]))
+        beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
+        return near, np.asarray(beyond - self.shares @ beyond)
 
     def _likeliest(self, codes: FloatArray, places: Places) -> Places:
         """Those of many places among which the highest score is."""

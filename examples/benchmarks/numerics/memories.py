@@ -117,6 +117,9 @@ def _dependent(rng: Rng, size: float) -> Iterator[Memory]:
         "the last five touches a hundred thousand times as loud", np.where(at < 95, 1e-5, 1) * features, places
     )
     yield _parted("the first touch a thousand times as loud", np.where(at > 0, 1e-3, 1) * features, places)
+    own = np.tile(np.arange(6), 20)
+    apart = rng.normal(size=(6, 1, 4))[own] + 1e-3 * rng.normal(size=(len(own), 2, 4))
+    yield _parted("six materials of four features, 10³ × as far apart as they scatter", _within(apart), own)
     # Inputs far from zero, as what a layer before gave: a fifth of the features are never on, a fifth always.
     rows = (4 + rng.normal(size=(round(1500 * size), 40))) @ rng.normal(size=(40, max(40, round(300 * size))))
     yield _parted("rectified random features", *_labelled(rng, np.maximum(rows, 0)))

@@ -46,9 +46,7 @@ def show_numerics(result: Mapping[str, Any]) -> None:
             )
             say(f"the learner's worst {name.replace('_', ' ')}: {escape(said)}")
     verdict = "stay below" if claimed["agreed"] else "[red]exceed[/]"
-    say(
-        f"scores, novelty and ρ of the learner {verdict} {claimed['limit']:.0e}; flipped: {claimed['flipped']}"
-    )
+    say(f"scores, novelty and ρ of the learner {verdict} {claimed['limit']:.0e}; flipped: {claimed['flipped']}")
 
 
 def _cell(record: Mapping[str, Any] | None) -> str:

@@ -15,6 +15,7 @@ from scroll_tactile import Augmented, Joined, Kernels, Maps, Robust, Sensor, Tac
 from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
+from scroll_tactile.prediction.current import CurrentModel
 from store import DamageError, Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
@@ -219,8 +220,9 @@ def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
         learner.merge(tmp_path / "other", shared="twice")
 
 
-def test_an_answer_is_of_one_state(tmp_path):
+def test_an_answer_is_of_one_state(monkeypatch):
     """While another thread observes, every answer is one that the memory gave between two of its observations."""
+    monkeypatch.setattr(CurrentModel, "present", CurrentModel.settle)  # answers are then a function of the memory
     learner = TactileLearner(sensor=PAD, embedding=Robust(Kernels(dimension=64)), augmentation=Augmented(copies=1))
     for seed in range(4):
         learner.observe("ab"[seed % 2], touch(seed))

@@ -23,7 +23,6 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.buffer import candidates_of
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
 from scroll_tactile.pipelines.classification import hold_out
 from scroll_tactile.prediction.features import FeatureExtractor

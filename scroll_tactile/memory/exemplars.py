@@ -121,8 +121,8 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
 class Exemplar:
     """A stream with its readings, and what herding needs of it.
 
-    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest scale, int32
-    of shape (d,). scale: that scale.
+    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest scale,
+    int32 of shape (d,). scale: that scale.
     """
 
     material: str

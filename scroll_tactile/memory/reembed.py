@@ -28,7 +28,7 @@ from store.lock import WriterLock
 __all__ = ["Reembedding", "finish_interrupted"]
 
 BATCH = 64  # rows that wait for the disk together
-SNAPSHOT_EVERY = 1024  # rows, after which a run that goes on does not embed them again
+SNAPSHOT_EVERY = 256  # rows, after which a run that goes on does not embed them again
 
 
 class Reembedding:

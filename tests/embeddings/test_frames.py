@@ -17,8 +17,11 @@ from scroll_tactile.errors import (
     NotFiniteError,
     ReadingsTypeError,
 )
+from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.moments import SecondMoment
 
 GEL = Gel()
 NETWORK = ResNet.random(0).state_dict()
@@ -185,6 +188,25 @@ def test_a_memory_of_single_frames_takes_no_resting_image():
             learner.observe(name, GEL.touch(name, i).readings[-1:])
     assert learner.predict(GEL.touch("cord", 9).readings[-1:]).material == "cord"
     assert learner.predict(np.full((1, *SMALL.shape), 9, np.uint8)).material in MATERIALS  # constant: no error
+
+
+def test_a_cameras_frames_are_learned_one_by_one_and_judged_together():
+    learner = TactileLearner(sensor=SMALL, embedding=Frames(rest=None))
+    frames = GEL.touch("cord", 0).readings[2:5]
+    learner.observe("cord", frames)
+    (scale,) = learner.memory.statistics.scales
+    rows = np.concatenate([learner._extractor.codes(frame_image(frame), b"")[scale] for frame in frames])
+    second = SecondMoment(rows.shape[1])
+    second.add(rows)
+    assert learner.memory.statistics.counts(scale, ["cord"]).tolist() == [3]
+    assert np.array_equal(learner.memory.statistics.second(scale).packed(), second.packed())
+    ((_, _, touch),) = learner.memory.sample
+    assert touch.pairs.tolist() == [[0, 0, 3]]
+    assert np.array_equal(touch.rows[0], mean_code(rows.sum(axis=0, dtype=np.int64), 3))
+
+
+def frame_image(frame):
+    return image_of(validate(frame[None], SMALL), None)
 
 
 def test_a_resting_image_given_once_serves_every_stream(memory):

@@ -110,8 +110,8 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     # Leaving one out by the formula is leaving it out of the system.
     counts, sums = statistics.totals(1)
     means = sums[:20] / counts[:20, None] - head.origin
-    upper = Task.of(statistics, 1, statistics.names(1)).scatter
-    scatter = np.triu(upper) + np.triu(upper, 1).T
+    lower = Task.of(statistics, 1, statistics.names(1)).scatter
+    scatter = np.tril(lower) + np.tril(lower, -1).T
     gram = means @ np.linalg.solve(scatter + head.penalty * np.trace(scatter) / 6 * np.eye(6), means.T)
     system = np.linalg.inv(solve(gram, head.gamma).inverse)
     targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)

@@ -73,7 +73,7 @@ def fit_heads(
         # From the tamest on: of equals the first stays.
         for penalty in sorted(PENALTIES, reverse=True):
             ridge = penalty * variance * np.eye(len(task.origin))
-            solved = System(np.asfortranarray(task.scatter + ridge)).solve(means)
+            solved = System(task.scatter + ridge).solve(means)
             for gamma in sorted(GAMMAS, reverse=True):
                 system = solve(solved @ means.T, gamma).inverse
                 for key, truth in known.items():

@@ -1,8 +1,8 @@
 """Heads for objects never touched, over a memory's own statistics, with a λ that is chosen by leaving objects out.
 
 `compose` takes over the shrinkage by which materials are classified, so that describing costs no factorisation. Where
-objects are few and unlike each other a head wants a tamer one. Both λ, the ridge beside the scatter within objects, and γ
-(see `readouts.attributes`) are those of least squared error on the class means of objects left out, one by one: of a
+objects are few and unlike each other a head wants a tamer one. Both λ, the ridge beside the scatter within objects, and
+γ (see `readouts.attributes`) are those of least squared error on the class means of objects left out, one by one: of a
 head that solves with B, the error of leaving object y out is α_y / B_yy, so no head is fitted twice.
 """
 

@@ -65,4 +65,4 @@ def test_the_default_accuracy_on_simulated_touches():
         learner.observe(material, SCENE.touch(material, 0))
     short = [(material, SCENE.touch(material, i, seconds=0.3)) for i in (10, 11) for material in SCENE.materials]
     right = np.count_nonzero([learner.predict(touch).material == material for material, touch in short])
-    assert 31 <= right <= 33  # of 40 touches of 0.3 s, after one touch of each material; another BLAS may move one
+    assert 28 <= right <= 30  # of 40 touches of 0.3 s, after one touch of each material; another BLAS may move one

@@ -113,7 +113,7 @@ def test_it_knows_again_what_it_felt(sensor, readout):
             prediction = learner.predict(touch(name, repetition, sensor))
             check(prediction, NAMES)
             assert prediction.material == name
-            assert prediction.probability > 0.5
+            assert prediction.probability > 0.4  # four materials, five touches of each
             assert prediction.seconds == sensor.readings / sensor.rate
 
 
@@ -512,8 +512,8 @@ def test_a_memory_of_another_sensor_or_embedding_is_refused_and_named(tmp_path):
 def test_a_memory_of_another_grid_is_refused(tmp_path, monkeypatch):
     with opened(tmp_path / "m") as learner:
         feel(learner, 1)
-    monkeypatch.setattr("scroll_tactile.memory.identity.FOLDS", 5)
-    with pytest.raises(MismatchError, match="folds"):
+    monkeypatch.setattr("scroll_tactile.memory.identity.BITS", 19)
+    with pytest.raises(MismatchError, match="bits"):
         opened(tmp_path / "m")
 
 
@@ -559,8 +559,8 @@ def test_a_failing_snapshot_loses_nothing(tmp_path, monkeypatch):
 def fill(learner):
     """Make a memory that seems to hold as many rows as exact sums can."""
     scale = learner.plan.windows[-1]
-    seconds = learner.memory.statistics._seconds[scale]
-    seconds[0] = SecondMoment.of(seconds[0].packed(), MOST_ROWS, SMALL.dimension)
+    seconds = learner.memory.statistics._seconds
+    seconds[scale] = SecondMoment.of(seconds[scale].packed(), MOST_ROWS, SMALL.dimension)
 
 
 def test_what_a_full_memory_refuses_is_not_in_the_journal_either(tmp_path):

@@ -13,7 +13,6 @@ SMALL = Kernels(dimension=64)
 WAYS = {
     "usual": {"sensor": PAD, "embedding": SMALL},
     "ridge": {"sensor": PAD, "embedding": SMALL, "readout": "ridge"},
-    "followed": {"sensor": PAD, "embedding": SMALL, "refit": 1.0},
     "no exemplars": {"sensor": PAD, "embedding": SMALL, "exemplars": 0},
     "copies": {"sensor": PAD, "embedding": SMALL, "augmentation": Augmented(copies=2)},
     "robust": {"sensor": PAD, "embedding": Robust(SMALL), "augmentation": Augmented(copies=0, noisy=2)},

@@ -137,7 +137,7 @@ class _Leaving:
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
-        scores = lda if self.kind == "lda" else self._ridge(white, own, leverage)
+        scores = lda if self.kind == "lda" else self._ridge(white, own, leverage, weights)
         return tuple(part.reshape(touches * count, -1) for part in (scores, centred, distances))  # type: ignore[return-value]
 
     def _whole(
@@ -167,13 +167,20 @@ class _Leaving:
         near = left @ self.onto_spread.T, right @ self.onto_spread.T
         return np.asarray(left @ right.transpose(0, 2, 1) - near[0] @ near[1].transpose(0, 2, 1))
 
-    def _ridge(self, white: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray) -> FloatArray:
+    def _ridge(
+        self, white: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray, weights: FloatArray
+    ) -> FloatArray:
         z = self.readout.gamma * (white @ self.means.T)
         z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
         fitted = self.readout.shares + z @ self.derived.background
         targets = np.zeros_like(fitted)
         targets[np.arange(len(own)), :, own] = 1.0
-        return np.asarray(np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - leverage @ targets))
+        scores = np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - leverage @ targets)
+        # With the shares of all touches, as a new one is judged: that a material lacks the very touch that is judged
+        # would be all that a heavily shrunk ridge says, and its scores would be believed not at all.
+        counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
+        shares = counts / (self.total - weights)[:, None]
+        return np.asarray(scores + (self.readout.shares - shares)[:, None, :])
 
 
 def _columns(rows: FloatArray, share: FloatArray, way: FloatArray) -> FloatArray:

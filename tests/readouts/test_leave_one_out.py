@@ -75,11 +75,30 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
         for stage, row in enumerate(rows):
             judged.add((places[material, key], stage))
             place = found.rows[places[material, key], stage]
-            scores = dense.lda(row, reference, readout.origin) if kind == "lda" else dense.ridge(row, reference)
+            scores = dense.lda(row, reference, readout.origin)
+            if kind == "ridge":  # but for the shares, which are those of all touches
+                shares = [float(dense.shares[name]) for name in reference]
+                scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
             require_near(found.scores[place], scores)
             require_near(found.distances[place], dense.distances(row, reference))
     assert found.rows.keys() == judged
     assert sorted(found.rows.values()) == list(range(len(found.scores)))
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
+    """The shares of what is left would tell against the material of the touch that is judged, and outdo the rest."""
+    statistics, sample = learned(touches_of([(i % 4, 1, 1) for i in range(20)], 3, 0))
+    found = left_out(heavily_shrunk(statistics), sample, STAGES, kind)
+    owners = ["abcd".index(material) for material, *_ in sample]
+    best = found.scores.argmax(axis=1)
+    assert np.mean([best[found.rows[i, 0]] == owner for i, owner in enumerate(owners)]) > 0.7
+
+
+def heavily_shrunk(statistics):
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("scroll_tactile.readouts.readout.shrinkage", lambda *_: 0.999)
+        return Readout(Task.of(statistics, SCALE, [*"abcd"]), statistics)
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])

@@ -120,8 +120,8 @@ class TestAugmentedObservation:
         augmented, plain = fed(FELT), fed(FELT, augmentation=None)
         assert augmented.materials == plain.materials == {"a": 3, "b": 3}
         assert augmented.digest() != plain.digest()
-        own = [touch.sums.tobytes() for *_, touch in plain.memory.sample]
-        assert [touch.sums.tobytes() for *_, touch in augmented.memory.sample] == own
+        own = [touch.rows.tobytes() for *_, touch in plain.memory.sample]
+        assert [touch.rows.tobytes() for *_, touch in augmented.memory.sample] == own
 
     def test_closed_killed_and_opened_again(self, tmp_path):
         learner, _ = filled(tmp_path / "m")

@@ -310,7 +310,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
 def _pool(learner: TactileLearner) -> str:
     digest = hashlib.sha256()
     for name, key, touch in learner._ledger.memory.sample:
-        digest.update(repr((name, key, touch.sums.tobytes(), touch.pairs.tobytes())).encode())
+        digest.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes())).encode())
     return digest.hexdigest()
 
 

@@ -29,6 +29,14 @@ PROBES = (("a", 50, 60), ("b", 51, 25), ("c", 52, 6))
 FIT = Draft.fit
 
 
+@pytest.fixture(autouse=True, scope="module")
+def often():
+    """A model is fitted again after an eighth, so that a few touches show how."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(current, "LAG", 8)
+        yield
+
+
 def stream(material, seed, readings=60):
     """A noisy wave whose level and pace are the material's, such that some are taken for others."""
     rng, place = np.random.default_rng([ord(material), seed]), "abcdef".index(material)
@@ -114,7 +122,7 @@ def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
 
 
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
-def test_what_was_just_observed_counts_and_the_calibration_lags_by_an_eighth(readout):
+def test_what_was_just_observed_counts_and_the_calibration_lags_by_no_more_than_is_said(readout):
     learner = fed([(name, seed) for seed in range(16) for name in "ab"], readout=readout)
     for i in range(40):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))

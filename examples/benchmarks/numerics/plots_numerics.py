@@ -73,4 +73,4 @@ def draw_numerics(path: Path, records: Records, *, title: str) -> None:
         panel.set(xlabel="processor time of an observation and the answer after it, ms")
         panel.set(ylabel="relative error of the answers: each memory, and the worst")
         panel.grid(alpha=0.25)
-        panel.legend(loc="upper left", fontsize=9)
+        panel.legend(loc="upper right", fontsize=9)

@@ -489,7 +489,7 @@ class TactileLearner:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.
 
         Between two such moments the readouts are those of all that was observed, to rounding; the calibration may rest
-        on a fifth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
+        on a sixth fewer touches, or two. The memory itself is always exact, and knows nothing of this.
 
         Raises CapacityError where the system has no memory left for it; `predict` does, too.
         """

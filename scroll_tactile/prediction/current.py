@@ -1,9 +1,10 @@
 """The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
 
 Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is
-fitted, the shrinkage and the calibration, follows when the memory has grown by a quarter: an eighth earlier a thread
-begins to fit it, to the integers. When which of them answers depends on the calls that came and not on how fast that
-thread is, so the same calls give the same answers.
+fitted, the shrinkage and the calibration, follows when the memory has grown by three sixteenths: a sixteenth earlier a
+thread begins to fit it, to the integers. A call waits for that thread only where the readouts can follow no further, and
+in a memory of few touches, where each of them counts. Otherwise touches that come faster than the thread fits have an
+earlier calibration a little longer.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel"]
 
-LAG = 4  # of the touches that a model was fitted to, one in so many may have come since its calibration
-LEAST = 2  # touches, in a small memory
+BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
+LEAST = 2  # touches, in the smallest of memories
+FEW = 64  # touches: of a memory with no more the calibration is worth waiting for
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
@@ -56,7 +58,7 @@ class CurrentModel:
         self._take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         model, (behind, self._behind) = self._model, (self._behind, None)
-        if model is None or behind is None or self._overdue(model, memory):
+        if model is None or behind is None or self._due(model, memory):
             model = self._adopted(memory)
         elif behind:
             self._exact = False
@@ -73,7 +75,7 @@ class CurrentModel:
         if model is None or self._behind is None or self._coming is not None:
             return
         lag = abs(touches - model.fitted_to)
-        if lag >= max(LEAST // 2, model.fitted_to // (2 * LAG)) or (lag and model.crowded):
+        if lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16) or (lag and model.crowded):
             # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
             with suppress(MemoryError, InputError, RuntimeError):
                 self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
@@ -111,15 +113,17 @@ class CurrentModel:
         self._version = ledger.version
         ledger.follow, ledger.added = True, []
 
-    def _overdue(self, model: Model, memory: Memory) -> bool:
-        return abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, model.fitted_to // LAG)
+    def _due(self, model: Model, memory: Memory) -> bool:
+        """Whether another model takes its place: it is late, and the next is there or worth waiting for."""
+        late = abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, ADOPT * model.fitted_to // 16)
+        return late and (model.fitted_to <= FEW or (self._coming is not None and self._coming.done()))
 
     def _adopted(self, memory: Memory) -> Model:
         """The coming model, followed to the memory as it is; a new one where there is none, or it cannot follow."""
         coming = self._coming
         if coming is not None and coming.exception() is None:  # it waits; interrupted there, the next call does
             model, self._exact, self._coming = coming.result(), not self._since, None
-            if not self._overdue(model, memory) and model.follow(memory, self._since):
+            if not self._due(model, memory) and model.follow(memory, self._since):
                 return model
         self._coming = None
         return self._fitted(memory)

@@ -33,8 +33,8 @@ def enough_memory() -> Iterator[None]:
         yield
     except MemoryError as error:
         raise CapacityError(
-            f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer materials "
-            "in a scene, or give the process more"
+            f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer "
+            "materials in a scene, or give the process more"
         ) from error
 
 

@@ -22,7 +22,7 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -183,7 +183,7 @@ class Readout:
         self._means, self._solved, self._sizes = self._means[:count], self._solved[:count], self._sizes[:count]
 
     def follow(self, changes: Sequence[Change]) -> bool:
-        """Take in touches, in the order they came, that the statistics have already.
+        """Take in touches that came and went, which the statistics have already.
 
         Returns False where all has to be solved again: they are too many, outweigh what it was solved from, or a
         material went.
@@ -191,14 +191,19 @@ class Readout:
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
         self._derived = self._compared = None
+        come: dict[str, list[FloatArray]] = {}
+        for material, rows, sign in changes:
+            if sign > 0:
+                come.setdefault(material, []).append(rows - self.origin)
         with one_thread():
             self._hold_before(changes)
+            self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
             for material, rows, sign in changes:
-                place = self.places.get(material)
-                before = 0.0 if place is None else self.counts[place]
-                if sign < 0 and before <= len(rows):
-                    return False
-                self._follow(self._new_place(material) if place is None else place, rows - self.origin, sign, before)
+                if sign < 0:
+                    place = self.places.get(material)
+                    if place is None or self.counts[place] <= len(rows):
+                        return False
+                    self._follow({material: rows - self.origin}, -1)
         return self.system.sound
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
@@ -213,43 +218,51 @@ class Readout:
             total, place = self._statistics.sums(self.scale, [name]) - later, self.places[name]
             self._hold([place], _class_means(self.counts[[place]], total, self.origin))
 
-    def _new_place(self, material: str) -> int:
+    def _follow(self, changed: Mapping[str, FloatArray], sign: int) -> None:
+        """Take in rows of some materials, (k, d) about the origin, at once: one product in place of many thin ones."""
+        columns, known, fresh = [], [], []
+        for material, rows in changed.items():
+            place, mean = self.places.get(material), rows.mean(axis=0)
+            if place is None:
+                columns.append(columns_of(rows, None))
+                fresh.append((material, mean, len(rows)))
+                continue
+            held, before = self._held[place], self.counts[place]
+            self.counts[place] = after = before + sign * len(rows)
+            step = mean - self._means[held]
+            columns.append(columns_of(rows, np.sqrt(before * len(rows) / after) * step))
+            known.append((place, held, sign * len(rows) / after * step))
+        self._border(np.concatenate([self._means[:0], *columns]), sign)
+        for _, held, step in known:
+            self._means[held] += step
+        rows_held = [held for _, held, _ in known]
+        self._solved[rows_held] = self.system.solve(self._means[rows_held])
+        self._sizes[rows_held] = np.einsum("hd,hd->h", self._means[rows_held], self._solved[rows_held])
+        for material, mean, count in fresh:
+            self._hold([self._new_place(material, count)], mean[None])
+        if self._coarse is not None:
+            for place in [place for place, *_ in known] + [self.places[material] for material, *_ in fresh]:
+                held = self._held[place]
+                self._coarse.put(place, self._means[held], self._sizes[held])
+
+    def _new_place(self, material: str, count: int) -> int:
         place = self.places[material] = len(self.names)
         if len(self.reference) == place:  # all materials, and this one too
             self.reference = np.append(self.reference, place)
         self.names.append(material)
-        self.counts = np.append(self.counts, 0.0)
+        self.counts = np.append(self.counts, float(count))
         return place
 
-    def _follow(self, place: int, rows: FloatArray, sign: int, before: float) -> None:
-        count, mean = len(rows), rows.mean(axis=0)
-        self.counts[place] = after = before + sign * count
-        if not before:
-            self._border(columns_of(rows, None), sign)
-            self._hold([place], mean[None])
-            held = self._held[place]
-        else:
-            held = self._held[place]
-            step = mean - self._means[held]
-            stretch = np.sqrt(before * count / after)
-            solved = self._border(columns_of(rows, stretch * step), sign)[-1] / stretch
-            self._means[held] += sign * count / after * step
-            self._solved[held] += sign * count / after * solved
-            self._sizes[held] = self._means[held] @ self._solved[held]
-        if self._coarse is not None:
-            self._coarse.put(place, self._means[held], self._sizes[held])
-
-    def _border(self, columns: FloatArray, sign: int) -> FloatArray:
-        """Take columns into K; returns K⁻¹ times them, shape (k, d)."""
+    def _border(self, columns: FloatArray, sign: int) -> None:
+        """Take columns into K, with all that is solved of it."""
         if not len(columns):
-            return columns
+            return
         leaving, corner = self.system.border(columns, sign)
         onto = self._means @ leaving.T
         self._solved -= (onto @ corner) @ leaving
-        self._sizes -= np.einsum("hk,kl,hl->h", onto, corner, onto)
+        self._sizes -= np.einsum("hk,kl,hl->h", onto, corner, onto, optimize=True)
         if self._coarse is not None:
             self._coarse.border(leaving, corner)
-        return np.asarray(leaving - (columns @ leaving.T) @ corner @ leaving)
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""

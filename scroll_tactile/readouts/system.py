@@ -20,10 +20,10 @@ __all__ = ["System", "columns_of", "contrasts"]
 
 FloatArray = npt.NDArray[np.float64]
 
-LARGEST_RANK = 4  # d over this: so many columns may come before K is inverted again
+LARGEST_RANK = 3  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
 # Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much
-# louder than all before, or one retracted on which the scatter rests, have K inverted again, that scores keep their 1e-9.
+# louder than all before, or one retracted on which the scatter rests, have K inverted again: scores keep their 1e-9.
 LARGEST_CONDITION = 256.0
 SMALL = 64  # rows of a triangle
 FEW = 8  # rows that are solved for one by one: a fifth of the time of a product of matrices
@@ -56,7 +56,7 @@ class System:
     def __init__(self, matrix: FloatArray) -> None:
         dimension = len(matrix)
         # numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import.
-        self._whitening = _inverse_of_triangle(np.linalg.cholesky(matrix))
+        self._whitening = _inverse_of_triangle(np.asarray(np.linalg.cholesky(matrix), dtype=np.float64))
         room = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._u, self._v = np.empty((room, dimension)), np.empty((room, dimension))
         self._e = np.empty((room, room))

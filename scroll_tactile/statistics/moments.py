@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,12 @@ LIMB = 22  # bits
 
 
 @lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
+def _libraries() -> list[tuple[Any, Callable[[int], None]]]:
+    """The BLAS libraries of this process, and what sets the threads of each."""
+    found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
+    # From version 3.8 on, threadpoolctl lets one thread alone set them, the first that ever did, and answers to others
+    # by doing nothing; here whoever is inside is counted, of all threads, so its guard is passed by.
+    return [(library, getattr(library, "_real_set_num_threads", library.set_num_threads)) for library in found]
 
 
 class _Limit:
@@ -35,19 +40,22 @@ class _Limit:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._restore: Callable[[], None]
+        self._before: list[tuple[Callable[[int], None], int]] = []
 
     def __enter__(self) -> None:
         with self._lock:
             if not self._inside:
-                self._restore = _controller().limit(limits=1, user_api="blas").restore_original_limits
+                self._before = [(put, library.num_threads) for library, put in _libraries()]
+                for put, _ in self._before:
+                    put(1)
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if not self._inside:
-                self._restore()
+                for put, count in self._before:
+                    put(count)
 
 
 _LIMIT = _Limit()

@@ -31,7 +31,7 @@ Stages = Sequence[Mapping[Scale, Sequence[Sequence[int]]]]
 
 
 def stage_rows(stages: Stages, windows: Codes) -> Codes:
-    """What is learned of a touch: for each scale a row for each group of each stage that it judges at, (rows, d) by scale.
+    """What is learned of a touch: for each scale a row for each group of each stage that it judges at, (rows, d).
 
     windows: the codes of the touch's windows by scale. A row is the mean of a group. Of a stage that is one group it is
     what will be judged of a touch that ends there.
@@ -47,7 +47,7 @@ def stage_rows(stages: Stages, windows: Codes) -> Codes:
 
 @dataclass(frozen=True)
 class SampledTouch:
-    """The mean row that a touch added to the statistics, of each stage that it reached and each scale that judges there.
+    """The mean row that a touch added to the statistics at each stage that it reached, of each scale that judges there.
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
     the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of

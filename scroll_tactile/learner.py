@@ -497,7 +497,7 @@ class TactileLearner:
             self._current.settle(self._ledger)
 
     def model(self) -> Model:
-        """The readouts and calibrations of the memory as it is now, as after `settle`; what comes later is not in them."""
+        """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in it."""
         with self._ledger.lock, enough_memory():
             return Draft.of(self._ledger.memory, self._settings.readout).fit()
 

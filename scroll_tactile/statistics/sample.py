@@ -78,7 +78,8 @@ class SampledTouch:
 
     def at(self, stage: int) -> npt.NDArray[np.int32]:
         """The rows of the scales that judge at a stage, ascending, (scales, d); none where it was not reached."""
-        return self.rows[self.pairs[:, 0] == stage]
+        rows: npt.NDArray[np.int32] = self.rows[self.pairs[:, 0] == stage]
+        return rows
 
 
 class Sample(Generic[T]):

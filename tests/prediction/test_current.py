@@ -33,7 +33,8 @@ FIT = Draft.fit
 def often():
     """A model is fitted again after an eighth, so that a few touches show how."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(current, "LAG", 8)
+        monkeypatch.setattr(current, "BEGIN", 1)
+        monkeypatch.setattr(current, "ADOPT", 2)
         yield
 
 

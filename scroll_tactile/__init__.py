@@ -50,7 +50,7 @@ __all__ = [
     "sensors",
 ]
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {

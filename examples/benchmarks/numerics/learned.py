@@ -182,6 +182,12 @@ def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
     return readout if readout.follow([change]) else solved(statistics)
 
 
+def _shares(places: npt.NDArray[np.intp]) -> npt.NDArray[np.float64]:
+    """The share of each material among touches of these places, shape (C,)."""
+    counts = np.bincount(places)
+    return np.asarray(counts / counts.sum())
+
+
 def _left_out_error(memory: Memory, readout: Readout) -> float | None:
     """The largest error of scores and distances of touches left out, against readouts of the others; None if many."""
     rows, dimension = memory.codes.shape[1:]
@@ -197,7 +203,10 @@ def _left_out_error(memory: Memory, readout: Readout) -> float | None:
         if (number, 0) not in apart["lda"].rows:
             continue
         i = int.from_bytes(key, "big")
-        true = truth_of(memory, memory.codes, readout, np.arange(len(memory.places)) != i).answers(memory.codes[i])
+        kept = np.arange(len(memory.places)) != i
+        true = truth_of(memory, memory.codes, readout, kept).answers(memory.codes[i])
+        # The ridge of the others, with the shares of all.
+        true.ridge[...] += _shares(memory.places) - _shares(memory.places[kept])
         at = [apart["lda"].rows[number, stage] for stage in range(rows)]
         distances = np.abs(apart["lda"].distances[at] - true.distances).max() / (np.abs(true.distances).max() or 1.0)
         worst = max(worst, float(distances))

@@ -520,7 +520,10 @@ class TactileLearner:
         return {name: [exemplar.key for exemplar in ranked] for name, ranked in self.ranked_exemplars().items()}
 
     def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
-        """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order."""
+        """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order.
+
+        Raises StoreError; CompactedError in a memory opened to read that was compacted since: `refresh` it first.
+        """
         with self._ledger.lock:
             return self._ledger.ranked_exemplars()
 

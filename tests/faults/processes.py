@@ -33,7 +33,7 @@ from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, State, after, expected, opened, perform, seen, warm
 from faults.plans import draw
 from faults.zygote import Zygote
-from store import LockedError
+from store import CompactedError, LockedError
 
 KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "describe", "compact", "fine_tune")
 SNAPSHOT_EVERY = 6
@@ -151,7 +151,11 @@ def read(channel: Connection, path: Path, seed: int) -> None:
                     reader, how = opened(path, "read"), "open"
                 elif how == "refresh":
                     reader.refresh()
-                found = seen(reader)
+                try:
+                    found = seen(reader)
+                except CompactedError:  # of its state the readings are gone: it is told to look again
+                    reader.refresh()
+                    found = seen(reader)
                 ended = time.monotonic()
                 answer = reader.predict(stream((rng.randrange(4), 60)))
                 shares = [share for _, share in answer.ranking]

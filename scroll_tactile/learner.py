@@ -21,13 +21,14 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
-from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
+from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.model import Draft, Model, enough_memory
+from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, require_name
@@ -35,12 +36,11 @@ from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
-from store import Store
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
 
-__all__ = ["TactileLearner", "reembed_memory"]
+__all__ = ["TactileLearner"]
 
 logger = logging.getLogger(__name__)
 
@@ -359,7 +359,7 @@ class TactileLearner:
         store = self._ledger.require_store("be embedded again")
         self._ledger.require_writing()
         chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
-        carried = _reembedding(store, chosen)
+        carried = reembedding(store, chosen)
         try:
             carried.copy(progress or _silent)
             with self._ledger.lock:
@@ -603,42 +603,6 @@ class TactileLearner:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def reembed_memory(
-    path: str | os.PathLike[str],
-    embedding: Embedding | None = None,
-    *,
-    progress: Callable[[str, int, int], object] | None = None,
-) -> Path:
-    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone."""
-    finish_interrupted(Path(path))
-    with Store.open(path) as store:
-        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
-        carried = _reembedding(store, chosen)
-        try:
-            carried.copy(progress or _silent)
-            return carried.put_in_place()
-        finally:
-            carried.close()
-
-
-def _reembedding(store: Store, embedding: Embedding) -> Reembedding:
-    made = Identity.read(store)
-    exemplars = made.exemplar_count(store, None)
-    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation)
-    plan = window_plan(made.sensor, embedding)
-    extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
-
-    def encode(readings: npt.NDArray[np.float32]) -> tuple[int, Codes]:
-        touch = Stream(made.sensor, readings)
-        image = extractor.image(touch)
-        return image.shape[1], extractor.codes(image, touch.key)
-
-    def load(draft: Store) -> Memory:
-        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1])
-
-    return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)
 
 
 def _silent(what: str, done: int, of: int) -> None:

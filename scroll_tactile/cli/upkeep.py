@@ -34,9 +34,9 @@ def reembed(
     default: Annotated[bool, typer.Option("--default", help="With the default embedding of its sensor.")] = False,
 ) -> None:
     """Embed all readings again, with the memory's own embedding as it is now; interrupted, start it again to go on."""
-    from scroll_tactile.learner import reembed_memory
     from scroll_tactile.memory.identity import Identity, usual_embedding
     from scroll_tactile.memory.reembed import finish_interrupted
+    from scroll_tactile.prediction.reembedding import reembed_memory
 
     finish_interrupted(folder)
     with Store.open(folder, mode="read") as store:

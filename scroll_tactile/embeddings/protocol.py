@@ -44,6 +44,8 @@ class Capabilities:
     judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
     reads_beginnings: the first narrow window of a touch is a scale of its own.
     fills_channels: dead channels are filled in from the others before anything is embedded.
+    shrinkage: how many times as far as its formula says the scatter of its features is shrunk; see
+        `readouts.shrinkage`. More than once for features that are far from normally distributed.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
     embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
     embeds_noise: it has `is_noisy(image)` and `embed_noisy(images)`, see `NoiseEmbedding`.
@@ -56,6 +58,7 @@ class Capabilities:
     judged_scales: Literal["widest", "all"] = "all"
     reads_beginnings: bool = False
     fills_channels: bool = False
+    shrinkage: float = 1.0
     reads_frames: bool = False
     rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
     embeds_windows: bool = False
@@ -168,6 +171,7 @@ def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
         declared.reads_beginnings,
         declared.embeds_noise,
         declared.fills_channels and sensor.channels <= embedding.dimension,
+        declared.shrinkage,
         sensor.camera,
     )
 

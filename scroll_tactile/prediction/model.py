@@ -75,7 +75,7 @@ class Draft:
         # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if scale != CHANNELS and statistics.second(scale).rows]
-        tasks = {scale: Task.of(statistics, scale, reference) for scale in judging}
+        tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
         stages += [list(NOISE)] * memory.plan.noisy
         return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)

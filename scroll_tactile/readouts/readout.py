@@ -57,6 +57,7 @@ class Task:
 
     packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
     shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
+    times: how many times as far as the formula says the scatter is shrunk.
     """
 
     scale: Scale
@@ -66,9 +67,10 @@ class Task:
     sums: IntArray
     reference: Places
     touches: int
+    times: float = 1.0
 
     @classmethod
-    def of(cls, statistics: Statistics, scale: Scale, reference: Sequence[str]) -> Task:
+    def of(cls, statistics: Statistics, scale: Scale, reference: Sequence[str], times: float = 1.0) -> Task:
         """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
         names = statistics.names(scale)
         places = {name: place for place, name in enumerate(names)}
@@ -76,7 +78,7 @@ class Task:
         known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
         own = np.array(known, dtype=np.intp)
         packed, (counts, sums) = statistics.second(scale).packed().copy(), statistics.totals(scale)
-        return cls(scale, packed, names, counts, sums, own, statistics.touches)
+        return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
 
     @cached_property
     def scatter(self) -> FloatArray:
@@ -116,7 +118,7 @@ class Readout:
         self._statistics = statistics
         matrix = task.scatter.copy()
         trace, dimension = float(np.trace(matrix)), len(matrix)
-        self.share = shrinkage(matrix, task.touches) if trace > 0 else 0.0
+        self.share = shrinkage(matrix, task.touches, task.times) if trace > 0 else 0.0
         all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)
         places = np.concatenate([task.reference, np.setdiff1d(all_places, task.reference)])
         means = _class_means(task.counts[places], task.sums[places], self.origin)

@@ -21,8 +21,8 @@ __all__ = ["LARGEST", "LEAST", "shrinkage"]
 LEAST, LARGEST = 1e-4, 0.99
 
 
-def shrinkage(scatter: npt.NDArray[np.float64], touches: int) -> float:
-    """ρ of a scatter in any unit, shape (d, d), of which the lower triangle is read, made of so many touches."""
+def shrinkage(scatter: npt.NDArray[np.float64], touches: int, times: float = 1.0) -> float:
+    """ρ, so many times, of a scatter in any unit, (d, d), of which the lower triangle is read, of so many touches."""
     dimension = len(scatter)
     diagonal = np.diagonal(scatter)
     trace = float(diagonal.sum())
@@ -32,4 +32,4 @@ def shrinkage(scatter: npt.NDArray[np.float64], touches: int) -> float:
     if not spread > 0:
         return LARGEST
     ratio = ((1 - 2 / dimension) * squares + trace**2) / ((touches + 1 - 2 / dimension) * spread)
-    return float(min(max(ratio, LEAST), LARGEST))
+    return float(min(max(times * ratio, LEAST), LARGEST))

@@ -185,7 +185,8 @@ class WindowPlan:
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
     is a scale of its own. noisy: whether touches observed through noise are. filled: whether dead channels are filled
-    in. frames: whether windows are a camera's frames.
+    in. shrinkage: how many times as far as the formula says readouts are shrunk. frames: whether windows are a camera's
+    frames.
     """
 
     widths: tuple[int, ...]
@@ -194,6 +195,7 @@ class WindowPlan:
     beginning: bool = False
     noisy: bool = False
     filled: bool = False
+    shrinkage: float = 1.0
     frames: bool = False
 
     @property

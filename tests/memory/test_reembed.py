@@ -10,8 +10,8 @@ from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, stream, wi
 
 from scroll_tactile import Kernels, Maps, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
-from scroll_tactile.learner import reembed_memory
 from scroll_tactile.memory import reembed
+from scroll_tactile.prediction.reembedding import reembed_memory
 from store import LockedError, Store, StoreFullError
 
 OTHER = {

@@ -1,0 +1,58 @@
+"""A memory carried over to another embedding, from the readings in its journal."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
+from scroll_tactile.memory.rows import Codes
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.signals.stream import Stream
+from store import Store
+
+__all__ = ["reembed_memory", "reembedding"]
+
+
+def reembed_memory(
+    path: str | os.PathLike[str],
+    embedding: Embedding | None = None,
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Path:
+    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone."""
+    finish_interrupted(Path(path))
+    with Store.open(path) as store:
+        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
+        carried = reembedding(store, chosen)
+        try:
+            carried.copy(progress or (lambda what, done, of: None))
+            return carried.put_in_place()
+        finally:
+            carried.close()
+
+
+def reembedding(store: Store, embedding: Embedding) -> Reembedding:
+    """What carries the memory in a store over to another embedding."""
+    made = Identity.read(store)
+    exemplars = made.exemplar_count(store, None)
+    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation)
+    plan = window_plan(made.sensor, embedding)
+    extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
+
+    def encode(readings: npt.NDArray[np.float32]) -> tuple[int, Codes]:
+        touch = Stream(made.sensor, readings)
+        image = extractor.image(touch)
+        return image.shape[1], extractor.codes(image, touch.key)
+
+    def load(draft: Store) -> Memory:
+        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1])
+
+    return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)

@@ -479,11 +479,11 @@ class TactileLearner:
         with one_thread():
             judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
         order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
-        names = map(candidates.__getitem__, order.tolist())
-        ranking = list(zip(names, judgement.probability[order].tolist(), strict=True))
+        names = [candidates[place] for place in order.tolist()]
+        ranking = tuple(zip(names, judgement.probability[order].tolist(), strict=True))
         known = bool(judgement.novelty <= judgement.calibration.threshold(self._settings.false_alarms))
         tuned = logits is not None
-        return Prediction(*ranking[0], tuple(ranking), judgement.novelty, known, encoded.seconds, tuned=tuned)
+        return Prediction(*ranking[0], ranking, judgement.novelty, known, encoded.seconds, tuned=tuned)
 
     def settle(self) -> None:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from scroll_tactile.errors import CapacityError, InputError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate
-from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
 from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
@@ -80,11 +81,18 @@ class Draft:
         stages += [list(NOISE)] * memory.plan.noisy
         return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)
 
-    def fit(self) -> Model:
-        """Solve the readouts and calibrate them."""
-        with one_thread():
-            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
-            calibrations, apart = calibrate(self.sample, self.stages, readouts, self.kind)
+    def fit(self, threads: int = 1) -> Model:
+        """Solve the readouts and calibrate them, on so many threads: more than one where somebody waits for it."""
+
+        def solve(scale: Scale) -> tuple[Readout, LeftOut]:
+            readout = Readout(self.tasks[scale], self.memory.statistics)
+            return readout, left_out(readout, self.sample, self.stages, self.kind)
+
+        with one_thread(), ThreadPoolExecutor(threads, "scroll-tactile fit") as workers:
+            solved = dict(zip(self.tasks, workers.map(solve, self.tasks), strict=True))
+            readouts = {scale: readout for scale, (readout, _) in solved.items()}
+            apart = {scale: left for scale, (_, left) in solved.items()}
+            calibrations = calibrate(self.sample, self.stages, readouts, apart, self.kind)
         give_back_scratch()
         return Model(self, readouts, calibrations, apart)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled, left_out
+from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.signals.windows import Scale
 
@@ -79,19 +79,19 @@ def calibrate(
     sample: Sampled,
     stages: Sequence[Sequence[Scale]],
     readouts: Mapping[Scale, Readout],
+    apart: Mapping[Scale, LeftOut],
     kind: ReadoutName,
-) -> tuple[list[Calibration], dict[Scale, LeftOut]]:
+) -> list[Calibration]:
     """Calibrate every stage, given as the scales that judge there, of which all have a readout.
 
-    readouts: that have followed nothing yet. Also returns what each scale says of the touches left out.
+    readouts: that have followed nothing yet. apart: what each says of the touches left out.
     """
-    apart = {scale: left_out(readouts[scale], sample, stages, kind) for scale in readouts}
     materials = [material for material, *_ in sample]
     return [
         calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
         for stage, scales in enumerate(stages)
         if all(scale in readouts for scale in scales)
-    ], apart
+    ]
 
 
 def calibrate_stage(

@@ -48,7 +48,7 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
 FIRST_KNOWN = 256  # materials
-MOST_HELD = 4 * EAGER  # then those that were asked for are let go
+MOST_HELD = 2 * EAGER  # then those that were asked for are let go
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,8 @@ class Readout:
         self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
         matrix[np.diag_indices(dimension)] += self.penalty
         self._held: dict[int, int] = {}  # place → row of these
-        self._means = self._solved = np.empty((0, dimension))  # m about the origin, and K⁻¹ m
+        self._room = np.empty((0, 2, dimension))
+        self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
         self._sizes = np.empty(0)  # mᵀ K⁻¹ m
         self._derived: Derived | None = None
         self._coarse: Coarse | None = None
@@ -159,11 +160,17 @@ class Readout:
 
     def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
         """Hold more materials, whose means about the origin are these, shape (k, d)."""
-        solved, first = self.system.solve(means), len(self._means)
-        # All of it before any is kept: there may be no memory for it.
-        more = np.vstack([self._means, means]), np.vstack([self._solved, solved])
-        sizes = np.append(self._sizes, np.einsum("hd,hd->h", means, solved))
-        (self._means, self._solved), self._sizes = more, sizes
+        solved, first = self.system.solve(means), len(self._held)
+        last = first + len(means)
+        if last > len(self._room):
+            # Room for half as many more, if there are any: materials that are asked for come one by one. All of it
+            # before any is kept: there may be no memory for it.
+            room = np.empty((last if not first else last + last // 2, 2, means.shape[1]))
+            room[:first] = self._room[:first]
+            self._room = room
+        self._room[first:last, 0], self._room[first:last, 1] = means, solved
+        self._sizes = np.append(self._sizes[:first], np.einsum("hd,hd->h", means, solved))
+        self._means, self._solved = self._room[:last, 0], self._room[:last, 1]
         self._held |= {int(place): first + i for i, place in enumerate(places)}
 
     def held(self, places: Sequence[int] | Places) -> Places:

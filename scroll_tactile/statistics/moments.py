@@ -23,6 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
+MANY = 1024  # classes
 
 
 @lru_cache(maxsize=1)
@@ -172,6 +173,17 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     for row, place in _rows_of_triangle(dimension):
         centred[row, : row + 1] = packed[place]
     rounded = np.zeros((dimension, dimension))
+    if len(counts) > MANY:
+        _take_about_the_mean(centred, rounded, counts, sums)
+    else:
+        _take_exactly(centred, rounded, counts, sums)
+    rounded *= -1.0
+    rounded += centred
+    return rounded
+
+
+def _take_exactly(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:
+    """Take Σ_y c_y c_yᵀ / n_y off `centred`, but for Σ_y r_y r_yᵀ / n_y, which is added to `rounded`."""
     # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
     largest = int(np.abs(sums).max(initial=1))
     block = min(1024, 2 ** (53 - BITS) // largest)
@@ -190,6 +202,20 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
             centred -= (total.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
             rest /= np.sqrt(rows)
             rounded += rest.T @ rest
-    rounded *= -1.0
-    rounded += centred
-    return rounded
+
+
+def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:
+    """Move `centred` to the integer g next to the mean of all, exactly; add Σ_y n_y (m_y − g)(m_y − g)ᵀ to `rounded`.
+
+    A product of half the operations in place of two: of ten thousand classes a second less for each scale. What is
+    lost is the digits by which the scatter between classes exceeds that within, and not those of the mean.
+    """
+    total, rows = sums.sum(axis=0), int(counts.sum())
+    mean = mean_code(total, rows)
+    centred -= np.outer(total, mean) + np.outer(mean, total - rows * mean)
+    with one_thread():
+        for first in range(0, len(counts), 1024):
+            block = counts[first : first + 1024, None]
+            apart = (sums[first : first + 1024] - block * mean).astype(np.float64)
+            apart /= np.sqrt(block)
+            rounded += apart.T @ apart

@@ -8,6 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate, fit_weights
+from scroll_tactile.readouts.leave_one_out import left_out
 from scroll_tactile.readouts.readout import Readout, Task
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
@@ -35,7 +36,9 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
 def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
-    return calibrate(pool, stages, {task.scale: Readout(task, statistics) for task in tasks}, kind)[0]
+    readouts = {task.scale: Readout(task, statistics) for task in tasks}
+    apart = {scale: left_out(readout, pool, stages, kind) for scale, readout in readouts.items()}
+    return calibrate(pool, stages, readouts, apart, kind)
 
 
 def calibrated(kind="lda", **settings):

@@ -17,7 +17,7 @@ from contextlib import suppress
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.filling import Filling
 from scroll_tactile.prediction.model import Draft, Model
@@ -57,16 +57,18 @@ class CurrentModel:
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
         self._take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
-        model, (behind, self._behind) = self._model, (self._behind, None)
-        if model is None or behind is None or self._due(model, memory):
-            model = self._adopted(memory)
-        elif behind:
+        (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
+        if model is not None and (behind is None or self._due(model, memory)):
+            model = None
+        if model is not None and behind:
             self._exact = False
             if not model.follow(memory, behind):
-                model = self._adopted(memory)
-        self._model, self._behind = model, []
+                model = None
+        # The last one is let go first, and its memory given back: each is some tens of MB.
+        present = self._adopted(memory) if model is None else model
+        self._model, self._behind = present, []
         self.prepare(ledger)
-        return model
+        return present
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin to fit the next model where enough has come since the last. Raises nothing: an observation is kept."""
@@ -123,7 +125,9 @@ class CurrentModel:
         coming = self._coming
         if coming is not None and coming.exception() is None:  # it waits; interrupted there, the next call does
             model, self._exact, self._coming = coming.result(), not self._since, None
+            del coming
             if not self._due(model, memory) and model.follow(memory, self._since):
+                give_back_scratch()
                 return model
         self._coming = None
         return self._fitted(memory)

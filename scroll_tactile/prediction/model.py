@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +23,8 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["Draft", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
+
+Solved = tuple[Readout, LeftOut]
 
 NEGLIGIBLE = 40.0  # of a logit: ten thousand materials so far behind have 4e-14 of the probability together
 
@@ -84,12 +86,12 @@ class Draft:
     def fit(self, threads: int = 1) -> Model:
         """Solve the readouts and calibrate them, on so many threads: more than one where somebody waits for it."""
 
-        def solve(scale: Scale) -> tuple[Readout, LeftOut]:
+        def solve(scale: Scale) -> Solved:
             readout = Readout(self.tasks[scale], self.memory.statistics)
             return readout, left_out(readout, self.sample, self.stages, self.kind)
 
-        with one_thread(), ThreadPoolExecutor(threads, "scroll-tactile fit") as workers:
-            solved = dict(zip(self.tasks, workers.map(solve, self.tasks), strict=True))
+        with one_thread():
+            solved = dict(zip(self.tasks, _mapped(solve, list(self.tasks), threads), strict=True))
             readouts = {scale: readout for scale, (readout, _) in solved.items()}
             apart = {scale: left for scale, (_, left) in solved.items()}
             calibrations = calibrate(self.sample, self.stages, readouts, apart, self.kind)
@@ -245,6 +247,13 @@ class Model:
         """The standardised novelty of a touch at some scales, if it is one of these materials that it may be."""
         distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
         return float(calibration.novelty(np.array(distances)))
+
+
+def _mapped(solve: Callable[[Scale], Solved], scales: list[Scale], threads: int) -> list[Solved]:
+    if threads == 1 or len(scales) < 2:
+        return [solve(scale) for scale in scales]
+    with ThreadPoolExecutor(threads) as workers:
+        return list(workers.map(solve, scales))
 
 
 def _chances(logits: FloatArray) -> FloatArray:

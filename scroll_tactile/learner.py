@@ -6,6 +6,7 @@ import copy
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -390,7 +391,7 @@ class TactileLearner:
         Raises StreamError, UnknownMaterialError for a scene that names a material never observed, InputError for an
         empty one. Before anything was observed the answer is material None, known False.
         """
-        touch = self._verified().stream(stream)
+        touch = self._extractor.stream(stream)
 
         def evaluate() -> tuple[int, Callable[[], Prediction]]:
             with self._ledger.lock:
@@ -412,7 +413,7 @@ class TactileLearner:
 
         evaluate: reads the memory and embeds the touch; gives the version that it read, and what answers.
         """
-        with enough_memory():
+        with self._verifying(), enough_memory():
             version, answer = evaluate()
             with self._ledger.lock:
                 if self._ledger.version != version:
@@ -438,7 +439,7 @@ class TactileLearner:
         """
         if not 0 <= unfamiliar <= 1:
             raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
-        touch = self._verified().stream(stream)
+        touch = self._extractor.stream(stream)
 
         def evaluate() -> tuple[int, Callable[[], Composition]]:
             with self._ledger.lock:
@@ -464,6 +465,21 @@ class TactileLearner:
             return version, answer
 
         return self._of_one_state(evaluate)
+
+    @contextmanager
+    def _verifying(self) -> Iterator[None]:
+        """Compare the fingerprint of an embedding that was made again, beside what the block does: it embeds, too."""
+        if self._unverified is None:
+            yield
+            return
+        identity, path = self._unverified
+        with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
+            compared = beside.submit(identity.require_embedding, path, self._embedding)
+            try:
+                yield
+            finally:
+                compared.result()  # of another embedding nothing else that the block raised means anything
+        self._unverified = None
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""

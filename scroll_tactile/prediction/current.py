@@ -133,7 +133,7 @@ class CurrentModel:
         return self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit(os.cpu_count() or 1)
+        model = Draft.of(memory, self._kind).fit()
         self._exact = True
         return model
 

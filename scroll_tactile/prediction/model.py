@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -23,8 +22,6 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["Draft", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
-
-Solved = tuple[Readout, LeftOut]
 
 NEGLIGIBLE = 40.0  # of a logit: ten thousand materials so far behind have 4e-14 of the probability together
 
@@ -83,17 +80,11 @@ class Draft:
         stages += [list(NOISE)] * memory.plan.noisy
         return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)
 
-    def fit(self, threads: int = 1) -> Model:
-        """Solve the readouts and calibrate them, on so many threads: more than one where somebody waits for it."""
-
-        def solve(scale: Scale) -> Solved:
-            readout = Readout(self.tasks[scale], self.memory.statistics)
-            return readout, left_out(readout, self.sample, self.stages, self.kind)
-
+    def fit(self) -> Model:
+        """Solve the readouts and calibrate them."""
         with one_thread():
-            solved = dict(zip(self.tasks, _mapped(solve, list(self.tasks), threads), strict=True))
-            readouts = {scale: readout for scale, (readout, _) in solved.items()}
-            apart = {scale: left for scale, (_, left) in solved.items()}
+            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+            apart = {scale: left_out(readouts[scale], self.sample, self.stages, self.kind) for scale in readouts}
             calibrations = calibrate(self.sample, self.stages, readouts, apart, self.kind)
         give_back_scratch()
         return Model(self, readouts, calibrations, apart)
@@ -247,13 +238,6 @@ class Model:
         """The standardised novelty of a touch at some scales, if it is one of these materials that it may be."""
         distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
         return float(calibration.novelty(np.array(distances)))
-
-
-def _mapped(solve: Callable[[Scale], Solved], scales: list[Scale], threads: int) -> list[Solved]:
-    if threads == 1 or len(scales) < 2:
-        return [solve(scale) for scale in scales]
-    with ThreadPoolExecutor(threads) as workers:
-        return list(workers.map(solve, scales))
 
 
 def _chances(logits: FloatArray) -> FloatArray:

@@ -28,7 +28,8 @@ __all__ = ["Ledger"]
 logger = logging.getLogger(__name__)
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
-SNAPSHOT_EVERY = 256  # rows between generations: opening replays so many in about a second
+SNAPSHOT_EVERY = 128  # rows between generations: opening embeds so many again in half a second
+MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a generation has all
 
 
 class Ledger:
@@ -336,7 +337,8 @@ class Ledger:
                 raise
 
     def _snapshot_if_due(self) -> None:
-        if self.store is None or self._batching or self._memory.sequence - self._saved < SNAPSHOT_EVERY:
+        rows = max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW)
+        if self.store is None or self._batching or self._memory.sequence - self._saved < rows:
             return
         arrays, attributes = self._memory.to_arrays()
         try:

@@ -44,7 +44,7 @@ class Coarse:
         """K⁻¹ has lost columnsᵀ corner columns, of shapes (k, d) and (k, k)."""
         onto = (self._means @ columns.astype(np.float32).T).astype(np.float64)
         error = self._error(columns).T
-        self._sizes -= np.einsum("ck,kl,cl->c", onto, corner, onto, optimize=True)
+        self._sizes -= ((onto @ corner) * onto).sum(axis=1)
         weights = np.abs(corner).sum(axis=1)
         self._slack += (2 * np.abs(onto) + error) * error @ weights
 

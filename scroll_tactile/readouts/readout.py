@@ -268,8 +268,9 @@ class Readout:
             return
         leaving, corner = self.system.border(columns, sign)
         onto = self._means @ leaving.T
-        self._solved -= (onto @ corner) @ leaving
-        self._sizes -= np.einsum("hk,kl,hl->h", onto, corner, onto, optimize=True)
+        moved = onto @ corner
+        self._solved -= moved @ leaving
+        self._sizes -= (moved * onto).sum(axis=1)
         if self._coarse is not None:
             self._coarse.border(leaving, corner)
 

@@ -228,14 +228,16 @@ class WindowPlan:
     def scored_stages(self, columns: int) -> list[dict[Scale, list[list[int]]]]:
         """For each stage that a touch of so many columns reached: scale → places of the windows that judge there.
 
-        They come in groups, each learned as its mean: all windows of a scale together, a camera's frames one by one.
-        One frame may be all that is judged, so GelSight's are 84.5 % right, and 78.4 learned from means of videos.
+        They come in groups, each learned as its mean: the narrow windows together, wide ones and a camera's frames one
+        by one. One of these may be all that is judged: of halves of BioTac's touches 97 % are right so and 92 learned
+        from means of their wide windows, of single frames of GelSight 84.5 and 78.4 % from means of videos.
         """
+
+        def grouped(scale: Scale, places: list[int]) -> list[list[int]]:
+            return [[place] for place in places] if self.frames or scale.width > self.widths[0] else [places]
+
         stages = [self.scored(columns, length) for length in self.stages(columns)]
-        return [
-            {scale: [[place] for place in places] if self.frames else [places] for scale, places in stage.items()}
-            for stage in stages
-        ]
+        return [{scale: grouped(scale, places) for scale, places in stage.items()} for stage in stages]
 
     def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""

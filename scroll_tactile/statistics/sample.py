@@ -76,11 +76,6 @@ class SampledTouch:
         rows = [mean_code(total, windows) for total, windows in zip(sums, pairs[:, 2].tolist(), strict=True)]
         return cls(np.array(rows, dtype=np.int32).reshape(sums.shape), pairs)
 
-    def at(self, stage: int) -> npt.NDArray[np.int32]:
-        """The rows of the scales that judge at a stage, ascending, (scales, d); none where it was not reached."""
-        rows: npt.NDArray[np.int32] = self.rows[self.pairs[:, 0] == stage]
-        return rows
-
 
 class Sample(Generic[T]):
     """At most `capacity` items of all materials: a function of the set observed.

@@ -16,7 +16,6 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.embeddings.maps import Maps
     from scroll_tactile.embeddings.modules import ModuleEmbedding
     from scroll_tactile.embeddings.protocol import Capabilities, Embedding
-    from scroll_tactile.embeddings.robust import Robust
     from scroll_tactile.embeddings.vision import Vision
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.results import Composition, Constituent, Observation, Prediction, Receipt
@@ -39,7 +38,6 @@ __all__ = [
     "Observation",
     "Prediction",
     "Receipt",
-    "Robust",
     "Sensor",
     "Settings",
     "Stream",
@@ -67,7 +65,6 @@ _MODULES = {
     "Observation": "results",
     "Prediction": "results",
     "Receipt": "results",
-    "Robust": "embeddings.robust",
     "Sensor": "sensors",
     "Settings": "settings",
     "Stream": "signals.stream",

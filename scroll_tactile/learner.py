@@ -102,7 +102,7 @@ class TactileLearner:
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
         self._snapshot_of: str | None = None
-        self._current = CurrentModel(self._settings, sensor.channels, embedding.bound)
+        self._current = CurrentModel(self._settings)
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self) -> Memory:
@@ -125,9 +125,9 @@ class TactileLearner:
         ships with scroll-tactile. Nothing is embedded before the first touch.
         mode: "read" shows what was committed when it was opened, also while another process writes the memory.
 
-        Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, or with a
-        user's own embedding that is not passed; InputError where a new memory is given no sensor; StoreError (locked,
-        damaged, not a store, a newer version …).
+        Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, with what
+        only earlier versions have, or with a user's own embedding that is not passed; InputError where a new memory is
+        given no sensor; StoreError (locked, damaged, not a store, a newer version …).
         """
         chosen = Settings(**settings)
         finish_interrupted(Path(path))
@@ -136,6 +136,7 @@ class TactileLearner:
         store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, mode)
         try:
             identity = Identity.read(store)
+            identity.require_current(store.path, embedding, mode)
             identity.require(store.path, sensor, augmentation)
             if embedding is None:
                 found = identity.own_embedding(store.path)
@@ -395,14 +396,14 @@ class TactileLearner:
 
         def evaluate() -> tuple[int, Callable[[], Prediction]]:
             with self._ledger.lock:
-                model, filling = self._current.present(self._ledger), self._current.filling(self._ledger)
+                model = self._current.present(self._ledger)
                 version, reader = self._ledger.version, self._reader() if tuned else None
                 candidates = candidates_of(scene, model.names, model.known)
             if not candidates:
                 return version, lambda: Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
-            encoded = self._extractor.encode(touch, model, filling, lambda columns: model.needed(candidates, columns))
+            encoded = self._extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
             logits = None
-            if reader is not None and not encoded.noisy and model.is_last(encoded.columns):
+            if reader is not None and model.is_last(encoded.columns):
                 logits = reader.logits_of(encoded.image, candidates)
             return version, lambda: self._answer(model, candidates, encoded, logits)
 
@@ -431,8 +432,7 @@ class TactileLearner:
 
         For a material that was observed the estimate is the composition of the materials it feels like, for one that
         was not that of heads over all described materials (see `prediction.composition`); the touch's novelty weighs
-        the two. A touch through noise, where noisy copies were observed, has the first alone. A constituent that all
-        materials have, or none, cannot be learned: `Constituent.unlearned` says so.
+        the two. A constituent that all materials have, or none, cannot be learned: `Constituent.unlearned` says so.
 
         Raises StreamError; DescriptionError where nothing was described, or for a constituent that no description
         names; InputError for an unfamiliar that is no probability.
@@ -444,8 +444,7 @@ class TactileLearner:
         def evaluate() -> tuple[int, Callable[[], Composition]]:
             with self._ledger.lock:
                 wanted = require_constituents(self._ledger.memory.descriptions, constituents)
-                model, filling = self._current.present(self._ledger), self._current.filling(self._ledger)
-                version = self._ledger.version
+                model, version = self._current.present(self._ledger), self._ledger.version
                 if not model.names:
                     nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
                     unknown = Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
@@ -455,7 +454,7 @@ class TactileLearner:
             def needed(columns: int) -> list[Scale]:
                 return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
 
-            encoded = self._extractor.encode(touch, model, filling, needed)
+            encoded = self._extractor.encode(touch, model.longest, needed)
 
             def answer() -> Composition:
                 prediction = self._answer(model, model.names, encoded, None)
@@ -493,7 +492,7 @@ class TactileLearner:
         self, model: Model, candidates: Sequence[str], encoded: Encoded, logits: Mapping[str, float] | None
     ) -> Prediction:
         with one_thread():
-            judgement = model.judge(candidates, encoded.means, encoded.columns, logits, noisy=encoded.noisy)
+            judgement = model.judge(candidates, encoded.means, encoded.columns, logits)
         order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
         names = [candidates[place] for place in order.tolist()]
         ranking = tuple(zip(names, judgement.probability[order].tolist(), strict=True))
@@ -563,9 +562,8 @@ class TactileLearner:
         Raises InputError where there are no exemplars, fewer of them than materials, one material only, or none long
         enough; FineTuneError where the loss is not finite or the device has no memory left; StoreError.
         """
-        from scroll_tactile.finetune.fine_tune import fine_tune, require_tunable
+        from scroll_tactile.finetune.fine_tune import fine_tune
 
-        require_tunable(self._plan, self._embedding)
         self._verified()
         with self._ledger.lock:
             self._ledger.require_writing()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import Augmented, Kernels, Robust, Sensor, TactileLearner
+from scroll_tactile import Augmented, Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.gel import SMALL as CAMERA
 from scroll_tactile.errors import LearnerError
 from scroll_tactile.testing import check_learner
@@ -15,7 +15,6 @@ WAYS = {
     "ridge": {"sensor": PAD, "embedding": SMALL, "readout": "ridge"},
     "no exemplars": {"sensor": PAD, "embedding": SMALL, "exemplars": 0},
     "copies": {"sensor": PAD, "embedding": SMALL, "augmentation": Augmented(copies=2)},
-    "robust": {"sensor": PAD, "embedding": Robust(SMALL), "augmentation": Augmented(copies=0, noisy=2)},
     "camera": {"sensor": CAMERA},
 }
 

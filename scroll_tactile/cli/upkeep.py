@@ -33,7 +33,10 @@ def reembed(
     folder: MemoryFolder,
     default: Annotated[bool, typer.Option("--default", help="With the default embedding of its sensor.")] = False,
 ) -> None:
-    """Embed all readings again, with the memory's own embedding as it is now; interrupted, start it again to go on."""
+    """Embed all readings again, with the memory's own embedding as it is now, or the default where that is gone.
+
+    Interrupted, start it again to go on.
+    """
     from scroll_tactile.memory.identity import Identity, usual_embedding
     from scroll_tactile.memory.reembed import finish_interrupted
     from scroll_tactile.prediction.reembedding import reembed_memory

@@ -19,7 +19,6 @@ __all__ = [
     "Capabilities",
     "CompositeEmbedding",
     "Embedding",
-    "NoiseEmbedding",
     "WindowEmbedding",
     "canary",
     "capabilities_of",
@@ -42,13 +41,10 @@ class Capabilities:
 
     partial_windows: a touch of 0.65 of a wide window or more is read at that scale, as far as it goes.
     judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
-    reads_beginnings: the first narrow window of a touch is a scale of its own.
-    fills_channels: dead channels are filled in from the others before anything is embedded.
     shrinkage: how many times as far as its formula says the scatter of its features is shrunk; see
         `readouts.shrinkage`. More than once for features that are far from normally distributed.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
     embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
-    embeds_noise: it has `is_noisy(image)` and `embed_noisy(images)`, see `NoiseEmbedding`.
     composite: it has `parts`, see `CompositeEmbedding`.
     tunable: it has `network()`, a copy of its network to be fine-tuned, see `Vision.network`.
     exact: its features are the same bits on every machine, so that a memory need not keep them beside the readings.
@@ -56,13 +52,10 @@ class Capabilities:
 
     partial_windows: bool = True
     judged_scales: Literal["widest", "all"] = "all"
-    reads_beginnings: bool = False
-    fills_channels: bool = False
     shrinkage: float = 1.0
     reads_frames: bool = False
     rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
     embeds_windows: bool = False
-    embeds_noise: bool = False
     composite: bool = False
     tunable: bool = False
     exact: bool = False
@@ -114,18 +107,6 @@ class WindowEmbedding(Embedding, Protocol):
         ...
 
 
-class NoiseEmbedding(Embedding, Protocol):
-    """An embedding with features made for noisy touches: `Capabilities.embeds_noise`."""
-
-    def is_noisy(self, image: npt.NDArray[np.float32]) -> bool:
-        """Whether a touch is read by `embed_noisy`, a function of its image (C, T) alone."""
-        ...
-
-    def embed_noisy(self, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:
-        """Two sets of features, shape (2, N, d), of N ≥ 1 whole images (C, T) of as many channels."""
-        ...
-
-
 class CompositeEmbedding(Embedding, Protocol):
     """An embedding that is others side by side, each one's features divided by its bound: `Capabilities.composite`."""
 
@@ -168,9 +149,6 @@ def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
         scales(sensor),
         declared.partial_windows,
         declared.judged_scales,
-        declared.reads_beginnings,
-        declared.embeds_noise,
-        declared.fills_channels and sensor.channels <= embedding.dimension,
         declared.shrinkage,
         sensor.camera,
     )

@@ -44,7 +44,6 @@ _KINDS = {  # each a module's name, too
     "joined": "Joined",
     "kernels": "Kernels",
     "maps": "Maps",
-    "robust": "Robust",
     "vision": "Vision",
 }
 
@@ -141,20 +140,9 @@ class JoinedConfiguration(Configuration):
     parts: Annotated[list[AnyConfiguration], Field(min_length=2, max_length=MOST_PARTS)]
 
 
-class RobustConfiguration(Configuration):
-    """Of `Robust`, with the embedding inside it."""
-
-    kind: Literal["robust"]
-    inner: AnyConfiguration
-    seed: _Seed
-
-
 _Single: TypeAlias = KernelsConfiguration | FramesConfiguration | VisionConfiguration | MapsConfiguration
-AnyConfiguration: TypeAlias = Annotated[
-    _Single | JoinedConfiguration | RobustConfiguration, Field(discriminator="kind")
-]
+AnyConfiguration: TypeAlias = Annotated[_Single | JoinedConfiguration, Field(discriminator="kind")]
 JoinedConfiguration.model_rebuild()
-RobustConfiguration.model_rebuild()
 ADAPTER: TypeAdapter[AnyConfiguration] = TypeAdapter(AnyConfiguration)
 
 
@@ -256,8 +244,6 @@ def _made(held: AnyConfiguration) -> Embedding:
     settings = held.model_dump(exclude={"kind"})
     if isinstance(held, JoinedConfiguration):
         return cast(Embedding, make(*map(_made, held.parts)))
-    if isinstance(held, RobustConfiguration):
-        return cast(Embedding, make(_made(held.inner), seed=held.seed))
     if isinstance(held, FramesConfiguration):
         rest = _picture(held.rest) if isinstance(held.rest, PictureConfiguration) else held.rest
         return _weighted(make, held.weights, **settings | {"rest": rest})
@@ -304,13 +290,10 @@ def _candidates(name: str, dimension: int, sensor: Sensor) -> Iterator[Callable[
     """Ways to make the embeddings of a name in common use, the likely first."""
     from scroll_tactile.embeddings.frames import Frames
     from scroll_tactile.embeddings.maps import Maps
-    from scroll_tactile.embeddings.robust import Robust
 
     if name == "kernels":
         yield lambda: Kernels(dimension=dimension)
         yield from (partial(Kernels, dimension=dimension, seed=seed) for seed in range(LIKELY_SEEDS))
-    elif name == "robust kernels":
-        yield lambda: Robust(Kernels(dimension=dimension))
     elif name == "frames":
         yield Frames
         yield lambda: Frames(rest=None)

@@ -36,10 +36,9 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune", "require_tunable"]
+__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -102,15 +101,6 @@ def fine_tune(
     tuned = Tuned(names, heads, final.bias * temperature, final.network, chosen, kept)
     report = TuneReport(kept, reason, chosen, len(samples), best, scores, time.perf_counter() - begun, tuned.digest())
     return replace(tuned, report=Tuned.described(report)), report
-
-
-def require_tunable(plan: WindowPlan, embedding: Embedding) -> None:
-    """Raise InputError for an embedding that reads more than windows."""
-    if plan.beginning or plan.noisy or plan.filled:
-        raise InputError(
-            f"f* is made of windows alone, and {embedding!r} reads beginnings, noise and dead channels by statistics "
-            "that training does not have: f* would see less than f. Fine-tune a memory of the embedding inside it"
-        )
 
 
 def _require_settings(

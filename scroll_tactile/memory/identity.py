@@ -10,19 +10,13 @@ from typing import Any, Literal, Self, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import Kernels
-from scroll_tactile.embeddings.protocol import (
-    Capabilities,
-    Embedding,
-    NoiseEmbedding,
-    embed_windows,
-    require_rest,
-    window_plan,
-)
+from scroll_tactile.embeddings.protocol import Capabilities, Embedding, embed_windows, require_rest, window_plan
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
+from scroll_tactile.memory.earlier import gone_copies, gone_embedding, is_gone, split_copies
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.statistics.grid import BITS
@@ -39,8 +33,7 @@ __all__ = [
 ]
 
 USUAL_EXEMPLARS = 400  # streams
-ROBUST = "robust kernels"
-LIKELY_EXACT = ("kernels", ROBUST)  # in memories made before configurations were kept
+LIKELY_EXACT = "kernels"  # in memories made before configurations were kept
 
 
 class _Kept(BaseModel):
@@ -74,6 +67,11 @@ class EmbeddingIdentity(_Kept):
         """Whether rows of observations hold readings alone: the memory can make the embedding again, to the bit."""
         return self.configuration is not None and _is_exact(self.configuration)
 
+    @property
+    def gone(self) -> bool:
+        """Whether only an earlier version can make it; a user's own of that name is told by its fingerprint."""
+        return is_gone(self.name, self.configuration)
+
     def __str__(self) -> str:
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
@@ -91,6 +89,7 @@ class Identity(_Kept):
 
     reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
     exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
+    gone_copies: the settings of copies that only an earlier version can make; of no new memory.
     """
 
     sensor: Sensor
@@ -99,6 +98,16 @@ class Identity(_Kept):
     reading: tuple[bool, Literal["all", "widest"]] | None = None
     exemplars: tuple[int | None, int | None] | None = None
     augmentation: Augmented | None = None
+    gone_copies: dict[str, Any] = Field(default_factory=dict, exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_what_is_gone(cls, fields: Any) -> Any:
+        kept = fields.get("augmentation") if isinstance(fields, Mapping) else None
+        if not isinstance(kept, Mapping):
+            return fields
+        augmentation, gone = split_copies(kept)
+        return {**fields, "augmentation": augmentation, "gone_copies": gone}
 
     @classmethod
     def of(
@@ -144,7 +153,7 @@ class Identity(_Kept):
         if self.exemplars is not None:
             kept["exemplars"] = list(self.exemplars)
         if self.augmentation is not None:
-            kept["augmentation"] = self.augmentation.to_json()
+            kept["augmentation"] = self.augmentation.model_dump(mode="json")
         kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
         return kept
 
@@ -170,18 +179,40 @@ class Identity(_Kept):
     def own_embedding(self, path: Path) -> Embedding:
         """The memory's embedding, made again from its configuration; nothing is embedded.
 
-        Raises EmbeddingMismatchError for a user's own embedding, which has no configuration.
+        Raises EmbeddingMismatchError for a user's own embedding, which has no configuration, and for one that is gone.
         """
         made = self.embedding
+        if made.gone:
+            raise gone_embedding(path, made)
         if made.configuration is not None:
             return from_configuration(made.configuration)
         found = guess(made.name, made.dimension, made.fingerprint, self.sensor)
         if found is None:
             raise EmbeddingMismatchError(
                 f"{path} was made with embedding {made}, which does not ship with scroll-tactile: pass the one that "
-                "made it, TactileLearner.open(path, embedding=...)"
+                "made it, TactileLearner.open(path, embedding=...), or carry the memory over to the default one: "
+                f"scroll-tactile memory reembed {path} --default"
             )
         return found
+
+    def require_current(self, path: Path, embedding: Embedding | None, mode: Literal["write", "read"]) -> None:
+        """Raise EmbeddingMismatchError or MismatchError for a memory made with what this version cannot make.
+
+        embedding: that it is opened with, if any: one that has the memory's fingerprint is the user's own. With an
+        AbsentEmbedding it can be read, and not written.
+        """
+        absent = isinstance(embedding, AbsentEmbedding)
+        if absent and mode == "read":
+            return
+        own = embedding is not None and not absent and embedding.fingerprint == self.embedding.fingerprint
+        if self.embedding.gone and not own:
+            raise gone_embedding(path, self.embedding)
+        self.require_copies(path)
+
+    def require_copies(self, path: Path) -> None:
+        """Raise MismatchError for a memory made with copies that this version cannot make."""
+        if self.gone_copies:
+            raise gone_copies(path, self.gone_copies)
 
     def require(self, path: Path, sensor: Sensor | None, augmentation: Augmented | None) -> None:
         """Raise MismatchError for a sensor or an augmentation, if given, that the memory was not made with."""
@@ -239,19 +270,17 @@ class AbsentEmbedding:
         self.fingerprint = made.fingerprint
         self._identity, self._path = identity, path
         partial, judged = identity.reading or (True, "all")
-        robust = made.name == ROBUST  # the only embedding with scales beside its windows
         self.capabilities = Capabilities(
             partial_windows=partial,
             judged_scales=judged,
-            reads_beginnings=robust,
-            fills_channels=robust,
             embeds_windows=True,
-            embeds_noise=robust,
-            exact=made.bare or (made.configuration is None and made.name in LIKELY_EXACT),
+            # What is gone was exact mostly; where its readings alone are there, `_made` says what to do.
+            exact=made.bare or made.gone or (made.configuration is None and made.name == LIKELY_EXACT),
         )
 
     @cached_property
     def _made(self) -> Embedding:
+        self._identity.require_copies(self._path)
         made = self._identity.own_embedding(self._path)
         self._identity.require_embedding(self._path, made)
         return made
@@ -266,18 +295,10 @@ class AbsentEmbedding:
         """As `embed`."""
         return embed_windows(self._made, image, windows)
 
-    def is_noisy(self, image: npt.NDArray[np.float32]) -> bool:
-        """As `embed`."""
-        return cast(NoiseEmbedding, self._made).is_noisy(image)
-
-    def embed_noisy(self, images: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.floating]:
-        """As `embed`."""
-        return cast(NoiseEmbedding, self._made).embed_noisy(images)
-
 
 def _is_exact(configuration: Mapping[str, Any]) -> bool:
     """Whether the embedding of a configuration declares `Capabilities.exact`; it is not made for that."""
-    inside = [configuration["inner"]] if "inner" in configuration else configuration.get("parts")
+    inside = configuration.get("parts")
     return all(map(_is_exact, inside)) if isinstance(inside, list) else configuration.get("kind") == "kernels"
 
 

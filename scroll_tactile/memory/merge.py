@@ -212,6 +212,7 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
                 f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is "
                 f"{_formatted(own)}, there {_formatted(incoming)}. Merge memories of one sensor and one embedding"
             )
+    other.require_copies(theirs.path)
     whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
     if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
         raise MismatchError(

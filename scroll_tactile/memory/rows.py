@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.signals.windows import BEGINNING, Scale, WindowPlan
+from scroll_tactile.signals.windows import EARLIER, Scale, WindowPlan
 from scroll_tactile.statistics.sample import stage_rows
 
 __all__ = [
@@ -101,16 +101,15 @@ def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:
 
 def unpack_codes(arrays: Arrays) -> Codes:
     """The codes that `pack_codes` packed; none where the row has readings alone, or is an earlier version's."""
-    return {_scale(name): rows for name, rows in arrays.items() if name.startswith(CODES)}
+    return {scale: arrays[name] for name, scale in _scales(arrays, CODES)}
 
 
 def unpack_windows(arrays: Arrays) -> Codes:
     """The codes of all windows by scale, which rows of earlier versions hold: as they are, or places among values."""
-    plain = {_scale(name): rows for name, rows in arrays.items() if name.startswith("codes-")}
+    plain = {scale: arrays[name] for name, scale in _scales(arrays, "codes-")}
     placed = {
-        _scale(name): np.ascontiguousarray(values[arrays[name.replace("values", "places")].T]).astype(np.int32)
-        for name, values in arrays.items()
-        if name.startswith("values-")
+        scale: np.ascontiguousarray(arrays[name][arrays[f"places-{scale}"].T]).astype(np.int32)
+        for name, scale in _scales(arrays, "values-")
     }
     return dict(sorted((plain | placed).items()))
 
@@ -127,7 +126,6 @@ def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | N
         return codes
     windows, readings = unpack_windows(arrays), unpack_readings(arrays)
     own = {Scale("window", width): len(starts) for width, starts in plan.extent(columns).items()}
-    own |= {BEGINNING: 1} if plan.beginning else {}
     alone = all(len(windows[scale]) == count for scale, count in own.items() if scale in windows)
     if readings is not None and encode is not None and not (windows and alone):
         return encode(readings)
@@ -140,8 +138,10 @@ def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | N
     return {**windows, **stage_rows(plan.scored_stages(columns), judging)}
 
 
-def _scale(name: str) -> Scale:
-    return Scale.numbered(int(name.partition("-")[2]))
+def _scales(arrays: Arrays, prefix: str) -> list[tuple[str, Scale]]:
+    """The names of the arrays with this prefix, each with its scale; not those of scales that are gone."""
+    numbers = {name: int(name.removeprefix(prefix)) for name in arrays if name.startswith(prefix)}
+    return [(name, Scale.numbered(number)) for name, number in numbers.items() if number not in EARLIER]
 
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:

@@ -15,7 +15,7 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, only_readings, row_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import NOISE, Scale, WindowPlan
+from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import CompactedError, DamageError, Generation, Head, Record, Store
@@ -230,11 +230,7 @@ class Memory:
         return columns, row_codes(record.arrays, columns, self.plan, self.encode)
 
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
-        stages = self.plan.scored_stages(columns)
-        if all(scale in codes for scale in NOISE):  # the first noisy copy, at a stage after all others
-            unreached: list[dict[Scale, list[list[int]]]] = [{}] * (len(self.plan.milestones()) - len(stages))
-            stages += [*unreached, {scale: [[0]] for scale in NOISE}]
-        return SampledTouch.of(stages, codes)
+        return SampledTouch.of(self.plan.scored_stages(columns), codes)
 
     def _join(self, record: Record) -> None:
         """Add another memory of the same making: a row that holds the arrays and attributes of its base."""

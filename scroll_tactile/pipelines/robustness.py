@@ -14,7 +14,6 @@ import numpy as np
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.augmentation import Image, changed, resize
-from scroll_tactile.signals.copies import hiss, silence, wander
 from scroll_tactile.signals.stream import Stream, fewest_readings
 
 __all__ = ["dead", "drift", "length", "noise", "speed"]
@@ -51,7 +50,7 @@ def noise(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
     amplitude: a share of the sensor's range [low, high], so that 0.5 is a standard deviation of 0.29 of the range. What
     leaves the range is clipped to it, as a converter does.
     """
-    return _drawn(stream, "noise", amplitude, seed, lambda image, rng: hiss(image, amplitude, rng))
+    return _drawn(stream, "noise", amplitude, seed, lambda image, rng: _hiss(image, amplitude, rng))
 
 
 def dead(stream: Stream, share: float, seed: int = 0) -> Stream:
@@ -61,7 +60,7 @@ def dead(stream: Stream, share: float, seed: int = 0) -> Stream:
     """
     if share > 1:
         raise InputError(f"expected a share of channels from 0 to 1; came {share}")
-    return _drawn(stream, "dead", share, seed, lambda image, rng: silence(image, share, rng))
+    return _drawn(stream, "dead", share, seed, lambda image, rng: _silence(image, share, rng))
 
 
 def drift(stream: Stream, strength: float, seed: int = 0) -> Stream:
@@ -70,7 +69,7 @@ def drift(stream: Stream, strength: float, seed: int = 0) -> Stream:
     strength: the zero by at most this share of the range, and the gain by at most this share of itself, at the end;
     drawn evenly between ± these for each channel. Clipped to the range.
     """
-    return _drawn(stream, "drift", strength, seed, lambda image, rng: wander(image, strength, strength, rng))
+    return _drawn(stream, "drift", strength, seed, lambda image, rng: _wander(image, strength, strength, rng))
 
 
 def _drawn(
@@ -85,3 +84,38 @@ def _drawn(
     # With 2 in front, where copies that are learned from have 1: never the same draw.
     rng = np.random.default_rng([2, seed, _KINDS[kind], int.from_bytes(stream.key, "little")])
     return changed(stream, lambda image: change(image, rng))
+
+
+def _hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
+    """The touch observed by a noisy sensor: uniform noise in ± `amplitude`, a share of the range; clipped to the range.
+
+    image: float32 of shape (C, T) in [-1, 1], twice the share. Every value has noise of its own.
+    """
+    noise = rng.random(image.shape, dtype=np.float32) * np.float32(2) - np.float32(1)
+    noisy: Image = np.clip(image + noise * np.float32(2 * amplitude), np.float32(-1), np.float32(1))
+    return noisy
+
+
+def _silence(image: Image, share: float, rng: np.random.Generator) -> Image:
+    """The touch observed with dead channels: a `share` of the channels, rounded, reads the low end of the range
+    throughout.
+
+    image: float32 of shape (C, T) in [-1, 1]. Which channels are dead is drawn.
+    """
+    copy = image.copy()
+    copy[rng.permutation(len(image))[: round(share * len(image))]] = -1
+    return copy
+
+
+def _wander(image: Image, offset: float, gain: float, rng: np.random.Generator) -> Image:
+    """The touch observed by a sensor that warms up: each channel's gain and zero change along a straight line.
+
+    image: float32 of shape (C, T) in [-1, 1]. From nothing at the beginning to, at the end, an offset of at most
+    `offset` of the range and a gain of at most 1 ± `gain` about the low end of the range, drawn for each channel;
+    clipped to the range.
+    """
+    along = np.linspace(0, 1, image.shape[1], dtype=np.float32)
+    drawn = rng.random((2, len(image), 1), dtype=np.float32) * np.float32(2) - np.float32(1)
+    change = (image + 1) * (drawn[0] * np.float32(gain)) + drawn[1] * np.float32(2 * offset)
+    wandered: Image = np.clip(image + change * along, np.float32(-1), np.float32(1))
+    return wandered

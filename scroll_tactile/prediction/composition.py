@@ -63,11 +63,7 @@ class Composer:
 
         feels_like: probability of each material observed. encoded: the touch, with the scales that are `needed`.
         expected: the probability of a material never observed before the touch.
-
-        A touch through noise rests on the described materials it feels like alone: the heads read what noise hides.
         """
-        if encoded.noisy:
-            return self._constituents(wanted, self.stages[-1], feels_like, None, 0.0), expected
         stage = self._stage(encoded.columns)
         heads, scales, calibration = self.stages[stage], self.model.stages[stage], self.model.calibrations[stage]
         z = combined(self.model, stage, self.spaces[stage].names, encoded.means)
@@ -82,7 +78,7 @@ class Composer:
         wanted: Sequence[str],
         heads: StageHeads,
         feels_like: Mapping[str, float],
-        z: FloatArray | None,
+        z: FloatArray,
         unfamiliar: float,
     ) -> tuple[Constituent, ...]:
         constituents = [self._constituent(name, heads, feels_like, z, unfamiliar) for name in self.targets]
@@ -90,7 +86,7 @@ class Composer:
         return tuple(by_name[name] for name in wanted)
 
     def _constituent(
-        self, name: str, heads: StageHeads, feels_like: Mapping[str, float], z: FloatArray | None, unfamiliar: float
+        self, name: str, heads: StageHeads, feels_like: Mapping[str, float], z: FloatArray, unfamiliar: float
     ) -> Constituent:
         target = self.targets[name]
 
@@ -100,8 +96,6 @@ class Composer:
             observed = {material: feels_like[material] for material in known if material in feels_like}
             believed = (1 - unfamiliar) * sum(observed.values())
             value = (1 - unfamiliar) * sum(chance * known[material] for material, chance in observed.items())
-            if z is None:
-                return min(value / believed, 1.0) if believed else None
             return min(max(value + (1 - believed) * head(z), 0.0), 1.0)
 
         having = [(material, feels_like.get(material, 0.0)) for material, has in target.presence.items() if has]

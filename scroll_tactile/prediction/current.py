@@ -19,7 +19,6 @@ from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.filling import Filling
 from scroll_tactile.prediction.model import Draft, Model
 from scroll_tactile.settings import Settings
 
@@ -32,15 +31,10 @@ MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardl
 
 
 class CurrentModel:
-    """The model of one memory. Whoever calls holds the ledger's lock.
+    """The model of one memory. Whoever calls holds the ledger's lock."""
 
-    channels, bound: of the sensor and of the embedding, by which dead channels are filled in.
-    """
-
-    def __init__(self, settings: Settings, channels: int, bound: float) -> None:
+    def __init__(self, settings: Settings) -> None:
         self._kind = settings.readout
-        self._channels = channels
-        self._bound = bound
         self._version = -1
         self._model: Model | None = None
         self._exact = False  # whether the model was fitted to the memory as it is, and not followed
@@ -49,7 +43,6 @@ class CurrentModel:
         self._since: list[Added] = []  # what came since the coming one was begun
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
-        self._filling: tuple[int, Filling | None] | None = None
         self._composer: tuple[Model, int, int, Composer] | None = None
 
     def present(self, ledger: Ledger) -> Model:
@@ -136,15 +129,6 @@ class CurrentModel:
         model = Draft.of(memory, self._kind).fit()
         self._exact = True
         return model
-
-    def filling(self, ledger: Ledger) -> Filling | None:
-        """What fills in dead channels; None where the embedding does not ask for that."""
-        memory = ledger.memory
-        if not memory.plan.filled:
-            return None
-        if self._filling is None or self._filling[0] != ledger.version:
-            self._filling = ledger.version, Filling.of(memory.statistics, self._channels, self._bound)
-        return self._filling[1]
 
     def composer(self, ledger: Ledger, model: Model) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import (
-    Embedding,
-    NoiseEmbedding,
-    capabilities_of,
-    embed_windows,
-    require_rest,
-)
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
-from scroll_tactile.prediction.filling import Filling, sampled_readings
-from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.signals.windows import BEGINNING, CHANNELS, NOISE, Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
@@ -39,13 +30,11 @@ Image = npt.NDArray[np.float32]
 class Encoded:
     """A touch as it is evaluated.
 
-    image: (C, T) in [-1, 1], dead channels filled in where the embedding asks for that. means: scale → mean features in
-    the codes' unit, (d,). noisy: whether it is read as observed through noise. seconds: how much touch it is.
+    image: (C, T) in [-1, 1]. means: scale → mean features in the codes' unit, (d,). seconds: how much touch it is.
     """
 
     image: Image
     means: dict[Scale, npt.NDArray[np.float64]]
-    noisy: bool
     seconds: float
 
     @property
@@ -84,40 +73,27 @@ class FeatureExtractor:
         """The rows of codes that a touch adds to the statistics, by scale: its own, behind them those of its copies.
 
         Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
-        other scales. Noisy copies have rows of their own where the embedding reads noise.
+        other scales.
         """
-        copies, noisy = self._augmentation.copies_of(image, key) if self._augmentation is not None else ([], [])
-        own, *others = [self._stage_rows(picture) for picture in (image, *copies, *noisy * (not self._plan.noisy))]
-        rows = {scale: [first, *(other[scale] for other in others if scale in other)] for scale, first in own.items()}
-        bound = self._embedding.bound
-        if self._plan.noisy and noisy:
-            sets = zip(NOISE, self._noisy_features(noisy), strict=True)
-            rows |= {scale: [to_codes(features, bound)] for scale, features in sets}
-        if self._plan.filled:
-            rows[CHANNELS] = [to_codes(sampled_readings(image, self._embedding.dimension), bound)]
-        return {scale: np.concatenate(rows[scale]) for scale in sorted(rows)}
+        copies = self._augmentation.copies_of(image, key) if self._augmentation is not None else []
+        own, *others = [self._stage_rows(picture) for picture in (image, *copies)]
+        return {
+            scale: np.concatenate([first, *(other[scale] for other in others if scale in other)])
+            for scale, first in own.items()
+        }
 
     def _stage_rows(self, image: Image) -> Codes:
         windows = {scale: to_codes(rows, self._embedding.bound) for scale, rows in self.features(image).items()}
         return stage_rows(self._plan.scored_stages(image.shape[1]), windows)
 
-    def encode(
-        self, stream: Stream, model: Model, filling: Filling | None, needed: Callable[[int], Sequence[Scale]]
-    ) -> Encoded:
+    def encode(self, stream: Stream, longest: int, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
         """What is evaluated of a `stream`: its part within the longest touch that was learned.
 
-        model: of the memory; it knows that length, and whether noisy touches were learned. filling: fills in dead
-        channels. needed: the scales to be read of a touch of so many columns.
+        longest: its columns. needed: the scales to be read of a touch of so many columns.
         """
-        stream = self._within(stream, model.longest)
+        stream = self._within(stream, longest)
         image = self.image(stream)
-        if model.noisy is not None and cast(NoiseEmbedding, self._embedding).is_noisy(image):
-            sets = self._noisy_features([image])
-            means = {scale: in_units(rows[0], self._embedding.bound) for scale, rows in zip(NOISE, sets, strict=True)}
-            return Encoded(image, means, True, stream.seconds)
-        if filling is not None:
-            image = filling.fill(image)
-        return Encoded(image, self.means(image, needed(image.shape[1])), False, stream.seconds)
+        return Encoded(image, self.means(image, needed(image.shape[1])), stream.seconds)
 
     def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale."""
@@ -131,7 +107,6 @@ class FeatureExtractor:
     def features(self, image: Image, scales: Sequence[Scale] | None = None) -> dict[Scale, npt.NDArray[np.floating]]:
         """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
         windows = self._plan.extent(image.shape[1])
-        narrowest = self._plan.widths[0]
         if scales is not None:
             wanted = {scale.width for scale in scales}
             windows = {width: windows[width] for width in windows if width in wanted}
@@ -142,10 +117,7 @@ class FeatureExtractor:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
                 )
-        by_scale = {Scale("window", width): features for width, features in embedded.items()}
-        if self._plan.beginning and narrowest in embedded:
-            by_scale = {BEGINNING: embedded[narrowest][:1], **by_scale}
-        return by_scale
+        return {Scale("window", width): features for width, features in embedded.items()}
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.
@@ -156,6 +128,3 @@ class FeatureExtractor:
         frame = self._plan.widths[0] if self._sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column
         return stream.first((longest // frame + before) / self._sensor.rate)
-
-    def _noisy_features(self, images: Sequence[Image]) -> npt.NDArray[np.floating]:
-        return cast(NoiseEmbedding, self._embedding).embed_noisy(images)

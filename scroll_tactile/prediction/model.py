@@ -15,7 +15,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
-from scroll_tactile.signals.windows import CHANNELS, NOISE, Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
@@ -76,10 +76,9 @@ class Draft:
             )
         # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
-        judging = [scale for scale in statistics.scales if scale != CHANNELS and statistics.second(scale).rows]
+        judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
         tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
-        stages += [list(NOISE)] * memory.plan.noisy
         return cls(kind, memory, names, stages, tasks, sample, statistics.longest, statistics.touches)
 
     def fit(self) -> Model:
@@ -97,8 +96,8 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same. stages: for each, the scales that judge there.
     readouts: scale → its readout. calibrations: of the stages, as far as any touch reached them. apart: scale → the
-    sampled touches left out. longest: the columns of the longest touch that was learned. noisy: the calibration of
-    touches observed through noise; None where none were learned. fitted_to: the touches that it was fitted to.
+    sampled touches left out. longest: the columns of the longest touch that was learned. fitted_to: the touches that it
+    was fitted to.
     """
 
     def __init__(
@@ -115,10 +114,8 @@ class Model:
         self.readouts, self.apart = readouts, apart
         self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
         self.materials = [material for material, *_ in draft.sample]
-        learned = self.plan.noisy and all(scale in readouts for scale in NOISE)
-        self.noisy = calibrations.pop() if learned else None
         self.calibrations = calibrations
-        self.stages = draft.stages[: len(draft.stages) - self.plan.noisy]
+        self.stages = draft.stages
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
@@ -127,7 +124,7 @@ class Model:
         """
         for scale in memory.statistics.scales:
             changes = [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
-            if not changes or scale == CHANNELS:
+            if not changes:
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
                 return False
@@ -156,21 +153,15 @@ class Model:
         means: Mapping[Scale, FloatArray],
         columns: int,
         tuned: Mapping[str, float] | None = None,
-        *,
-        noisy: bool = False,
     ) -> Judgement:
         """Weigh the candidates for a touch.
 
-        means: for each scale that is `needed`, or of NOISE where the touch is `noisy`, its mean features in the codes'
-        unit, (d,). columns: observed so far. tuned: logits of f*, by material, in place of the last stage's scores.
+        means: for each scale that is `needed`, its mean features in the codes' unit, (d,). columns: observed so far.
+        tuned: logits of f*, by material, in place of the last stage's scores.
 
         A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
         the probability that is left goes to the others, which later stages weigh again.
         """
-        if noisy:
-            assert self.noisy is not None
-            chances = _chances(self._weighted(NOISE, self.noisy, means, candidates))
-            return Judgement(chances, self.novelty(NOISE, self.noisy, means, candidates), self.noisy)
         decided = self._decided(candidates, len(self.plan.stages(columns)))
         probability, mass = np.ones(len(candidates)), 1.0
         for i, (stage, members) in enumerate(decided):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.identity import Identity, usual_embedding
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
@@ -27,10 +27,16 @@ def reembed_memory(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Path:
-    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone."""
+    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone.
+
+    A memory whose embedding only an earlier version can make has then the default one, unless another is given. One
+    with copies that only an earlier version can make has none.
+    """
     finish_interrupted(Path(path))
     with Store.open(path) as store:
-        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
+        made, chosen = Identity.read(store), embedding
+        if chosen is None:
+            chosen = usual_embedding(made.sensor) if made.embedding.gone else made.own_embedding(store.path)
         carried = reembedding(store, chosen)
         try:
             carried.copy(progress or (lambda what, done, of: None))

@@ -17,12 +17,10 @@ import numpy as np
 from scroll_tactile.sensors import Sensor
 
 __all__ = [
-    "BEGINNING",
-    "CHANNELS",
+    "EARLIER",
     "ENOUGH",
     "FRAMES",
     "MOST_WINDOWS",
-    "NOISE",
     "Extent",
     "Scale",
     "WindowPlan",
@@ -43,46 +41,40 @@ FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
 Extent = dict[int, list[int]]  # width of windows → their first columns
 
-# The numbers by which memories on disk know the scales that are no windows; a window's number is its width.
-_NUMBERS = {"noise-a": 0, "beginning": 1, "channels": 2, "noise-b": 3}
+EARLIER = frozenset(range(4))
+"""Numbers of scales on disk that only versions up to 0.3 wrote, and no other may have: of noisy copies (0 and 3), of
+beginnings (1) and of sampled readings (2)."""
 
 
 @dataclass(frozen=True)
 class Scale:
     """A kind of features that has statistics of its own.
 
-    kind: "window" for windows of `width` columns; "beginning" for the first of the narrowest windows alone; "noise-a"
-    and "noise-b" for the two sets of features of a whole touch observed through noise; "channels" for readings
-    themselves, which fill in dead channels and judge nothing. width: 0 except for windows.
+    kind: "window" for windows of `width` columns.
 
-    Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it.
+    Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it. A window's
+    is its width.
     """
 
-    kind: Literal["window", "beginning", "noise-a", "noise-b", "channels"]
-    width: int = 0
+    kind: Literal["window"]
+    width: int
 
     @classmethod
     def numbered(cls, number: int) -> Scale:
-        """The scale of a number on disk."""
-        special = {other: kind for kind, other in _NUMBERS.items()}
-        return cls(special[number]) if number in special else cls("window", number)  # type: ignore[arg-type]
+        """The scale of a number on disk, which is none of `EARLIER`."""
+        return cls("window", number)
 
     def __hash__(self) -> int:
-        return self.width  # scales are looked up a hundred times a touch; of the few with no width all are equal here
+        return self.width  # scales are looked up a hundred times a touch
 
     def __index__(self) -> int:
-        return self.width if self.kind == "window" else _NUMBERS[self.kind]
+        return self.width
 
     def __str__(self) -> str:
         return str(int(self))
 
     def __lt__(self, other: Scale) -> bool:
         return int(self) < int(other)
-
-
-NOISE = (Scale("noise-a"), Scale("noise-b"))
-BEGINNING = Scale("beginning")
-CHANNELS = Scale("channels")
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
@@ -183,18 +175,13 @@ class WindowPlan:
     """How the touches of a sensor are read by an embedding: which windows, and which scales judge.
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
-    judged: "all" scales that fit a touch, or the "widest" of them alone. beginning: whether the first narrow window
-    is a scale of its own. noisy: whether touches observed through noise are. filled: whether dead channels are filled
-    in. shrinkage: how many times as far as the formula says readouts are shrunk. frames: whether windows are a camera's
-    frames.
+    judged: "all" scales that fit a touch, or the "widest" of them alone. shrinkage: how many times as far as the
+    formula says readouts are shrunk. frames: whether windows are a camera's frames.
     """
 
     widths: tuple[int, ...]
     partial: bool = True
     judged: Literal["all", "widest"] = "all"
-    beginning: bool = False
-    noisy: bool = False
-    filled: bool = False
     shrinkage: float = 1.0
     frames: bool = False
 
@@ -205,9 +192,8 @@ class WindowPlan:
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """All scales, ascending by number: the windows come last."""
-        own = NOISE * self.noisy + (BEGINNING,) * self.beginning + (CHANNELS,) * self.filled
-        return (*sorted(own), *self.windows)
+        """All scales, ascending by number."""
+        return self.windows
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""
@@ -217,13 +203,12 @@ class WindowPlan:
         """The scales that judge when so many columns have been observed."""
         fit = fitting(length, self.widths, partial=self.partial)
         chosen = fit[-1:] if self.judged == "widest" else fit
-        first = [BEGINNING] if self.beginning and chosen[0] == self.widths[0] else []
-        return [*first, *(Scale("window", width) for width in chosen)]
+        return [Scale("window", width) for width in chosen]
 
     def scored(self, columns: int, length: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows that judge after the first `length`."""
         places = scored(self.extent(columns), length, partial=self.partial)
-        return {scale: places.get(scale.width, [0]) for scale in self.judging(length)}
+        return {scale: places[scale.width] for scale in self.judging(length)}
 
     def scored_stages(self, columns: int) -> list[dict[Scale, list[list[int]]]]:
         """For each stage that a touch of so many columns reached: scale → places of the windows that judge there.
@@ -242,8 +227,7 @@ class WindowPlan:
     def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
         places = scored(self.extent(columns), columns, partial=self.partial)
-        windows = {Scale("window", width): chosen for width, chosen in places.items()}
-        return {BEGINNING: [0], **windows} if self.beginning else windows
+        return {Scale("window", width): chosen for width, chosen in places.items()}
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""

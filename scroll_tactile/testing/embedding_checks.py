@@ -16,8 +16,6 @@ Image = npt.NDArray[np.float32]
 HASHED = 16  # hex digits: of fewer than 64 bits two would be equal by chance
 DECLARED = {  # by which capability
     "embed_windows": "embeds_windows",
-    "is_noisy": "embeds_noise",
-    "embed_noisy": "embeds_noise",
     "parts": "composite",
     "network": "tunable",
 }

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Frames, Joined, Kernels, Robust, Sensor, TactileLearner, sensors
+from scroll_tactile import Frames, Joined, Kernels, Sensor, TactileLearner, sensors
 from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
 from scroll_tactile.embeddings.frames import LIGHT, STRENGTHS, SURFACE, light, surface
 from scroll_tactile.embeddings.resnet import ResNet
@@ -125,8 +125,6 @@ def test_a_resting_image_that_is_none_is_refused(rest):
 def test_images_of_channels_are_refused():
     with pytest.raises(InputError, match=r"expected the tactile image of a camera's frame.*came \(19, 400\)"):
         Frames().embed(np.zeros((19, 400), np.float32))
-    with pytest.raises(InputError, match="expected an embedding of channels"):
-        Robust(Frames())
     with pytest.raises(InputError, match="one resting image"):
         Joined(Frames(), Frames(rest=None))
 

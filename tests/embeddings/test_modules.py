@@ -162,7 +162,7 @@ CASES = {
     "writes into its input": (broken(embed=writes), "wrote into the image"),
     "refuses read-only": (broken(embed=only_writable), "read-only"),
     "windows undeclared": (broken(embed_windows=lies), "declare Capabilities(embeds_windows=True)"),
-    "noise undone": (broken(capabilities=Capabilities(embeds_noise=True)), "it has no is_noisy"),
+    "parts undone": (broken(capabilities=Capabilities(composite=True)), "it has no parts"),
     "capabilities of another type": (broken(capabilities={}), "expected the capabilities of Mine"),
     "windows differ from cuts": (broken(embed_windows=lies, capabilities=OWN), "cut out"),
     "windows missing": (broken(embed_windows=forgets_rows, capabilities=OWN), "expected features of shape (3, 2)"),

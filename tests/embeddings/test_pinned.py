@@ -8,7 +8,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, Robust, TactileLearner, sensors
+from scroll_tactile import Frames, Joined, Kernels, Maps, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.banks import bank
 from scroll_tactile.embeddings.protocol import embed_windows, window_plan
@@ -22,7 +22,6 @@ FINGERPRINTS = [
     (Kernels(dimension=64), "57f08f53388ea400c235b2c91e24d47edb76fc83175b793c42183337022f65d3"),
     (Frames(), "4acbe6a3662862972b53271ce2e817fb6ca8eb8ea17ccd9fc51bdcef2be7de8f"),
     (Frames(rest=None), "c0681443478dd89f9aadb7c5fdb199e1138ca2339eecb2ec232290fc04e0b952"),
-    (Robust(), "8a11586640b932752ea1323ac0a5090213659bf1812ed76d04189f2d6b0fbc23"),
     (
         Joined(Kernels(dimension=64), Kernels(seed=2, dimension=128)),
         "03526032c69ee247a5292ba2e52ddd94aa3c4f6c1f49c863f302e80ed51f2215",

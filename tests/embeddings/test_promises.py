@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
 from scroll_tactile.embeddings.protocol import is_embedding
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
@@ -44,7 +44,6 @@ SHIPPED = {
     "vision": (Vision(NETWORK), SIZES),
     "vision, all stages": (Vision(None, seed=1, stages=(0, 1, 2, 3, 4)), ((19,), (9, 60))),
     "vision, bfloat16": (Vision(NETWORK, stages=(0, 4), precision="bfloat16"), ((19,), (9, 60))),
-    "robust": (Robust(KERNELS), SIZES),
     "joined": (Joined(KERNELS, Vision(NETWORK, stages=(1, 2))), ((19,), (9, 60))),
     "joined with one's own": (Joined(Loud(), KERNELS), ((19,), (9, 60))),
     "a module": (ModuleEmbedding(pool(), name="pool", dimension=16), ((19,), (9, 60))),

@@ -60,9 +60,8 @@ def test_windows_are_read_by_the_embedding_itself_only_where_it_declares_so(own)
 
 
 def test_the_plan_of_windows_follows_what_is_declared():
-    plan = window_plan(sensors.BIOTAC, Declaring(Capabilities(False, "widest", True, True)))
-    assert (plan.partial, plan.judged, plan.beginning) == (False, "widest", True)
-    assert not plan.filled  # three features are fewer than nineteen channels
+    plan = window_plan(sensors.BIOTAC, Declaring(Capabilities(False, "widest", 3.0)))
+    assert (plan.partial, plan.judged, plan.shrinkage) == (False, "widest", 3.0)
     assert window_plan(sensors.BIOTAC, Plain()) == window_plan(sensors.BIOTAC, Kernels())
 
 

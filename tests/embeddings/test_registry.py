@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision, sensors
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision, sensors
 from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration, guess
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import PUBLISHED
@@ -39,8 +39,7 @@ SHIPPED = {
     "frames by cosines": lambda: Frames(cosines=64, seed=2),
     "maps": lambda: Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64, reach=3, seed=2),
     "random vision": lambda: Vision(None, seed=1, stages=(0, 2)),
-    "robust": lambda: Robust(Kernels(dimension=64), seed=5),
-    "joined": lambda: Joined(Kernels(dimension=64), Robust(Joined(Kernels(dimension=64, seed=2), Maps(layout=(5,))))),
+    "joined": lambda: Joined(Kernels(dimension=64), Joined(Kernels(dimension=64, seed=2), Maps(layout=(5,)))),
 }
 
 
@@ -72,7 +71,6 @@ def mine():
     [
         mine(),
         Joined(Kernels(dimension=64), mine()),
-        Robust(mine()),
         type("Mine", (Kernels,), {})(dimension=64),
         Kernels(dimension=64, seed=2**70),
     ],
@@ -96,10 +94,10 @@ def test_what_could_not_be_made_again_has_no_configuration(embedding):
         ({}, "Unable to extract tag"),
         ([], "came \\[\\]"),
         (None, "came None"),
-        ({"kind": "thermal"}, "of kind frames, joined, kernels, maps, robust, vision; it: .*'thermal'"),
+        ({"kind": "thermal"}, "of kind frames, joined, kernels, maps, vision; it: .*'thermal'"),
         ({"kind": "joined", "parts": [KERNELS] * 9}, "at most 8 items"),
         ({"kind": "joined", "parts": [KERNELS]}, "at least 2 items"),
-        ({"kind": "robust", "inner": KERNELS | {"seed": -1}, "seed": 0}, "robust.inner.kernels.seed"),
+        ({"kind": "joined", "parts": [KERNELS, KERNELS | {"seed": -1}]}, "joined.parts.1.kernels.seed"),
         (MAPS | {"layout": [10**9]}, "maps.layout.0"),
         (MAPS | {"layout": [4096, 4096]}, "more than 16384 features"),
         (MAPS | {"layout": [4096, 4096], "cosines": 1000}, "weights"),
@@ -122,11 +120,11 @@ def test_a_hostile_configuration_is_refused_before_anything_is_made(configuratio
 def test_a_configuration_of_very_many_levels_is_refused():
     nested = KERNELS
     for _ in range(10**5):
-        nested = {"kind": "robust", "inner": nested, "seed": 0}
+        nested = {"kind": "joined", "parts": nested}
     with pytest.raises(EmbeddingError, match="at most 16 levels"):
         from_configuration(nested)
-    while isinstance(nested.get("inner"), dict):  # freed level by level: dicts are freed by recursion
-        nested = nested.pop("inner")
+    while isinstance(nested.get("parts"), dict):  # freed level by level: dicts are freed by recursion
+        nested = nested.pop("parts")
 
 
 JSON = st.recursive(
@@ -204,8 +202,6 @@ class TestGuess:
         [
             (Kernels(), sensors.BIOTAC),
             (Kernels(dimension=64), sensors.BIOTAC),
-            (Robust(Kernels(dimension=64)), sensors.BIOTAC),
-            (Robust(), sensors.BIOTAC),
             (Frames(), sensors.GELSIGHT),
             (Frames(rest=None), sensors.GELSIGHT),
             (Frames(cosines=64), sensors.GELSIGHT),
@@ -228,7 +224,7 @@ class TestGuess:
             ("kernels", "64", ""),
             (None, 64, ""),
             ("mine", 64, ""),
-            ("robust kernels", 63, ""),
+            ("robust kernels", 64, ""),
             ("maps", 7, ""),
         ],
     )
@@ -239,9 +235,9 @@ class TestGuess:
 IMPORTS = """
 import sys
 import scroll_tactile.datasets.simulator, scroll_tactile.datasets.gel, scroll_tactile.testing
-from scroll_tactile import Frames, Joined, Kernels, Maps, Robust
+from scroll_tactile import Frames, Joined, Kernels, Maps
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration
-for embedding in (Kernels(), Frames(), Robust(), Maps(layout=(3,)), Joined(Kernels(), Kernels(seed=2))):
+for embedding in (Kernels(), Frames(), Maps(layout=(3,)), Joined(Kernels(), Kernels(seed=2))):
     from_configuration(configuration_of(embedding))
 assert "torch" not in sys.modules
 Kernels().fingerprint

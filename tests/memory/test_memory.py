@@ -67,7 +67,7 @@ def test_real_touches_take_less_than_ten_kilobytes_on_average(real_data):
 
 
 def test_codes_come_back():
-    codes = {NARROW: np.arange(8, dtype=np.int32).reshape(2, 4), Scale("beginning"): np.zeros((1, 4), np.int32)}
+    codes = {NARROW: np.arange(8, dtype=np.int32).reshape(2, 4), Scale("window", 300): np.zeros((1, 4), np.int32)}
     again = unpack_codes(pack_codes(codes))
     assert {scale: rows.tolist() for scale, rows in again.items()} == {
         scale: rows.tolist() for scale, rows in codes.items()

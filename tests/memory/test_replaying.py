@@ -7,7 +7,7 @@ import pytest
 from commands import run
 from touches import OBSERVED, PAD, stream, without
 
-from scroll_tactile import Augmented, Capabilities, Joined, Kernels, Maps, Robust, TactileLearner
+from scroll_tactile import Augmented, Capabilities, Joined, Kernels, Maps, TactileLearner
 from scroll_tactile.memory import ledger
 from store import DamageError, Store
 
@@ -26,8 +26,7 @@ MADE = {
     "maps": {"embedding": Maps(layout=(2,))},
     "maps, no exemplars": {"embedding": Maps(layout=(2,)), "exemplars": 0},
     "joined": {"embedding": Joined(SMALL, Maps(layout=(2,)))},
-    "copies": {"embedding": SMALL, "augmentation": Augmented(copies=2, dead=0.3)},
-    "robust": {"embedding": Robust(SMALL), "augmentation": Augmented(copies=1, noisy=2)},
+    "copies": {"embedding": SMALL, "augmentation": Augmented(copies=2)},
 }
 
 
@@ -159,7 +158,7 @@ def test_rows_hold_readings_alone_where_the_memory_can_embed_them_again(made, tm
         observe(learner, OBSERVED[:1])
     with Store.open(tmp_path / "m", mode="read") as store:
         kinds = {name.partition("-")[0] for name in store.record(1).arrays}
-    bare = made["embedding"] in (SMALL,) or isinstance(made["embedding"], Robust)
+    bare = made["embedding"] is SMALL
     assert kinds == ({"readings"} if bare else {"stages"} | ({"readings"} if made["exemplars"] else set()))
 
 

@@ -11,7 +11,6 @@ from scroll_tactile.errors import DescriptionError, MaterialError
 from scroll_tactile.memory.descriptions import checked, targets_of
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.constituents import ConstituentHead, StageHeads
-from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.readouts.attributes import Curve
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
@@ -93,16 +92,15 @@ class TestCompose:
 
 @pytest.mark.parametrize(("unknown", "shares"), [((), [0.25, 0.75]), (("silk",), [None, 0.75])])
 def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares):
-    """Of a touch observed through noise, which its probabilities alone compose."""
+    """Of a touch of materials that were observed, which its probabilities alone compose."""
     descriptions = {"a": {"wool": 1.0}, "b": {"wool": 0.5, "silk": 0.5}}
     targets = targets_of({name: checked(name, description) for name, description in descriptions.items()})
     head = ConstituentHead(np.arange(2), np.zeros(3), None)
     heads = {name: "too few" if name in unknown else head for name in targets}
-    composer = Composer(None, targets, [StageHeads(Curve(1.0, 0.0), heads, heads)], [])
-    touch_through_noise = Encoded(np.zeros((4, 50), np.float32), {}, noisy=True, seconds=1.0)
-    found, unfamiliar = composer.compose(["silk", "wool"], {"a": 0.5, "b": 0.5}, touch_through_noise, 0.1)
+    stage = StageHeads(Curve(1.0, 0.0), heads, heads)
+    composer = Composer(None, targets, [stage], [])
+    found = composer._constituents(["silk", "wool"], stage, {"a": 0.5, "b": 0.5}, np.zeros(3), 0.0)
     assert [constituent.share for constituent in found] == shares
-    assert unfamiliar == 0.1
 
 
 class TestDescribing:

@@ -98,7 +98,7 @@ def robustness(
     plot: Plot = None,
     materials: FewMaterials = 20,
 ) -> None:
-    """Train on clean touches, test on shorter, faster, noisier ones; each system with augmentation and without.
+    """Train on clean touches, test on shorter, faster, noisier ones; ours as it is, others with augmentation, too.
 
     A system learns a fold once, with one setting, for all studies; only another recording session has folds of its own.
     """
@@ -120,7 +120,9 @@ def robustness(
             makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
             folder = None if run is None else run / recordings.name
             studies = _studies(study, recordings)
-            task = Robustness(recordings, makes, settings, studies, seed=seed, quick=quick, folder=folder)
+            task = Robustness(
+                recordings, makes, settings, studies, plain=(OURS,), seed=seed, quick=quick, folder=folder
+            )
             about = {"dataset": recordings.name}
             chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
             found = [about | record for fold in task.run(chosen, progress) for record in fold]
@@ -203,7 +205,7 @@ def _show(dataset: str, rows: Sequence[Mapping[str, Any]]) -> None:
         for strength in dict.fromkeys(row["strength"] for row in rows if row["study"] == study):
             own = [cells[study, strength, *system] for system in systems]
             shown = [percent(row["mean"]) + (f" ± {100 * row['sd']:.1f}" if row["folds"] > 1 else "") for row in own]
-            mine = cells.get((study, strength, OURS, True))
+            mine = cells.get((study, strength, OURS, False))
             shown += _beside(dataset, PAPER.get((study, strength), {}), mine) if quoted else []
             table.add_row(study, "" if study == SESSION else f"{strength:g}", *shown)
         table.add_section()

@@ -1,8 +1,9 @@
 """Robustness: systems that trained on clean touches, tested on touches that were made or recorded otherwise.
 
-A study is a grid of strengths, systems, with and without augmentation, and folds. A system learns a fold once, for
-all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has training touches of its
-own. Each cell is written down when it is finished, and an interrupted run resumes with the next.
+A study is a grid of strengths, systems, without augmentation and with it where they have any, and folds. A system
+learns a fold once, for all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has
+training touches of its own. Each cell is written down when it is finished, and an interrupted run resumes with the
+next.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cells import require_data
-from scroll_tactile import Embedding, Robust
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
@@ -27,7 +27,6 @@ from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
 from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["NAMES", "PAPER", "PERTURBED", "SESSION", "Learned", "Make", "Robustness", "TestedSystem", "ours", "summary"]
@@ -69,9 +68,6 @@ PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
 """(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
 with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
 
-AUGMENTED = Augmented(copies=6, speed=2.1, thinned=True, noisy=40, noise=0.7)
-"""The setting of the robust learner, one for all sensors and studies; its embedding is `Robust()`."""
-
 Progress = Callable[[str, int, int], object]
 
 
@@ -98,25 +94,16 @@ class Learned:
         return [self.learner.predict(stream).material for stream in streams]
 
 
-def ours(
-    sensor: Sensor, augmentation: Augmented = AUGMENTED, embedding: Embedding | None = None
-) -> tuple[Make, dict[str, Any]]:
-    """The one-pass learner of a sensor, and what it depends on; one setting for every sensor and every study.
-
-    Without augmentation it is the default learner. With it the embedding is `Robust()`, unless given.
-    """
-    robust = Robust() if embedding is None else embedding
+def ours(sensor: Sensor) -> tuple[Make, dict[str, Any]]:
+    """The default learner of a sensor, and what it depends on; it has no augmentation."""
 
     def make(train: Sequence[Labelled], augmented: bool, progress: Progress) -> TestedSystem:
-        if augmented:
-            learner = TactileLearner(sensor=sensor, embedding=robust, exemplars=0, augmentation=augmentation)
-        else:
-            learner = TactileLearner(sensor=sensor, exemplars=0)
+        learner = TactileLearner(sensor=sensor, exemplars=0)
         done = count()
         observe_all(learner, train, lambda: progress("learning", next(done) + 1, len(train)))
         return Learned(learner)
 
-    return make, {"embedding": repr(robust), "augmentation": augmentation.to_json()}
+    return make, {"embedding": repr(TactileLearner(sensor=sensor).embedding)}
 
 
 @dataclass(frozen=True)
@@ -125,8 +112,8 @@ class Robustness:
 
     recordings: the touches. systems: by name, what makes and trains each. settings: by name, all that a system's
     answers depend on beside its name, in JSON's types, so that what other settings gave is not mixed in.
-    studies: out of NAMES. augmented: with augmentation (True), without, or both. seed: of what perturbations draw.
-    quick: fewer strengths. folder: where finished cells are kept, or None.
+    studies: out of NAMES. augmented: with augmentation (True), without, or both. plain: the systems that have none.
+    seed: of what perturbations draw. quick: fewer strengths. folder: where finished cells are kept, or None.
 
     Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "session" where the
     order of recording is not known.
@@ -137,6 +124,7 @@ class Robustness:
     settings: Mapping[str, Any] = field(default_factory=dict)
     studies: Sequence[str] = NAMES
     augmented: Sequence[bool] = (False, True)
+    plain: Sequence[str] = ()
     seed: int = 0
     quick: bool = False
     folder: Path | None = None
@@ -183,7 +171,7 @@ class Robustness:
             yield [
                 record
                 for system in self.systems
-                for augmented in self.augmented
+                for augmented in ((False,) if system in self.plain else self.augmented)
                 for record in self._records(system, augmented, cells, notes, progress)
             ]
 

@@ -55,7 +55,7 @@ class WidestFeatures:
 
     def __init__(self, sensor: Sensor, embedding: Embedding) -> None:
         plan = window_plan(sensor, embedding)
-        if plan.judged != "widest" or plan.beginning or plan.noisy:
+        if plan.judged != "widest":
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
         self._plan = plan

@@ -9,7 +9,7 @@
     │   │   ├── StreamTooShortError          touch for longer
     │   │   ├── NoContactError               no frame of a camera differs from its resting image: press the gel
     │   │   ├── ChannelCountError            they are not laid out as (time, channel) for this sensor
-    │   │   ├── NotFiniteError               NaN or infinity: leave the touch out, or repair the readings
+    │   │   ├── NotFiniteError               NaN or infinity: leave it out, repair it, or have it taken as missing
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
     │   ├── MaterialError                    a material's name is not usable
     │   ├── DescriptionError                 what a material is said to be made of cannot be
@@ -46,7 +46,7 @@ class EmptyStreamError(StreamError):
 
 
 class StreamTooShortError(StreamError):
-    """There are too few readings, less than 0.1 s: touch for longer."""
+    """There are too few readings, fewer than two: touch for longer."""
 
 
 class NoContactError(StreamError):
@@ -58,7 +58,7 @@ class ChannelCountError(StreamError):
 
 
 class NotFiniteError(StreamError):
-    """Some values are NaN, infinite or masked."""
+    """Values are NaN, infinite or masked, and the sensor takes none as missing, or all are."""
 
 
 class ReadingsTypeError(StreamError, TypeError):

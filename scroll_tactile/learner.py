@@ -228,7 +228,7 @@ class TactileLearner:
         """Learn that this stream is how the material feels; it is durable when this returns.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
-        unit, T of at least 0.1 s: an array, a tensor, lists, or an iterable of readings; of a camera frames,
+        unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
         (T, height, width, 3), the first of the gel at rest (see `Frames`), of which those in contact are kept.
 
         Raises StreamError (NoContactError where the gel was not pressed), MaterialError (nothing was kept),

@@ -9,11 +9,19 @@ Four sensors come with the project; one's own is one more, made in one line:
 """
 
 import math
-from typing import Annotated, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 __all__ = ["BIOTAC", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
 
@@ -32,6 +40,8 @@ class Sensor(BaseModel):
     duration: how long a touch usually lasts, in seconds. Streams may be shorter or longer.
     layout: how the channels lie on the sensor, such as (6, 10) patches × taxels; its product is `channels`.
     camera: whether a reading is a picture; then layout is (height, width, 3).
+    non_finite: whether streams with NaN or ±infinity are "refused", or these values are taken as "missing": then
+        `validate` interpolates them, see `Stream.mask`.
 
     Raises pydantic.ValidationError, which is a ValueError, for fields that do not fit together.
     """
@@ -47,6 +57,16 @@ class Sensor(BaseModel):
     duration: _Positive
     layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     camera: bool = False
+    non_finite: Literal["refused", "missing"] = "refused"
+
+    @model_serializer(mode="wrap")
+    def _as_before(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Memories are compared with the sensors they were made with, byte for byte: those made before the field was
+        # have none.
+        fields: dict[str, Any] = serialize(self)
+        if fields.get("non_finite") == "refused":
+            del fields["non_finite"]
+        return fields
 
     @model_validator(mode="after")
     def _one_for_all_or_one_each(self) -> Self:

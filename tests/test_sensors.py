@@ -95,6 +95,18 @@ def test_a_number_means_all_channels_to_the_bit():
     assert one.model_dump(mode="json")["low"] == one.low  # as memories have kept it from the first version on
 
 
+def test_only_a_sensor_that_misses_values_says_so_in_json():
+    skin = Sensor(**FIELDS)
+    assert "non_finite" not in skin.model_dump_json()  # as in the memories of earlier versions
+    missing = Sensor(**FIELDS, non_finite="missing")
+    assert missing.model_dump(mode="json") == skin.model_dump(mode="json") | {"non_finite": "missing"}
+    for sensor in (skin, missing):
+        assert Sensor.model_validate_json(sensor.model_dump_json()) == sensor
+    assert missing != skin
+    with pytest.raises(ValidationError, match="'refused' or 'missing'"):
+        Sensor(**FIELDS, non_finite="ignored")
+
+
 def test_a_camera_has_one_range():
     fields = {"name": "eye", "channels": 12, "rate": 5.0, "high": 1.0, "unit": "1", "duration": 1.0, "camera": True}
     with pytest.raises(ValidationError, match="a camera has one low for all its pixels"):

@@ -147,7 +147,7 @@ def read_events(path: Path) -> npt.NDArray[np.float64]:
 def stream_of(events: npt.NDArray[np.float64], seconds: float = 3.0) -> Stream:
     """A press as a stream: in each bin of 16 ms from its first event on, the last value that each taxel sent.
 
-    events: as of `read_events`, N ≥ 1. Raises StreamTooShortError, an InputError, for less than 0.1 s.
+    events: as of `read_events`, N ≥ 1. Raises StreamTooShortError, an InputError, for less than two bins.
     """
     count = round(seconds * NUSKIN.rate)
     bins = np.floor((events[:, 0] - events[0, 0]) * NUSKIN.rate).astype(np.int64)

@@ -24,7 +24,7 @@ _KINDS = {"noise": 0, "dead": 1, "drift": 2}
 def length(stream: Stream, seconds: float, seed: int = 0) -> Stream:
     """The first seconds of the touch, or all of a shorter one; nothing is drawn.
 
-    Raises StreamTooShortError for less than 0.1 s.
+    Raises StreamTooShortError for less than two readings.
     """
     return stream.first(seconds)
 
@@ -34,7 +34,7 @@ def speed(stream: Stream, factor: float, seed: int = 0) -> Stream:
 
     The sensor's rate stays, so a slow slide is a longer stream. Linear interpolation, without a filter before it: a
     sensor has none either. What a slide's speed changes beside its time scale (force, friction) is not modelled, and
-    nothing is drawn. A stream is made no shorter than 0.1 s.
+    nothing is drawn. A stream is made no shorter than two readings.
     """
     if not (math.isfinite(factor) and factor > 0):
         raise InputError(f"expected a finite speed above 0; came {factor}")

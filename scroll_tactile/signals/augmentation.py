@@ -193,7 +193,7 @@ class Augmentation:
     def streams(self, streams: Sequence[Stream], rng: np.random.Generator) -> list[Stream]:
         """Each of N streams as another touch of its material would have given it, drawn from `rng` for each alone.
 
-        None is made shorter than the 0.1 s that a stream has to last: it goes on as its mirror image up to there.
+        None is made shorter than the two readings that make a stream: it goes on as its mirror image up to there.
         Raises InputError for a camera's stream.
         """
         return [

@@ -71,7 +71,8 @@ def pressed(stream: Stream, rest: Rest) -> Stream:
         return stream
     readings = stream.readings[kept]
     readings.setflags(write=False)
-    return Stream(stream.sensor, readings, min(stream.clipped, readings.size))
+    mask = None if stream.mask is None else stream.mask[kept]
+    return Stream(stream.sensor, readings, min(stream.clipped, readings.size), mask)
 
 
 def image_of(stream: Stream, rest: Rest) -> npt.NDArray[np.float32]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,8 @@ class Stream:
     readings: float32 of shape (T, n), or (T, height, width, 3) for a camera, in the sensor's unit and within
         its range; C-contiguous, read-only, and nobody else's memory.
     clipped: how many values lay outside the sensor's range before they were clipped to it.
+    mask: which values were missing (NaN or infinite), bool of the readings' shape, read-only; None where none were.
+        `readings` has in their place the line between their neighbours in time.
 
     Two streams are equal where their sensors and their readings are.
     """
@@ -46,6 +48,12 @@ class Stream:
     sensor: Sensor
     readings: npt.NDArray[np.float32]
     clipped: int = 0
+    mask: npt.NDArray[np.bool_] | None = None
+
+    @property
+    def missing(self) -> int:
+        """How many values were missing."""
+        return 0 if self.mask is None else int(np.count_nonzero(self.mask))
 
     @property
     def seconds(self) -> float:
@@ -68,9 +76,11 @@ class Stream:
     def first(self, seconds: float) -> "Stream":
         """The stream of the first `seconds`, or the whole stream if it is no longer; memory is shared.
 
-        `clipped` stays an upper bound: which values were clipped is not kept.
+        `clipped` stays an upper bound: which values were clipped is not kept. Missing values are interpolated anew,
+        from what had been observed by then.
 
-        Raises InputError if seconds is not a number, StreamTooShortError if it asks for less than 0.1 s.
+        Raises InputError if seconds is not a number, StreamTooShortError if it asks for less than two readings (or one
+        frame of a camera), NotFiniteError if all values until then are missing.
         """
         if math.isnan(seconds):
             raise InputError("first() needs a number of seconds; came NaN")
@@ -80,7 +90,14 @@ class Stream:
         if count >= len(self):
             return self
         part = self.readings[:count]
-        return Stream(self.sensor, part, min(self.clipped, part.size))
+        if self.mask is None or not self.mask[:count].any():
+            return Stream(self.sensor, part, min(self.clipped, part.size))
+        mask = self.mask[:count]
+        _require_any(mask, self.sensor)
+        part = part.copy()
+        _interpolate(part, mask, self.sensor)
+        part.setflags(write=False)
+        return Stream(self.sensor, part, min(self.clipped, np.count_nonzero(~mask)), mask)
 
     def __len__(self) -> int:
         return len(self.readings)
@@ -97,12 +114,15 @@ class Stream:
 
     def __repr__(self) -> str:
         shape = self.readings.shape
-        return f"Stream({self.sensor.name}, {shape}, {self.seconds:g} s, clipped={self.clipped})"
+        missing = "" if self.mask is None else f", missing={self.missing}"
+        return f"Stream({self.sensor.name}, {shape}, {self.seconds:g} s, clipped={self.clipped}{missing})"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Pickling and copying drop the read-only flag.
         self.__dict__.update(state)
         self.readings.setflags(write=False)
+        if self.mask is not None:
+            self.mask.setflags(write=False)
 
 
 def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor: Sensor) -> Stream:
@@ -112,9 +132,14 @@ def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor:
         torch tensor of any real type, nested lists, anything with `__array__`, an iterable of readings, or a
         stream. It is neither changed nor kept. Values outside the sensor's range are clipped and counted.
 
-    Raises EmptyStreamError, StreamTooShortError (less than 0.1 s; one frame is enough for a camera),
-    ChannelCountError (shape), NotFiniteError, ReadingsTypeError, all of them StreamErrors;
-    SensorMismatchError for another sensor's stream; and whatever an iterable raises while it is read.
+    NaN and ±infinity are refused, or missing, as the sensor's `non_finite` says. A missing value is interpolated
+    linearly in time between its channel's neighbours and held at the ends; a channel without any reads the low end of
+    its range. What is masked in a masked array is NaN.
+
+    Raises EmptyStreamError, StreamTooShortError (fewer than two readings; one frame is enough for a camera),
+    ChannelCountError (shape), NotFiniteError (where such values are refused, or there are no others),
+    ReadingsTypeError, all of them StreamErrors; SensorMismatchError for another sensor's stream; and whatever an
+    iterable raises while it is read.
     """
     if isinstance(readings, Stream):
         if readings.sensor is not sensor and readings.sensor != sensor:
@@ -133,30 +158,64 @@ def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor:
     array = _real(array)
     _require_shape(array.shape, sensor)
     _require_length(len(array), sensor)
-    return _clip(array, sensor)
+    return _sound(array, sensor)
 
 
 def fewest_readings(sensor: Sensor) -> int:
-    """The fewest readings that make a stream: 0.1 s of them, or one frame of a camera."""
-    # Dividing by 10 rounds once; multiplying by 0.1, which is a little more than a tenth, could give one too
-    # many.
-    return 1 if sensor.camera else math.ceil(sensor.rate / 10)
+    """The fewest readings that make a stream: two, between which something changes, or one frame of a camera."""
+    return 1 if sensor.camera else 2
 
 
-def _clip(array: _Array, sensor: Sensor) -> Stream:
+def _sound(array: _Array, sensor: Sensor) -> Stream:
     low, high = sensor.limits
     with np.errstate(all="ignore"):  # values beyond float32 become infinite here, and are clipped below
         values = np.array(array, dtype=np.float32, order="C", copy=True, subok=False)
         least, most = values.min(), values.max()  # NaN if any value is
-    if not (math.isfinite(least) and math.isfinite(most)):
-        _require_finite(array, sensor)
+    mask = None if math.isfinite(least) and math.isfinite(most) else _missing(array, sensor)
+    if mask is not None:
+        values[mask] = low.min()  # neither clipped nor compared
+        mask.setflags(write=False)
     clipped = 0
-    if least < low.max() or most > high.min():
-        clipped = int(np.count_nonzero(values < low)) + int(np.count_nonzero(values > high))
+    if mask is not None or least < low.max() or most > high.min():
+        outside = (values < low) | (values > high)
+        clipped = int(np.count_nonzero(outside if mask is None else outside & ~mask))
         np.clip(values, low, high, out=values)
+    if mask is not None:
+        _interpolate(values, mask, sensor)
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
     values.setflags(write=False)
-    return Stream(sensor, values, clipped)
+    return Stream(sensor, values, clipped, mask)
+
+
+def _missing(array: _Array, sensor: Sensor) -> npt.NDArray[np.bool_] | None:
+    """Which values are not finite, None if all are; raises NotFiniteError where that is too many for the sensor."""
+    bad: npt.NDArray[np.bool_] = np.logical_not(np.isfinite(array), order="C")
+    if not bad.any():
+        return None
+    if sensor.non_finite == "refused":
+        _refuse(array, bad, sensor)
+    _require_any(bad, sensor)
+    return bad
+
+
+def _interpolate(values: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], sensor: Sensor) -> None:
+    """Write into each missing value, in place, the line between its channel's neighbours in time."""
+    flat, flags = values.reshape(len(values), -1), mask.reshape(len(mask), -1)
+    channels = np.flatnonzero(flags.any(axis=0))
+    held, gap = flat[:, channels].astype(np.float64), flags[:, channels]
+    dead = gap.all(axis=0)
+    low = np.broadcast_to(sensor.limits[0], sensor.shape).reshape(-1)[channels]
+    held[:, dead], gap[:, dead] = low[dead], False
+    last = len(values)
+    time = np.arange(last)[:, None]
+    before = np.maximum.accumulate(np.where(gap, -1, time), axis=0)
+    after = np.minimum.accumulate(np.where(gap, last, time)[::-1], axis=0)[::-1]
+    before, after = np.where(before < 0, after, before), np.where(after == last, before, after)  # held at the ends
+    begin, end = np.take_along_axis(held, before, axis=0), np.take_along_axis(held, after, axis=0)
+    # Step by step in float64, not np.interp: a fused multiply-add would round otherwise on another machine.
+    slope = (end - begin) / np.maximum(after - before, 1)
+    flat[:, channels] = np.where(gap, begin + slope * (time - before), held)
+    np.clip(values, *sensor.limits, out=values)  # rounding may pass a neighbour by a unit in the last place
 
 
 def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:
@@ -272,21 +331,26 @@ def _require_length(count: int, sensor: Sensor) -> None:
     needed = fewest_readings(sensor)
     if count < needed:
         raise StreamTooShortError(
-            f"expected at least {needed} readings of sensor {sensor.name!r} (0.1 s at {sensor.rate:g} Hz); "
-            f"came {count}, which is {count / sensor.rate:.3g} s. Touch for longer"
+            f"expected at least {needed} {'frame' if sensor.camera else 'readings'} of sensor {sensor.name!r} at "
+            f"{sensor.rate:g} Hz; came {count}, which is {count / sensor.rate:.3g} s. Touch for longer"
         )
 
 
-def _require_finite(array: _Array, sensor: Sensor) -> None:
-    bad = ~np.isfinite(array)
-    count = int(np.count_nonzero(bad))
-    if not count:
-        return
+def _refuse(array: _Array, bad: npt.NDArray[np.bool_], sensor: Sensor) -> NoReturn:
     index = np.unravel_index(int(np.argmax(bad)), bad.shape)
     raise NotFiniteError(
         f"expected finite readings of sensor {sensor.name!r}; {_place(index)} is {float(array[index])}, the "
-        f"first of {count} not finite among {array.size} values. Leave this touch out, or repair the readings"
+        f"first of {np.count_nonzero(bad)} not finite among {array.size} values. Leave this touch out, repair the "
+        'readings, or make the sensor with non_finite="missing"'
     )
+
+
+def _require_any(mask: npt.NDArray[np.bool_], sensor: Sensor) -> None:
+    if mask.all():
+        raise NotFiniteError(
+            f"expected readings of sensor {sensor.name!r}, of which some may be missing; all {mask.size} values of "
+            f"{len(mask)} readings are NaN or infinite. Is the sensor connected?"
+        )
 
 
 def _place(index: tuple[Any, ...]) -> str:

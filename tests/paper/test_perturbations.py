@@ -73,7 +73,7 @@ def test_drift_grows_from_nothing():
     assert off.max() <= 0.1 * 8 + 0.1 * 5 + 1e-5  # of the range, and of what lies above the low end
 
 
-@pytest.mark.parametrize(("factor", "readings"), [(0.25, 400), (0.5, 200), (2, 50), (4, 25), (100, 5)])
+@pytest.mark.parametrize(("factor", "readings"), [(0.25, 400), (0.5, 200), (2, 50), (4, 25), (100, 2)])
 def test_faster_is_shorter_between_the_same_ends(factor, readings):
     ramp = validate(np.linspace(0, 4, 100)[:, None].repeat(10, axis=1), PAD)
     changed = speed(ramp, factor)
@@ -92,7 +92,7 @@ def test_what_cannot_be_is_refused():
         with pytest.raises(InputError, match="above 0"):
             speed(touch(), factor)
     with pytest.raises(StreamTooShortError):
-        length(touch(), 0.05)
+        length(touch(), 0.01)
     frame = validate(np.zeros((1, *sensors.GELSIGHT.shape)), sensors.GELSIGHT)
     with pytest.raises(InputError, match="whole frames"):
         noise(frame, 0.5, 0)

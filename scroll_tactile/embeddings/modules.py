@@ -16,17 +16,20 @@ from torch import nn
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.signals.augmentation import fit
 
 __all__ = ["ModuleEmbedding"]
 
-COLUMNS = (9, 30, 75)  # of the fixed images that the fingerprint is taken of
+NARROWEST = 9  # columns that a module is given; modules of convolutions read no two columns
+COLUMNS = (NARROWEST, 30, 75)  # of the fixed images that the fingerprint is taken of
 CHANNELS = (1, 3, 19)
 
 
 class ModuleEmbedding:
     """A torch module of one's own, from images (1, C, T) float32 in [-1, 1] to features (1, d), as an embedding.
 
-    The module is copied, put into evaluation mode and frozen: what is done to the original later changes nothing.
+    The module is copied, put into evaluation mode and frozen: what is done to the original later changes nothing. An
+    image of fewer than nine columns is continued by its mirror image to nine before the module reads it.
 
     name: what messages call it. dimension: d. bound: no feature's magnitude exceeds it.
     partial_windows: whether it reads a touch narrower than a window as it reads a whole window.
@@ -101,7 +104,7 @@ class ModuleEmbedding:
         Raises EmbeddingError where the module's output has another shape, is not finite or exceeds the bound.
         """
         with steady():
-            output = self._module(torch.tensor(image[None], dtype=torch.float32))
+            output = self._module(torch.tensor(fit(image, max(NARROWEST, image.shape[-1]))[None], dtype=torch.float32))
         if not isinstance(output, torch.Tensor) or output.shape != (1, self.dimension):
             came = tuple(output.shape) if isinstance(output, torch.Tensor) else type(output).__name__
             raise EmbeddingError(

@@ -20,6 +20,7 @@ from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.embeddings.weights import digest_of, hash_tensors, load_network, source_name
 from scroll_tactile.errors import InputError
+from scroll_tactile.signals.augmentation import fit
 
 __all__ = ["TunableVision", "Vision", "pool_windows", "to_planes"]
 
@@ -124,8 +125,8 @@ class Vision:
 
         Raises InputError for an image that has not two axes, or an empty one.
         """
-        columns = self._require_image(image)
-        features: FloatArray = self._read(image, [(0, columns)])[0]
+        image = self._readable(image)
+        features: FloatArray = self._read(image, [(0, image.shape[1])])[0]
         return features
 
     def embed_windows(
@@ -136,7 +137,8 @@ class Vision:
         Windows of 48 columns or more are averaged from one pass over the whole image, so that they also see a little
         of what lies beside them. A narrower one is what `embed` gives for it alone, to the bit.
         """
-        columns = self._require_image(image)
+        image = self._readable(image)
+        columns = image.shape[1]
         wide = [width for width in windows if width >= TOGETHER and columns <= MOST_COLUMNS]
         places = [(start, width) for width in wide for start in windows[width]]
         pooled = iter(self._read(image, places)) if places else iter(())
@@ -158,8 +160,8 @@ class Vision:
         """
         features = np.empty((len(images), self.dimension), np.float32)
         sizes: dict[tuple[int, ...], list[int]] = {}
+        images = [self._readable(image) for image in images]
         for i, image in enumerate(images):
-            self._require_image(image)
             sizes.setdefault(image.shape, []).append(i)
         for (_, columns), members in sizes.items():
             for first in range(0, len(members), BATCH):
@@ -178,16 +180,17 @@ class Vision:
         net = copy.deepcopy(self._net).requires_grad_(True)
         return TunableVision(net, self.stages)
 
-    def _require_image(self, image: npt.NDArray[np.floating]) -> int:
-        """The number of columns of an image that the network can read."""
+    def _readable(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """The image, continued by its mirror image where it has fewer columns than the network can read."""
         if image.ndim != 2 or 0 in image.shape:
             raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
-        if min(image.shape) < LEAST[self._net.stem]:
+        least = LEAST[self._net.stem]
+        if len(image) < least:
             raise InputError(
-                f"expected a tactile image of at least {LEAST[self._net.stem]} channels and columns, which the "
-                f"{self._net.stem} stem needs; came {image.shape}. Take weights in torchvision's layout, or Kernels"
+                f"expected a tactile image of at least {least} channels, which the {self._net.stem} stem needs; came "
+                f"{image.shape}. Take weights in torchvision's layout, or Kernels"
             )
-        return int(image.shape[1])
+        return image if image.shape[1] >= least else fit(np.asarray(image, np.float32), least)
 
     def _read(self, image: npt.NDArray[np.float32], windows: Sequence[tuple[int, int]]) -> FloatArray:
         """Features (windows, d) from one pass over an image."""

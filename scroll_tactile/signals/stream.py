@@ -97,7 +97,7 @@ class Stream:
         part = part.copy()
         _interpolate(part, mask, self.sensor)
         part.setflags(write=False)
-        return Stream(self.sensor, part, min(self.clipped, np.count_nonzero(~mask)), mask)
+        return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask)
 
     def __len__(self) -> int:
         return len(self.readings)

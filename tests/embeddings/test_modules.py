@@ -57,6 +57,13 @@ def test_dropout_and_batch_statistics_are_off_and_the_original_is_left_alone():
     assert ModuleEmbedding(module, name="mine", dimension=16).fingerprint != digits
 
 
+def test_a_touch_of_two_readings_is_continued_by_its_mirror_image():
+    embedding = ModuleEmbedding(fixed_channels(), name="mine", dimension=16)
+    a, b = np.random.default_rng(0).uniform(-1, 1, (2, 19)).astype(np.float32)
+    whole = np.stack([a, b, b, a, a, b, b, a, a], axis=1)
+    assert embedding.embed(np.stack([a, b], axis=1)).tobytes() == embedding.embed(whole).tobytes()
+
+
 def test_the_fingerprint_is_of_images_of_channels_that_the_module_takes():
     assert ModuleEmbedding(fixed_channels(), name="mine", dimension=16).fingerprint  # 19 of (1, 3, 19)
     seven = fixed_channels(7)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
-from scroll_tactile.embeddings.protocol import is_embedding
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision
+from scroll_tactile.embeddings.protocol import embed_windows, is_embedding
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
 from scroll_tactile.testing import check_embedding
@@ -56,6 +56,18 @@ def test_it_keeps_the_promises_of_an_embedding(kind):
     embedding, (channels, columns) = SHIPPED[kind]
     assert is_embedding(embedding)
     assert len(check_embedding(embedding, channels=channels, columns=columns)) == 10
+
+
+@pytest.mark.parametrize("kind", SHIPPED)
+def test_the_shortest_touches_are_read(kind):
+    embedding, (channels, _) = SHIPPED[kind]
+    check_embedding(embedding, channels=channels[-1:], columns=(2, 5, 8))
+    rng = np.random.default_rng(2)
+    for columns in range(2, 9):
+        image = rng.uniform(-1, 1, (channels[-1], columns)).astype(np.float32)
+        (row,) = embed_windows(embedding, image, {30: [0]})[30]
+        assert row.shape == (embedding.dimension,)
+        assert np.abs(row).max() <= embedding.bound
 
 
 @pytest.mark.parametrize("kind", ["kernels", "vision", "maps of a grid", "frames"])

@@ -180,7 +180,7 @@ def test_settings_that_do_not_fit_are_refused(wrong):
 
 def test_the_universal_stem_says_what_is_too_small_for_it():
     vision = Vision(ResNet.random(0, 18, "universal").state_dict())
-    assert vision.embed(image(3, 3)).shape == (448,)
+    assert vision.embed(image(3, 3)).shape == vision.embed(image(3, 2)).shape == (448,)
     assert vision.fingerprint
     with pytest.raises(InputError, match="at least 3 channels"):
         vision.embed(image(2, 30))

@@ -1,0 +1,191 @@
+"""Touches that no model was made for: each is refused by a typed error, or answered with finite probabilities."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from scroll_tactile import Sensor, TactileLearner
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import NotFiniteError, StreamTooShortError
+
+LOW, HIGH = (0.0, -10.0, 0.0, 100.0, 0.0), (255.0, 10.0, 1.0, 900.0, 4095.0)
+PLAIN = Sensor(name="pad", channels=5, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.5)
+MIXED = PLAIN.model_copy(update={"name": "mixed", "low": LOW, "high": HIGH})
+GAPPED = MIXED.model_copy(update={"name": "gapped", "non_finite": "missing"})
+SINGLE = Sensor(name="single", channels=1, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.5)
+SENSORS = [PLAIN, MIXED, GAPPED, SINGLE]
+NAMES = ["bark", "felt", "oak", "silk"]
+
+
+def readings_of(sensor, name="felt", repetition=9):
+    return Scene(sensor).touch(name, repetition).readings.astype(np.float64)
+
+
+@pytest.fixture(scope="module", params=SENSORS, ids=lambda sensor: sensor.name)
+def learner(request):
+    """A memory of five touches of each of four materials; the tests only ask it."""
+    return learned(request.param)
+
+
+def learned(sensor, of_each=5):
+    made, scene = TactileLearner(sensor=sensor), Scene(sensor)
+    for repetition in range(of_each):
+        for name in NAMES:
+            made.observe(name, scene.touch(name, repetition))
+    return made
+
+
+def limits(sensor):
+    return np.broadcast_to(sensor.low, sensor.shape), np.broadcast_to(sensor.high, sensor.shape)
+
+
+def dead(values, sensor, alive=0):
+    return np.where(np.arange(sensor.channels) < alive, values, limits(sensor)[0])
+
+
+def noise(values, sensor, amplitude=None):
+    rng = np.random.default_rng(0)
+    low, high = limits(sensor)
+    if amplitude is None:
+        return rng.uniform(low, high, values.shape)
+    return values + rng.normal(0, amplitude, values.shape) * (high - low)
+
+
+def stuck(values, sensor):
+    return np.where(np.arange(sensor.channels) == 0, limits(sensor)[1], values)
+
+
+def with_some(values, sensor, what):
+    spoilt = values.copy()
+    spoilt[[3, 4, 20], [0, -1, 0]] = what
+    return spoilt
+
+
+def narrow(values, sensor):
+    low, high = limits(sensor)
+    return low + 0.6 * (high - low) + 0.01 * (values - low)
+
+
+def slower(values, sensor, times=100):
+    places = np.linspace(0, len(values) - 1, times * len(values))
+    return np.stack([np.interp(places, range(len(values)), channel) for channel in values.T], axis=1)
+
+
+SOUND = {
+    "a usual touch": lambda values, sensor: values,
+    "all channels dead": dead,
+    "all channels but one dead": lambda values, sensor: dead(values, sensor, alive=1),
+    "constant": lambda values, sensor: values[:1].repeat(len(values), axis=0),
+    "constant at the top": lambda values, sensor: limits(sensor)[1][None].repeat(len(values), axis=0),
+    "two readings": lambda values, sensor: values[:2],
+    "seven readings": lambda values, sensor: values[:7],
+    "noise alone": noise,
+    "noise as wide as the range": lambda values, sensor: noise(values, sensor, amplitude=1.0),
+    "a channel stuck at the top": stuck,
+    "a hundredth of the range": narrow,
+    "a hundred times slower": slower,
+    "a hundred times faster": lambda values, sensor: values[:: len(values) - 1],
+    "two channels swapped": lambda values, sensor: values[:, [*range(sensor.channels)][::-1]],
+    "far outside the range": lambda values, sensor: values * 1e300,
+}
+NOT_FINITE = {
+    "NaN": lambda values, sensor: with_some(values, sensor, np.nan),
+    "infinity": lambda values, sensor: with_some(values, sensor, [np.inf, -np.inf, np.inf]),
+    "a channel of NaN": lambda values, sensor: np.where(
+        np.arange(sensor.channels) == sensor.channels - 1, np.nan, values
+    ),
+    "a second of NaN": lambda values, sensor: np.where(np.arange(len(values))[:, None] < 50, np.nan, values),
+    "but one value NaN": lambda values, sensor: np.where(
+        np.arange(values.size).reshape(values.shape) == 9, values, np.nan
+    ),
+}
+
+
+def check(prediction, names):
+    ranked, shares = zip(*prediction.ranking, strict=True)
+    assert sorted(ranked) == sorted(names)
+    assert all(math.isfinite(share) and 0 <= share <= 1 for share in shares)
+    assert sum(shares) == pytest.approx(1)
+    assert (prediction.material, prediction.probability) == prediction.ranking[0]
+    assert math.isfinite(prediction.novelty)
+    assert isinstance(prediction.known, bool)
+
+
+@pytest.mark.parametrize("kind", SOUND)
+def test_an_unusual_touch_is_answered(learner, kind):
+    readings = SOUND[kind](readings_of(learner.sensor), learner.sensor)
+    check(learner.predict(readings), NAMES)
+    check(learner.predict(readings, scene=NAMES[1:3]), NAMES[1:3])
+    assert learner.predict(readings) == learner.predict(readings)
+
+
+@pytest.mark.parametrize("kind", NOT_FINITE)
+def test_what_is_not_finite_is_answered_or_refused_as_the_sensor_says(learner, kind):
+    readings = NOT_FINITE[kind](readings_of(learner.sensor), learner.sensor)
+    if learner.sensor.non_finite == "missing":
+        check(learner.predict(readings), NAMES)
+    else:
+        with pytest.raises(NotFiniteError, match="expected finite readings"):
+            learner.predict(readings)
+
+
+def test_a_touch_of_nothing_finite_or_of_one_reading_is_refused(learner):
+    values = readings_of(learner.sensor)
+    before = learner.digest()
+    for readings, error in ((np.full_like(values, np.nan), NotFiniteError), (values[:1], StreamTooShortError)):
+        for call in (learner.predict, lambda touch: learner.observe("felt", touch)):
+            with pytest.raises(error):
+                call(readings)
+    assert learner.digest() == before
+
+
+@pytest.mark.parametrize("kind", [*SOUND, *NOT_FINITE])
+def test_an_unusual_touch_is_learned_and_no_answer_suffers(kind):
+    made = learned(GAPPED, of_each=3)
+    for repetition in range(2):
+        made.observe("odd", (SOUND | NOT_FINITE)[kind](readings_of(GAPPED, repetition=repetition), GAPPED))
+    for readings in (readings_of(GAPPED), (SOUND | NOT_FINITE)[kind](readings_of(GAPPED), GAPPED)):
+        check(made.predict(readings), [*NAMES, "odd"])
+
+
+@pytest.mark.parametrize("kind", ["all channels dead", "constant", "two readings", "noise alone", "a channel of NaN"])
+def test_a_memory_of_nothing_else_answers(kind):
+    made = TactileLearner(sensor=GAPPED)
+    for repetition in range(3):
+        for name in NAMES[:2]:
+            made.observe(name, (SOUND | NOT_FINITE)[kind](readings_of(GAPPED, name, repetition), GAPPED))
+            usual = readings_of(GAPPED, name)
+            check(made.predict(usual), list(made.materials))
+            check(made.predict((SOUND | NOT_FINITE)[kind](usual, GAPPED)), list(made.materials))
+
+
+def test_what_was_missing_is_kept_as_it_was_filled(tmp_path):
+    readings = NOT_FINITE["NaN"](readings_of(GAPPED), GAPPED)
+    with TactileLearner.open(tmp_path / "m", sensor=GAPPED) as made:
+        for name in NAMES[:2]:
+            made.observe(name, readings_of(GAPPED, name, 0))
+        receipt = made.observe("felt", readings)
+        before, answer = made.digest(), made.predict(readings)
+    with TactileLearner.open(tmp_path / "m") as again:
+        assert again.sensor == GAPPED
+        assert (again.digest(), again.predict(readings)) == (before, answer)
+        again.retract(receipt)
+        check(again.predict(readings), NAMES[:2])
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_anything_of_the_right_shape_is_answered_or_refused(learner, data):
+    shape = (data.draw(st.integers(1, 40)), learner.sensor.channels)
+    readings = data.draw(hnp.arrays(np.float64, shape, elements=st.floats(width=32)))
+    finite = np.isfinite(readings)
+    enough = finite.any() if learner.sensor.non_finite == "missing" else finite.all()
+    if enough and len(readings) > 1:
+        check(learner.predict(readings), NAMES)
+    else:
+        with pytest.raises((NotFiniteError, StreamTooShortError)):
+            learner.predict(readings)

@@ -1,6 +1,6 @@
 """What is known about a tactile sensor: its channels, rate and range of values.
 
-Four sensors come with the project; one's own is one more, made in one line:
+Five sensors come with the project; one's own is one more, made in one line:
 
 >>> from scroll_tactile.sensors import Sensor
 >>> skin = Sensor(name="my-skin", channels=39, rate=50.0, low=0.0, high=1.0, unit="counts", duration=5.0)
@@ -23,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = ["BIOTAC", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
+__all__ = ["BIOTAC", "BIOTAC_ALL", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
 
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
 
@@ -140,6 +140,23 @@ BIOTAC = Sensor(
 )
 """The 19 electrodes of a SynTouch BioTac."""
 
+_BIOTAC_HIGH = (
+    *(255.0,) * 19,  # electrodes, as of BIOTAC
+    63.0,  # temperature, tdc: recordings reach 38
+    511.0,  # its change, tac: 358
+    255.0,  # pressure, pdc: 220
+    1023.0,  # mean of the 22 vibration readings, pac: 99.9 % lie below 905 one by one
+    255.0,  # their standard deviation: 99.9 % lie below 126
+    63.0,  # mean absolute change from one to the next: 99.99 % lie below 79, 99.9 % below 30
+)
+
+BIOTAC_ALL = BIOTAC.model_copy(update={"name": "biotac-all", "channels": 25, "high": _BIOTAC_HIGH})
+"""All that a SynTouch BioTac measures in 10 ms, made of its 44 words by `datasets.biotac_slide.all_channels`.
+
+Electrodes 1 to 19, temperature, its change, pressure, and of the 22 vibration readings mean, standard deviation and
+mean absolute change. Words are of 12 bits, 0 to 4095; the ranges are where those of BioTac-20's training parts lie.
+"""
+
 ROBOSKIN = Sensor(
     name="roboskin",
     channels=60,
@@ -179,4 +196,4 @@ GELSIGHT = Sensor(
 
 def known() -> dict[str, Sensor]:
     """The sensors that come with the project, by name."""
-    return {sensor.name: sensor for sensor in (BIOTAC, ROBOSKIN, CONTACTILE, GELSIGHT)}
+    return {sensor.name: sensor for sensor in (BIOTAC, BIOTAC_ALL, ROBOSKIN, CONTACTILE, GELSIGHT)}

@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from scroll_tactile import sensors
-from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
+from scroll_tactile.sensors import BIOTAC, BIOTAC_ALL, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 
@@ -13,17 +13,28 @@ FIELDS = {
 
 
 def test_known_sensors_by_name():
-    assert sensors.known() == {s.name: s for s in (BIOTAC, ROBOSKIN, CONTACTILE, GELSIGHT)}
-    assert set(sensors.known()) == {"biotac", "roboskin", "contactile", "gelsight"}
+    assert sensors.known() == {s.name: s for s in (BIOTAC, BIOTAC_ALL, ROBOSKIN, CONTACTILE, GELSIGHT)}
+    assert set(sensors.known()) == {"biotac", "biotac-all", "roboskin", "contactile", "gelsight"}
 
 
 @pytest.mark.parametrize(
     ("sensor", "shape", "readings"),
-    [(BIOTAC, (19,), 400), (ROBOSKIN, (60,), 75), (CONTACTILE, (27,), 599), (GELSIGHT, (480, 640, 3), 25)],
+    [
+        (BIOTAC, (19,), 400),
+        (BIOTAC_ALL, (25,), 400),
+        (ROBOSKIN, (60,), 75),
+        (CONTACTILE, (27,), 599),
+        (GELSIGHT, (480, 640, 3), 25),
+    ],
 )
 def test_nominal_shapes(sensor, shape, readings):
     assert sensor.shape == shape
     assert sensor.readings == readings
+
+
+def test_presets_are_what_their_fields_would_make():
+    for sensor in sensors.known().values():
+        assert Sensor.model_validate(sensor.model_dump()) == sensor
 
 
 def test_own_sensor_in_one_line_and_back_from_json():

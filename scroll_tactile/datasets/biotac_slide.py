@@ -3,8 +3,8 @@
 Published as github.com/dexrob/BioTac_slide_20_50 (R. Gao et al., Supervised Autoencoder Joint Learning on
 Heterogeneous Tactile Sensory Data, IROS 2020), in this layout::
 
-    raw_data/mat{1..20}/mat{m}_{1..50}.pt      BioTac: int tensors (≥ 400, 44) at 100 Hz; the last 19 columns
-                                               are the electrodes
+    raw_data/mat{1..20}/mat{m}_{1..50}.pt      BioTac: int tensors (≥ 400, 44) at 100 Hz; columns tdc, tac, pdc,
+                                               pac1..22, ele1..19
     compiled_data/icub_{val_0..3,test}.npy     RoboSkin: five folds of float (200, 6, 10, 75) at 50 Hz
     compiled_data/labels_{val_0..3,test}.npy   their labels: l is material l + 1
 
@@ -28,10 +28,10 @@ import numpy.typing as npt
 
 from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError, StreamError
-from scroll_tactile.sensors import BIOTAC, ROBOSKIN, Sensor
+from scroll_tactile.sensors import BIOTAC, BIOTAC_ALL, ROBOSKIN, Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["MATERIALS", "load"]
+__all__ = ["MATERIALS", "all_channels", "load"]
 
 FOLDER = "biotac_slide_20_50"
 MATERIALS = tuple(f"mat{number}" for number in range(1, 21))
@@ -39,15 +39,18 @@ MATERIALS = tuple(f"mat{number}" for number in range(1, 21))
 
 _REPETITIONS = 50
 _FOLDS = 5
-_COLUMNS = 44  # of a raw BioTac recording: tdc, tac, pdc, pac1..22, ele1..19
+_COLUMNS = 44  # of a raw BioTac recording
+_VIBRATION = slice(3, 25)  # of these columns
 _ROBOSKIN_FILES = ("val_0", "val_1", "val_2", "val_3", "test")  # icub_test_4.npy overlaps these: left out
 _ROBOSKIN_SHAPE = (200, 6, 10, 75)
 
 
 def load(
-    root: str | Path, sensor: Literal["biotac", "roboskin"], seed: int = 0, *, unmixed: bool = False
+    root: str | Path, sensor: Literal["biotac", "biotac-all", "roboskin"], seed: int = 0, *, unmixed: bool = False
 ) -> Recordings:
     """Read one sensor's 1000 streams: (400, 19) for "biotac", (75, 60) for "roboskin", both in counts.
+
+    "biotac-all": the same touches and folds as "biotac" with all that the sensor measures, (400, 25); see BIOTAC_ALL.
 
     root: the folder of the data set, or the folder it lies in.
     seed: deals BioTac's repetitions into five folds of ten for each material. RoboSkin's five folds are its
@@ -60,14 +63,37 @@ def load(
     Raises DatasetError if a file is missing or not as published, InputError for another sensor, a negative seed,
     or a BioTac that is to be unmixed.
     """
-    if sensor not in ("biotac", "roboskin"):
-        raise InputError(f"expected sensor 'biotac' or 'roboskin'; came {sensor!r}")
+    if sensor not in ("biotac", "biotac-all", "roboskin"):
+        raise InputError(f"expected sensor 'biotac', 'biotac-all' or 'roboskin'; came {sensor!r}")
     if seed < 0:
         raise InputError(f"expected a seed of 0 or more; came {seed}")
     if unmixed and sensor != "roboskin":
         raise InputError(f"expected sensor 'roboskin' to be unmixed; came {sensor!r}, which is published in order")
     folder = _find(Path(root).expanduser())
-    return _load_biotac(folder / "raw_data", seed) if sensor == "biotac" else _load_roboskin(folder, unmixed)
+    if sensor == "roboskin":
+        return _load_roboskin(folder, unmixed)
+    return _load_biotac(folder / "raw_data", BIOTAC if sensor == "biotac" else BIOTAC_ALL, seed)
+
+
+def all_channels(words: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Readings of BIOTAC_ALL, shape (T, 25), of a BioTac's words of each 10 ms, shape (T, 44).
+
+    words: tdc, tac, pdc, pac1..22, ele1..19. The 22 vibration readings come in as what they say of the 10 ms: their
+    mean, standard deviation and mean absolute change from one to the next. Each as a channel of its own they drown the
+    others. Raises InputError for another shape.
+    """
+    if words.ndim != 2 or words.shape[1] != _COLUMNS:
+        raise InputError(f"expected a BioTac's words of shape (T, {_COLUMNS}); came {words.shape}")
+    values = words.astype(np.float64)
+    vibration = values[:, _VIBRATION]
+    count = vibration.shape[1]
+    with np.errstate(invalid="ignore"):  # what is infinite is missing in all three
+        mean = vibration.sum(axis=1) / count
+        # Of whole numbers both sums are exact, so that no machine rounds another energy.
+        energy = np.maximum(count * np.square(vibration).sum(axis=1) - np.square(vibration.sum(axis=1)), 0)
+        change = np.abs(np.diff(vibration, axis=1)).sum(axis=1) / (count - 1)
+    slow, electrodes = values[:, : _VIBRATION.start], values[:, _VIBRATION.stop :]
+    return np.column_stack([electrodes, slow, mean, np.sqrt(energy) / count, change])
 
 
 def _find(root: Path) -> Path:
@@ -81,16 +107,16 @@ def _find(root: Path) -> Path:
     )
 
 
-def _load_biotac(folder: Path, seed: int) -> Recordings:
+def _load_biotac(folder: Path, sensor: Sensor, seed: int) -> Recordings:
     streams, folds = [], []
     for number, material in enumerate(MATERIALS):
         for file in range(1, _REPETITIONS + 1):
-            streams.append(_read_biotac(folder / material / f"{material}_{file}.pt"))
+            streams.append(_read_biotac(folder / material / f"{material}_{file}.pt", sensor))
         dealt = np.arange(_REPETITIONS) % _FOLDS
         folds.append(np.random.default_rng([seed, number]).permutation(dealt))
     return Recordings(
-        name="BioTac-20",
-        sensor=BIOTAC,
+        name="BioTac-20" if sensor is BIOTAC else "BioTac-20, all channels",
+        sensor=sensor,
         streams=streams,
         materials=[material for material in MATERIALS for _ in range(_REPETITIONS)],
         repetition=np.tile(np.arange(_REPETITIONS), len(MATERIALS)),
@@ -99,7 +125,7 @@ def _load_biotac(folder: Path, seed: int) -> Recordings:
     )
 
 
-def _read_biotac(path: Path) -> Stream:
+def _read_biotac(path: Path, sensor: Sensor) -> Stream:
     import torch  # a second or more: not for those who read RoboSkin only
 
     wanted = f"a tensor of shape (≥ {BIOTAC.readings}, {_COLUMNS})"
@@ -108,7 +134,8 @@ def _read_biotac(path: Path) -> Stream:
         raise DatasetError(f"expected {path} to hold {wanted}; it holds a {type(tensor).__name__}")
     if tensor.ndim != 2 or len(tensor) < BIOTAC.readings or tensor.shape[1] != _COLUMNS:
         raise DatasetError(f"expected {path} to hold {wanted}; its shape is {tuple(tensor.shape)}")
-    return _stream(tensor[: BIOTAC.readings, -BIOTAC.channels :].numpy(), BIOTAC, path)
+    words = tensor[: BIOTAC.readings].numpy()
+    return _stream(words[:, -BIOTAC.channels :] if sensor is BIOTAC else all_channels(words), sensor, path)
 
 
 def _load_roboskin(folder: Path, unmixed: bool) -> Recordings:

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.biotac_slide import MATERIALS, load
+from scroll_tactile.datasets.biotac_slide import MATERIALS, all_channels, load
 from scroll_tactile.errors import DatasetError, InputError
-from scroll_tactile.sensors import BIOTAC, ROBOSKIN
+from scroll_tactile.sensors import BIOTAC, BIOTAC_ALL, ROBOSKIN
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +46,33 @@ def test_biotac_is_a_thousand_streams_in_seeded_folds(biotac, real_data):
     assert not np.array_equal(other.fold, biotac.fold)
     assert not np.array_equal(biotac.fold[:50], biotac.fold[50:100])  # not one permutation for all materials
     assert set(biotac.repetition[biotac.blocked() == 4]) == set(range(40, 50))
+
+
+def test_all_of_biotac_is_the_same_touches_with_more_channels(biotac, real_data):
+    whole = load(real_data, "biotac-all")
+    assert (whole.name, whole.sensor, len(whole)) == ("BioTac-20, all channels", BIOTAC_ALL, 1000)
+    assert (whole.materials, whole.fold.tolist()) == (biotac.materials, biotac.fold.tolist())
+    for stream, electrodes in zip(whole.streams, biotac.streams, strict=True):
+        assert stream.readings.shape == (400, 25)
+        assert np.array_equal(stream.readings[:, :19], electrodes.readings)
+    assert sum(stream.clipped for stream in whole.streams) < 1e-4 * sum(s.readings.size for s in whole.streams)
+
+
+def test_a_biotacs_words_become_channels():
+    words = np.zeros((2, 44), dtype=np.int64)
+    words[:, 3:25] = np.arange(22)[::-1] * 186  # to 3906 of 4095
+    words[0, :3], words[0, 25:] = (30, 200, 100), np.arange(19)
+    words[1, 3:25] = 7
+    rows = all_channels(words)
+    assert rows[0, :22].tolist() == [*range(19), 30, 200, 100]
+    assert rows[0, 22:].tolist() == pytest.approx([1953, 186 * np.std(np.arange(22)), 186])
+    assert rows[1].tolist() == [0] * 22 + [7, 0, 0]
+    spoilt = words.astype(float)
+    spoilt[0, 5], spoilt[1, 30] = np.inf, np.nan
+    missing = ~np.isfinite(all_channels(spoilt))
+    assert np.argwhere(missing).tolist() == [[0, 22], [0, 23], [0, 24], [1, 5]]
+    with pytest.raises(InputError, match=r"shape \(T, 44\); came \(2, 43\)"):
+        all_channels(words[:, 1:])
 
 
 def test_roboskin_is_the_publishers_five_files(roboskin, real_data):
@@ -171,7 +198,7 @@ def test_a_roboskin_file_that_is_not_as_published_is_named(folder, file, content
 
 
 def test_other_sensors_and_seeds_are_refused(folder):
-    with pytest.raises(InputError, match="expected sensor 'biotac' or 'roboskin'; came 'gelsight'"):
+    with pytest.raises(InputError, match="expected sensor 'biotac', 'biotac-all' or 'roboskin'; came 'gelsight'"):
         load(folder, "gelsight")
     with pytest.raises(InputError, match="seed of 0 or more; came -1"):
         load(folder, "biotac", seed=-1)

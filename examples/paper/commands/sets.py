@@ -42,14 +42,20 @@ class Dataset(StrEnum):
     """The recorded sets."""
 
     BIOTAC = "biotac-20"
+    BIOTAC_ALL = "biotac-20-all"  # all that the sensor measures, not its electrodes alone: none of the paper's sets
     ROBOSKIN = "roboskin-20"
     UNMIXED = "roboskin-20-unmixed"  # in the order of time, which the published arrays are not in
 
 
 def read(dataset: Dataset, data: Path, seed: int) -> Recordings:
     """Read a recorded set. Raises DatasetError for a folder that is not laid out as published."""
-    sensor: Literal["biotac", "roboskin"] = "biotac" if dataset is Dataset.BIOTAC else "roboskin"
-    return load(data, sensor, seed, unmixed=dataset is Dataset.UNMIXED)
+    sensors: dict[Dataset, Literal["biotac", "biotac-all", "roboskin"]] = {
+        Dataset.BIOTAC: "biotac",
+        Dataset.BIOTAC_ALL: "biotac-all",
+        Dataset.ROBOSKIN: "roboskin",
+        Dataset.UNMIXED: "roboskin",
+    }
+    return load(data, sensors[dataset], seed, unmixed=dataset is Dataset.UNMIXED)
 
 
 def parse_folds(folds: str, recordings: Recordings) -> list[int]:

@@ -135,7 +135,7 @@ def test_before_anything_was_felt_the_answer_is_unknown():
     with pytest.raises(UnknownMaterialError, match="never observed"):
         learner.predict(touch("wool", 0), scene=["wool"])
     with pytest.raises(StreamError):
-        learner.predict(np.zeros((2, 3)))
+        learner.predict(np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize("readout", ["lda", "ridge"])

@@ -27,8 +27,8 @@ def observe(
     sensor: Annotated[
         str | None,
         typer.Option(
-            help="Whose readings they are: biotac, roboskin, contactile, gelsight, or a JSON file with name, channels, "
-            "rate, low, high, unit and duration. Needed only to make a new memory."
+            help="Whose readings they are: biotac, biotac-all, roboskin, contactile, gelsight, or a JSON file with "
+            "name, channels, rate, low, high, unit and duration. Needed only to make a new memory."
         ),
     ] = None,
 ) -> None:

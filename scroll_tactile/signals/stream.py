@@ -22,6 +22,7 @@ from scroll_tactile.errors import (
     StreamTooShortError,
 )
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.interpolation import interpolate
 
 if TYPE_CHECKING:
     import torch
@@ -95,7 +96,7 @@ class Stream:
         mask = self.mask[:count]
         _require_any(mask, self.sensor)
         part = part.copy()
-        _interpolate(part, mask, self.sensor)
+        interpolate(part, mask, self.sensor)
         part.setflags(write=False)
         return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask)
 
@@ -181,7 +182,7 @@ def _sound(array: _Array, sensor: Sensor) -> Stream:
         clipped = int(np.count_nonzero(outside if mask is None else outside & ~mask))
         np.clip(values, low, high, out=values)
     if mask is not None:
-        _interpolate(values, mask, sensor)
+        interpolate(values, mask, sensor)
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
     values.setflags(write=False)
     return Stream(sensor, values, clipped, mask)
@@ -196,26 +197,6 @@ def _missing(array: _Array, sensor: Sensor) -> npt.NDArray[np.bool_] | None:
         _refuse(array, bad, sensor)
     _require_any(bad, sensor)
     return bad
-
-
-def _interpolate(values: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], sensor: Sensor) -> None:
-    """Write into each missing value, in place, the line between its channel's neighbours in time."""
-    flat, flags = values.reshape(len(values), -1), mask.reshape(len(mask), -1)
-    channels = np.flatnonzero(flags.any(axis=0))
-    held, gap = flat[:, channels].astype(np.float64), flags[:, channels]
-    dead = gap.all(axis=0)
-    low = np.broadcast_to(sensor.limits[0], sensor.shape).reshape(-1)[channels]
-    held[:, dead], gap[:, dead] = low[dead], False
-    last = len(values)
-    time = np.arange(last)[:, None]
-    before = np.maximum.accumulate(np.where(gap, -1, time), axis=0)
-    after = np.minimum.accumulate(np.where(gap, last, time)[::-1], axis=0)[::-1]
-    before, after = np.where(before < 0, after, before), np.where(after == last, before, after)  # held at the ends
-    begin, end = np.take_along_axis(held, before, axis=0), np.take_along_axis(held, after, axis=0)
-    # Step by step in float64, not np.interp: a fused multiply-add would round otherwise on another machine.
-    slope = (end - begin) / np.maximum(after - before, 1)
-    flat[:, channels] = np.where(gap, begin + slope * (time - before), held)
-    np.clip(values, *sensor.limits, out=values)  # rounding may pass a neighbour by a unit in the last place
 
 
 def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:

@@ -52,6 +52,7 @@ class Joined:
         self.capabilities = Capabilities(
             partial_windows=all(part.partial_windows for part in declared),
             judged_scales="widest" if widest else "all",
+            reads_whole_touches=all(part.reads_whole_touches for part in declared),
             reads_frames=bool(framed),
             rest=rest,
             embeds_windows=True,

@@ -70,7 +70,7 @@ class Kernels:
 
     name = "kernels"
     bound = 1.0
-    capabilities = Capabilities(embeds_windows=True, exact=True)
+    capabilities = Capabilities(embeds_windows=True, exact=True, reads_whole_touches=True)
 
     def __init__(self, *, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
         if not LEAST_FEATURES <= dimension <= MOST_FEATURES:

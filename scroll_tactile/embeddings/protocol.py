@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest
-from scroll_tactile.signals.windows import WindowPlan, scales
+from scroll_tactile.signals.windows import WindowPlan, scales, whole_columns
 
 __all__ = [
     "TOGETHER",
@@ -41,6 +41,7 @@ class Capabilities:
 
     partial_windows: a touch of 0.65 of a wide window or more is read at that scale, as far as it goes.
     judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
+    reads_whole_touches: beside windows it embeds two views of each whole touch, see `signals.views`.
     shrinkage: how many times as far as its formula says the scatter of its features is shrunk; see
         `readouts.shrinkage`. More than once for features that are far from normally distributed.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
@@ -52,6 +53,7 @@ class Capabilities:
 
     partial_windows: bool = True
     judged_scales: Literal["widest", "all"] = "all"
+    reads_whole_touches: bool = False
     shrinkage: float = 1.0
     reads_frames: bool = False
     rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
@@ -151,6 +153,7 @@ def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
         declared.judged_scales,
         declared.shrinkage,
         sensor.camera,
+        whole_columns(sensor) if declared.reads_whole_touches else 0,
     )
 
 

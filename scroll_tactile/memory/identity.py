@@ -89,6 +89,7 @@ class Identity(_Kept):
 
     reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
     exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
+    views: whether whole touches are read beside windows; earlier versions, whose kernels do so from now on, had none.
     gone_copies: the settings of copies that only an earlier version can make; of no new memory.
     """
 
@@ -98,6 +99,7 @@ class Identity(_Kept):
     reading: tuple[bool, Literal["all", "widest"]] | None = None
     exemplars: tuple[int | None, int | None] | None = None
     augmentation: Augmented | None = None
+    views: bool = False
     gone_copies: dict[str, Any] = Field(default_factory=dict, exclude=True)
 
     @model_validator(mode="before")
@@ -127,6 +129,7 @@ class Identity(_Kept):
             reading=(plan.partial, plan.judged),
             exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
             augmentation=augmentation,
+            views=bool(plan.whole),
         )
 
     @classmethod
@@ -148,12 +151,14 @@ class Identity(_Kept):
 
     def to_json(self) -> dict[str, Any]:
         """Its fields in JSON's types, as a store keeps them; absent ones are left out, as earlier versions did."""
-        kept = self.model_dump(mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars"})
+        kept = self.model_dump(mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars", "views"})
         kept["grid"] = self.grid.model_dump(mode="json", exclude={"frames"} if not self.grid.frames else None)
         if self.exemplars is not None:
             kept["exemplars"] = list(self.exemplars)
         if self.augmentation is not None:
             kept["augmentation"] = self.augmentation.model_dump(mode="json")
+        if self.views:
+            kept["views"] = True
         kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
         return kept
 
@@ -270,12 +275,13 @@ class AbsentEmbedding:
         self.fingerprint = made.fingerprint
         self._identity, self._path = identity, path
         partial, judged = identity.reading or (True, "all")
+        kernels = made.bare or (made.configuration is None and made.name == LIKELY_EXACT)
         self.capabilities = Capabilities(
             partial_windows=partial,
             judged_scales=judged,
+            reads_whole_touches=identity.views or kernels,
             embeds_windows=True,
-            # What is gone was exact mostly; where its readings alone are there, `_made` says what to do.
-            exact=made.bare or made.gone or (made.configuration is None and made.name == LIKELY_EXACT),
+            exact=kernels or made.gone,  # mostly; where its readings alone are there, `_made` says what to do
         )
 
     @cached_property

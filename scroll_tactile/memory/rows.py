@@ -117,8 +117,8 @@ def unpack_windows(arrays: Arrays) -> Codes:
 def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | None) -> Codes:
     """The rows of codes that a touch of so many columns added, by scale, from the arrays of its journal row.
 
-    encode: embeds readings where the row has nothing else. Where it holds the windows of an earlier version, with
-    copies, the readings are embedded again; where that cannot be, the touch counts without its copies.
+    encode: embeds readings where the row has nothing else. Where it holds the windows of an earlier version, and copies
+    or views belong beside them, the readings are embedded again; where that cannot be, the touch counts without those.
 
     Raises MismatchError where the row cannot be read without its embedding.
     """
@@ -127,7 +127,7 @@ def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | N
     windows, readings = unpack_windows(arrays), unpack_readings(arrays)
     own = {Scale("window", width): len(starts) for width, starts in plan.extent(columns).items()}
     alone = all(len(windows[scale]) == count for scale, count in own.items() if scale in windows)
-    if readings is not None and encode is not None and not (windows and alone):
+    if readings is not None and encode is not None and not (windows and alone and not plan.views):
         return encode(readings)
     if not windows:
         raise MismatchError(

@@ -296,8 +296,11 @@ class Memory:
         self.base = store.compacted
         # Without a sound generation the base raises what is lost; without a base the journal has every row.
         newest = store.latest()
-        # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count.
-        earlier = newest if newest is not None and "pool-sums" in newest.arrays else None
+        # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count, or
+        # has no views, which the rows give that hold readings.
+        scales = list(map(int, self.plan.scales))
+        current = newest is None or ("pool-sums" not in newest.arrays and newest.attributes["scales"] == scales)
+        earlier = None if current else newest
         start = store.base() if newest is None or earlier is not None else newest
         if start is not None:
             self._take(start.arrays, start.attributes, 0)

@@ -16,7 +16,8 @@ from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.signals.views import shape_image, stretched
+from scroll_tactile.signals.windows import SHAPE, WHOLE, Extent, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
@@ -87,29 +88,53 @@ class FeatureExtractor:
         return stage_rows(self._plan.scored_stages(image.shape[1]), windows)
 
     def encode(self, stream: Stream, longest: int, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
-        """What is evaluated of a `stream`: its part within the longest touch that was learned.
+        """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
         longest: its columns. needed: the scales to be read of a touch of so many columns.
         """
-        stream = self._within(stream, longest)
-        image = self.image(stream)
-        return Encoded(image, self.means(image, needed(image.shape[1])), stream.seconds)
+        within = self._within(stream, longest)
+        image = self.image(within)
+        whole = image if len(within) == len(stream) else self.image(stream)
+        return Encoded(image, self.means(image, needed(image.shape[1]), whole), within.seconds)
 
-    def means(self, image: Image, scales: Sequence[Scale]) -> dict[Scale, npt.NDArray[np.float64]]:
-        """A touch's mean features in the codes' unit, (d,) by scale."""
+    def means(
+        self, image: Image, scales: Sequence[Scale], whole: Image | None = None
+    ) -> dict[Scale, npt.NDArray[np.float64]]:
+        """A touch's mean features in the codes' unit, (d,) by scale. whole: what is viewed, `image` unless given."""
         places = self._plan.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error here.
         return {
             scale: in_units(rows[places[scale]], self._embedding.bound).mean(axis=0)
-            for scale, rows in self.features(image, scales).items()
+            for scale, rows in self.features(image, scales, whole).items()
         }
 
-    def features(self, image: Image, scales: Sequence[Scale] | None = None) -> dict[Scale, npt.NDArray[np.floating]]:
-        """The features of a tactile image's windows, (windows, d) by scale: all, or those of some scales."""
-        windows = self._plan.extent(image.shape[1])
-        if scales is not None:
-            wanted = {scale.width for scale in scales}
-            windows = {width: windows[width] for width in windows if width in wanted}
+    def features(
+        self, image: Image, scales: Sequence[Scale] | None = None, whole: Image | None = None
+    ) -> dict[Scale, npt.NDArray[np.floating]]:
+        """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales."""
+        wanted = self._plan.scales if scales is None else scales
+        extent = self._plan.extent(image.shape[1])
+        windows = {scale: extent[scale.width] for scale in wanted if scale.width in extent}
+        views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
+        width = self._plan.whole
+        if WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:
+            # A touch of the usual length is convolved once for its windows and for itself.
+            embedded = self._embedded(image, {**{int(scale): starts for scale, starts in windows.items()}, width: [0]})
+            found = {WHOLE: embedded.pop(width)}
+        else:
+            embedded = self._embedded(image, {int(scale): starts for scale, starts in windows.items()})
+            found = {}
+        for view, picture in views.items():
+            if view not in found:
+                found[view] = self._embedded(picture, {width: [0]})[width]
+        return {Scale("window", width): rows for width, rows in embedded.items()} | dict(sorted(found.items()))
+
+    def _views(self, image: Image) -> dict[Scale, Image]:
+        """The pictures of a whole touch by view; of a touch of the usual length the first is the image itself."""
+        usual = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
+        return {WHOLE: usual, SHAPE: shape_image(usual)}
+
+    def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
         embedded = embed_windows(self._embedding, image, windows)
         for width, features in embedded.items():
             expected = (len(windows[width]), self._embedding.dimension)
@@ -117,7 +142,7 @@ class FeatureExtractor:
                 raise EmbeddingError(
                     f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
                 )
-        return {Scale("window", width): features for width, features in embedded.items()}
+        return embedded
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.

@@ -41,6 +41,7 @@ class LeftOut:
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
+    strangeness: shape (N,), see `Readout.strangeness`, from the material of the highest score.
     """
 
     rows: dict[tuple[int, int], int]
@@ -48,6 +49,7 @@ class LeftOut:
     scores: FloatArray
     z: FloatArray
     distances: FloatArray
+    strangeness: FloatArray
 
 
 def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], kind: ReadoutName) -> LeftOut:
@@ -81,7 +83,8 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
         assert leaving is not None
         parts.append(leaving.out(np.asarray(rows), np.asarray(weights), np.asarray(owners)))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
-    return LeftOut(index, names, *joined)
+    strangeness = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
+    return LeftOut(index, names, joined[0], joined[1], joined[2], strangeness)
 
 
 class _Leaving:
@@ -108,8 +111,8 @@ class _Leaving:
 
     def out(
         self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, each of shape (M·k, R), of rows about the origin, shape (M, k, d).
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Scores, z and distances, each of shape (M·k, R), and strangeness (M·k,), of rows about the origin (M, k, d).
 
         weights: the rows of the statistics that each touch stands for, shape (M,). own: its material among the
         reference, shape (M,).
@@ -138,7 +141,20 @@ class _Leaving:
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, own, leverage, weights)
-        return tuple(part.reshape(touches * count, -1) for part in (scores, centred, distances))  # type: ignore[return-value]
+        strange = self._strangeness(rows, weights, own, scores.argmax(axis=2))
+        flat = [part.reshape(touches * count, -1) for part in (scores, centred, distances)]
+        return flat[0], flat[1], flat[2], strange.reshape(-1)
+
+    def _strangeness(
+        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp], best: npt.NDArray[np.intp]
+    ) -> FloatArray:
+        """Of rows, shape (M, k, d), from the material `best` of each, shape (M, k), without the touch's own rows."""
+        means, counts = self.readout.means_solved()[0], self.counts[own]
+        nearest = means[best]
+        back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
+        nearest -= (best == own[:, None])[:, :, None] * back[:, None]
+        strangeness: FloatArray = np.square(rows - nearest) @ self.readout.precision
+        return strangeness
 
     def _whole(
         self, white: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray

@@ -101,7 +101,8 @@ class Readout:
     """The readout of one scale: of a task, and of the touches that came and went since.
 
     names: the materials; one is known by its place among them. reference: places. origin: shape (d,), in codes.
-    counts: rows, shape (C,). share: ρ. penalty: P. Not for several threads at once.
+    counts: rows, shape (C,). share: ρ. penalty: P. precision: one over the variance of each feature within materials as
+    it was solved, shape (d,). Not for several threads at once.
 
     Some materials are held, with all that scores need: the reference first.
 
@@ -126,6 +127,7 @@ class Readout:
         spread = trace / dimension * self.share / (1 - self.share)
         self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
         matrix[np.diag_indices(dimension)] += self.penalty
+        self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix)
         self._held: dict[int, int] = {}  # place → row of these
         self._room = np.empty((0, 2, dimension))
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
@@ -298,6 +300,15 @@ class Readout:
         row = codes - self.origin
         z = self._solved[held] @ row if solved is None else (solved @ row)[held]
         return np.asarray(z - self._sizes[held] / 2)
+
+    def strangeness(self, codes: FloatArray, place: int) -> float:
+        """The squared distance of codes (d,) from a material's mean, in variances of each feature as it was fitted.
+
+        It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
+        differs in.
+        """
+        away = codes - self.origin - self._means[self.held([place])[0]]
+        return float(np.square(away) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
         """The scores of materials as weights (d, k) of codes about the origin, and offsets (k,); see `scores`."""

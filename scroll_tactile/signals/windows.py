@@ -1,8 +1,9 @@
-"""Windows: the stretches of a stream that are embedded, at a few scales.
+"""Windows and views: what of a stream is embedded, at a few scales.
 
-An embedding of a whole stream is lost when a touch is shorter, longer, faster or slower than those learned from.
-So a stream is read in windows of 0.3 s and of three quarters of the usual duration, and each of these scales has
-statistics of its own. A stream is known from its first 0.3 s on, and better with every reading.
+An embedding of a whole stream is lost when a touch is shorter or longer than those learned from. So a stream is read in
+windows of 0.3 s and of three quarters of the usual duration, and each of these scales has statistics of its own. A
+stream is known from its first 0.3 s on, and better with every reading. Windows in seconds are lost when a touch is made
+faster or slower: beside them the whole of it is read in its own time (see `views`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ __all__ = [
     "ENOUGH",
     "FRAMES",
     "MOST_WINDOWS",
+    "SHAPE",
+    "WHOLE",
     "Extent",
     "Scale",
     "WindowPlan",
@@ -30,6 +33,7 @@ __all__ = [
     "scales",
     "scored",
     "stages",
+    "whole_columns",
 ]
 
 SHORTEST = 0.3  # seconds
@@ -37,6 +41,7 @@ LONGEST = 0.75  # of the usual duration: a usual touch has several windows of it
 ENOUGH = 0.65  # of a window: a touch half the usual one is read with the kernels of the wide windows as far as it goes
 FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
+MOST_COLUMNS = 1024  # of a whole touch: what is finer than a thousandth of it is for windows
 FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
 Extent = dict[int, list[int]]  # width of windows → their first columns
@@ -46,35 +51,41 @@ EARLIER = frozenset(range(4))
 beginnings (1) and of sampled readings (2)."""
 
 
+VIEWS = {"whole": 2**20, "shape": 2**20 + 1}  # their numbers on disk: no window is as wide
+
+
 @dataclass(frozen=True)
 class Scale:
     """A kind of features that has statistics of its own.
 
-    kind: "window" for windows of `width` columns.
+    kind: "window" for windows of `width` columns; "whole" and "shape" for the views of a whole touch, without a width.
 
     Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it. A window's
     is its width.
     """
 
-    kind: Literal["window"]
-    width: int
+    kind: Literal["window", "whole", "shape"]
+    width: int = 0
 
     @classmethod
     def numbered(cls, number: int) -> Scale:
         """The scale of a number on disk, which is none of `EARLIER`."""
-        return cls("window", number)
+        return {int(view): view for view in (WHOLE, SHAPE)}.get(number) or cls("window", number)
 
     def __hash__(self) -> int:
         return self.width  # scales are looked up a hundred times a touch
 
     def __index__(self) -> int:
-        return self.width
+        return self.width or VIEWS[self.kind]
 
     def __str__(self) -> str:
         return str(int(self))
 
     def __lt__(self, other: Scale) -> bool:
         return int(self) < int(other)
+
+
+WHOLE, SHAPE = Scale("whole"), Scale("shape")
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
@@ -89,6 +100,11 @@ def scales(sensor: Sensor) -> tuple[int, ...]:
     # A touch must fit the shortest before it fits the longest: stages are known by their number.
     two = longest >= 1.5 * shortest and ENOUGH * longest > shortest
     return (shortest, longest) if two else (shortest,)
+
+
+def whole_columns(sensor: Sensor) -> int:
+    """The columns that a whole touch is stretched to, those of a usual one within bounds; 0 for a camera: no views."""
+    return 0 if sensor.camera else min(max(sensor.readings, FEWEST), MOST_COLUMNS)
 
 
 def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
@@ -176,7 +192,8 @@ class WindowPlan:
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. shrinkage: how many times as far as the
-    formula says readouts are shrunk. frames: whether windows are a camera's frames.
+    formula says readouts are shrunk. frames: whether windows are a camera's frames. whole: the columns that a whole
+    touch is stretched to for the views of it; 0 where there are none.
     """
 
     widths: tuple[int, ...]
@@ -184,6 +201,7 @@ class WindowPlan:
     judged: Literal["all", "widest"] = "all"
     shrinkage: float = 1.0
     frames: bool = False
+    whole: int = 0
 
     @property
     def windows(self) -> tuple[Scale, ...]:
@@ -191,16 +209,21 @@ class WindowPlan:
         return tuple(Scale("window", width) for width in self.widths)
 
     @property
+    def views(self) -> tuple[Scale, ...]:
+        """The scales that are views of a whole touch, ascending."""
+        return (WHOLE, SHAPE) if self.whole else ()
+
+    @property
     def scales(self) -> tuple[Scale, ...]:
-        """All scales, ascending by number."""
-        return self.windows
+        """All scales, ascending by number: windows, then views."""
+        return self.windows + self.views
 
     def extent(self, columns: int) -> Extent:
         """The windows that are read of a touch of so many columns."""
         return extent(columns, self.widths, partial=self.partial, frames=self.frames)
 
     def judging(self, length: int) -> list[Scale]:
-        """The scales that judge when so many columns have been observed."""
+        """The windows that judge when so many columns have been observed; the views always do."""
         fit = fitting(length, self.widths, partial=self.partial)
         chosen = fit[-1:] if self.judged == "widest" else fit
         return [Scale("window", width) for width in chosen]
@@ -213,21 +236,25 @@ class WindowPlan:
     def scored_stages(self, columns: int) -> list[dict[Scale, list[list[int]]]]:
         """For each stage that a touch of so many columns reached: scale → places of the windows that judge there.
 
-        They come in groups, each learned as its mean: the narrow windows together, wide ones and a camera's frames one
-        by one. One of these may be all that is judged: of halves of BioTac's touches 97 % are right so and 92 learned
-        from means of their wide windows, of single frames of GelSight 84.5 and 78.4 % from means of videos.
+        The views judge a touch as a whole, at its last stage. Places come in groups, each learned as its mean: the
+        narrow windows together, wide ones and a camera's frames one by one. One of these may be all that is judged: of
+        halves of BioTac's touches 97 % are right so and 92 learned from means of their wide windows, of single frames
+        of GelSight 84.5 and 78.4 % from means of videos.
         """
 
         def grouped(scale: Scale, places: list[int]) -> list[list[int]]:
             return [[place] for place in places] if self.frames or scale.width > self.widths[0] else [places]
 
         stages = [self.scored(columns, length) for length in self.stages(columns)]
-        return [{scale: grouped(scale, places) for scale, places in stage.items()} for stage in stages]
+        groups = [{scale: grouped(scale, places) for scale, places in stage.items()} for stage in stages]
+        groups[-1] |= {view: [[0]] for view in self.views}
+        return groups
 
     def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
         places = scored(self.extent(columns), columns, partial=self.partial)
-        return {Scale("window", width): chosen for width, chosen in places.items()}
+        windows = {Scale("window", width): chosen for width, chosen in places.items()}
+        return windows | {view: [0] for view in self.views}
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""

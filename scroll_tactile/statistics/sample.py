@@ -33,12 +33,12 @@ Stages = Sequence[Mapping[Scale, Sequence[Sequence[int]]]]
 def stage_rows(stages: Stages, windows: Codes) -> Codes:
     """What is learned of a touch: for each scale a row for each group of each stage that it judges at, (rows, d).
 
-    windows: the codes of the touch's windows by scale. A row is the mean of a group. Of a stage that is one group it is
-    what will be judged of a touch that ends there.
+    windows: the codes of the touch's windows by scale; a scale without any adds none. A row is the mean of a group. Of
+    a stage that is one group it is what will be judged of a touch that ends there.
     """
     rows: dict[Scale, list[npt.NDArray[np.int64]]] = {}
     for stage in stages:
-        for scale, groups in stage.items():
+        for scale, groups in ((scale, groups) for scale, groups in stage.items() if scale in windows):
             rows.setdefault(scale, []).extend(
                 mean_code(windows[scale][places].sum(axis=0, dtype=np.int64), len(places)) for places in groups
             )
@@ -64,6 +64,8 @@ class SampledTouch:
         rows, pairs = [], []
         for stage, scales in enumerate(stages):
             for place, scale in enumerate(sorted(scales)):
+                if scale not in codes:
+                    continue
                 row, count = used.get(scale, 0), len(scales[scale])
                 used[scale] = row + count
                 rows.append(mean_code(codes[scale][row : row + count].sum(axis=0, dtype=np.int64), count))

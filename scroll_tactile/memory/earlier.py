@@ -6,14 +6,19 @@ a memory all is shown that needs nothing embedded; the readings that it holds ca
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError
+from scroll_tactile.signals.windows import EARLIER, WindowPlan
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 
-__all__ = ["gone_copies", "gone_embedding", "is_gone", "split_copies"]
+__all__ = ["gone_copies", "gone_embedding", "is_gone", "sample_of_windows", "split_copies"]
 
+BEGINNING: Final = 1  # the number of the one scale that is gone and judged beside windows
 ROBUST: Final = "robust"  # the kind in its configuration
 NAME: Final = "robust kernels"  # of the one that memories without a configuration had
 NEUTRAL: Final = {"dead": 0, "offset": 0, "gain": 0, "noisy": 0, "thinned": False}
@@ -45,6 +50,25 @@ def split_copies(settings: Mapping[str, Any]) -> tuple[dict[str, Any] | None, di
     if gone:
         return None, gone | ({"noise": settings["noise"]} if "noisy" in gone and "noise" in settings else {})
     return {name: value for name, value in settings.items() if name not in (*NEUTRAL, "noise")}, {}
+
+
+def sample_of_windows(sample: TouchSample, scales: Collection[int], plan: WindowPlan) -> TouchSample:
+    """The sample of a generation that had these numbers of scales, without the rows of those that are gone.
+
+    Beginnings came first wherever the narrow windows judged; noisy copies had a stage behind all others. So a memory of
+    a user's own embedding, which once declared these, is judged by its windows alone.
+    """
+    if EARLIER.isdisjoint(scales):
+        return sample
+    lengths = plan.milestones()
+    before = np.array([BEGINNING in scales and plan.judging(length)[0] == plan.windows[0] for length in lengths])
+    kept = TouchSample()
+    for material, key, touch in sample:
+        own = touch.pairs[:, 0] < len(lengths)
+        rows, pairs = touch.rows[own], touch.pairs[own]
+        pairs[:, 1] -= before[pairs[:, 0]]
+        kept.add(material, key, SampledTouch(rows[pairs[:, 1] >= 0], pairs[pairs[:, 1] >= 0]))
+    return kept
 
 
 def gone_embedding(path: Path, made: object) -> EmbeddingMismatchError:

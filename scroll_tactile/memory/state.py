@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, only_readings, row_codes, unspanned
 from scroll_tactile.memory.tuned import Tuned
@@ -340,7 +341,8 @@ class Memory:
     def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        self.sample = TouchSample.from_arrays(arrays, attributes["pool"])
+        sample = TouchSample.from_arrays(arrays, attributes["pool"])
+        self.sample = sample_of_windows(sample, attributes["scales"], self.plan)
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))

@@ -15,10 +15,11 @@ from commands import refused, run
 
 from scroll_tactile import Augmented, Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError
-from scroll_tactile.memory.earlier import is_gone, split_copies
+from scroll_tactile.memory.earlier import is_gone, sample_of_windows, split_copies
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.rows import row_codes, unpack_codes, unpack_windows
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from store import Store
 
 GONE = Path(__file__).parents[1] / "data" / "gone"
@@ -158,6 +159,30 @@ class TestIdentity:
             assert learner.materials == {"a": 1}
         with pytest.raises(EmbeddingMismatchError):
             TactileLearner.open(tmp_path / "m")
+
+
+def test_a_sample_is_read_without_the_rows_of_scales_that_are_gone():
+    """As a memory of a user's own embedding holds it that once declared beginnings and noise."""
+    plan, rng = WindowPlan((15, 37)), np.random.default_rng(0)
+    now, then = TouchSample(), TouchSample()
+    for i, columns in enumerate((12, 20, 30, 60)):
+        pairs = [
+            (stage, place) for stage, n in enumerate(plan.stages(columns)) for place in range(len(plan.judging(n)))
+        ]
+        rows = rng.integers(-9, 9, (len(pairs), 4)).astype(np.int32)
+        now.add("m", bytes([i] * 32), SampledTouch(rows, np.array([(*pair, 3) for pair in pairs])))
+        others = [(stage, 0, 3) for stage, place in pairs if place == 0] + [
+            (len(plan.milestones()), k, 2) for k in (0, 1)
+        ]
+        mixed = np.array([*((stage, place + 1, 3) for stage, place in pairs), *others])
+        order = np.lexsort((mixed[:, 1], mixed[:, 0]))
+        every = np.concatenate([rows, np.full((len(others), 4), 99, np.int32)])
+        then.add("m", bytes([i] * 32), SampledTouch(every[order], mixed[order]))
+    found = sample_of_windows(then, [0, 1, 2, 3, 15, 37], plan)
+    for (*_, touch), (*_, expected) in zip(found, now, strict=True):
+        assert touch.rows.tobytes() == expected.rows.tobytes()
+        assert touch.pairs.tolist() == expected.pairs.tolist()
+    assert sample_of_windows(now, [15, 37], plan) is now
 
 
 class TestRows:

@@ -160,5 +160,5 @@ def _require_readings(store: Store) -> None:
         return
     raise MismatchError(
         f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "
-        "the embedding that made it, or touch again what it knows"
+        "the embedding that made it, where that is gone with the version that had it, or touch again what it knows"
     )

@@ -48,6 +48,13 @@ def test_kept_are_the_rest_and_the_frames_in_contact():
     assert pressed(touch, None) is touch
 
 
+def test_what_frames_in_contact_missed_is_still_known():
+    frames = stream(0, 0, 20, 1, 40).readings.copy()
+    frames[2, 3, 3, 0] = np.nan
+    kept = pressed(validate(frames, SMALL.model_copy(update={"non_finite": "missing"})), "first")
+    assert np.argwhere(kept.mask).tolist() == [[1, 3, 3, 0]]
+
+
 @pytest.mark.parametrize("rest", ["first", REST, None], ids=["first", "given", "none"])
 def test_what_is_kept_is_kept_again(rest):
     kept = pressed(stream(0, *[20, 0, 30] * 60), rest)

@@ -1,0 +1,101 @@
+"""What kept touches say of a touch, and how far that is to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.likelihood import LEVELS, LevelArray, Likelihood, Noise
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A kept touch: its material, its content hash, and its levels, uint8 of shape (C, T)."""
+
+    material: str
+    key: bytes
+    levels: LevelArray
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a set of kept touches says of itself.
+
+    likelihood: its tables. doubt: κ. coherence: how much larger the deviation of a channel's mean from a kept touch's
+    is, squared and times T, than that of a value; 1 for independent noise. energy: how much independent noise touches
+    left out seem to have at most, but for one in twenty, in squared levels.
+    """
+
+    likelihood: Likelihood
+    doubt: float
+    coherence: float
+    energy: float
+
+
+@dataclass(frozen=True)
+class Recollection:
+    """What kept touches say of a touch.
+
+    scores: log-likelihood of each material, times β, in the order of `Recall.materials`, shape (M,): a softmax gives
+    probabilities. noise: what most likely came over it. stuck: the channels that never change, shape (C,).
+    expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
+    trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
+    evidence: the log-likelihood per value beyond that of values drawn at random from the touch's own; not above 0
+    where nothing that is kept explains the touch. surprise: the log-likelihood per value that is lacking to what a
+    touch of the set would have.
+    """
+
+    scores: FloatArray
+    noise: Noise
+    stuck: npt.NDArray[np.bool_]
+    expected: FloatArray
+    trust: float
+    evidence: float
+    surprise: float
+
+    def filled(self, readings: npt.NDArray[np.floating], sensor: Sensor) -> npt.NDArray[np.float32]:
+        """The readings, shape (T, C) in the sensor's unit, with what is missing or stuck as kept touches have it."""
+        low, high = sensor.limits
+        recalled = low + (high - low) * (self.expected.T.astype(np.float32) / np.float32(LEVELS - 1))
+        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(recalled)
+        return np.where(lacking, recalled, readings).astype(np.float32)
+
+
+def shape_of(deviation: FloatArray, seen: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    """Energy and coherence (see Measured) of a touch's deviation, (C, T) in levels, 0 where a value is not seen."""
+    counts = seen.sum(axis=1)
+    energy = float(np.square(deviation).sum()) / max(int(counts.sum()), 1)
+    if not energy:
+        return 0.0, 1.0
+    together = float((np.square(deviation.sum(axis=1)) / np.maximum(counts, 1)).sum()) / np.count_nonzero(counts)
+    return energy, together / energy
+
+
+def independent(energy: float, coherence: float, natural: float) -> float:
+    """The energy σ² of independent noise in a deviation of some energy v and coherence w.
+
+    natural: the coherence of natural deviations, of which the rest is made: w v = σ² + natural · (v − σ²).
+    """
+    if natural <= 1:
+        return energy
+    return energy * min(max((natural - coherence) / (natural - 1), 0.0), 1.0)
+
+
+def trust_in(energy: float, coherence: float, measured: Measured) -> float:
+    """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² that of touches without any."""
+    noise = independent(energy, coherence, measured.coherence)
+    return noise**2 / (noise**2 + measured.energy**2) if noise else 0.0
+
+
+def by_chance(levels: LevelArray) -> float:
+    """The mean log-likelihood of values drawn from their own frequencies: minus their entropy; 0 of none."""
+    shares = np.bincount(levels, minlength=LEVELS) / max(len(levels), 1)
+    shares = shares[shares > 0]
+    return float((shares * np.log(shares)).sum())

@@ -1,0 +1,70 @@
+"""Tables of what noise makes of a level, against draws of the same noise."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
+from scroll_tactile.sensors import Sensor
+
+NOISES = [CLEAN, Noise(400), Noise(784), Noise(920), Noise(12, True), Noise(34, True)]
+
+
+@pytest.fixture(scope="module")
+def likelihood():
+    return Likelihood(1 + 0.05 * np.arange(LEVELS), np.ones(LEVELS))
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_each_level_becomes_some_level_with_certainty(likelihood, noise):
+    chances = np.exp(likelihood.table(noise).logs.reshape(256, 256)[:LEVELS, :LEVELS] / UNIT)
+    assert np.allclose(chances.sum(axis=0), 1, atol=2e-3)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_chances_are_those_of_draws(likelihood, noise, draws=200_000):
+    rng, reach = np.random.default_rng(0), noise.amplitude * (LEVELS - 1)
+    table = likelihood.table(noise)
+    for x in (0, 3, 90, 254):
+        natural = x + rng.normal(size=draws) * likelihood.spread[x]
+        added = rng.normal(size=draws) * reach / 3**0.5 if noise.normal else rng.uniform(-reach, reach, draws)
+        drawn = np.rint(np.clip(natural + added, 0, LEVELS - 1)).astype(int)
+        logs = table.logs[256 * drawn + x] / UNIT
+        assert logs.mean() == pytest.approx(table.expected[x], abs=0.02)
+        assert drawn.mean() == pytest.approx(table.mean[x], abs=0.5)
+        seen = np.bincount(drawn, minlength=LEVELS) / draws
+        assert np.abs(seen - np.exp(table.logs.reshape(256, 256)[:LEVELS, x] / UNIT)).max() < 0.01
+
+
+def test_what_is_missing_says_nothing(likelihood):
+    logs = likelihood.table(Noise(784)).logs.reshape(256, 256)
+    assert not logs[MISSING].any()
+    assert not logs[:, MISSING].any()
+
+
+def test_noise_hides_how_touches_differ(likelihood):
+    certainty = [
+        likelihood.table(noise).certainty for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
+    ]
+    assert certainty[0] == pytest.approx(1, abs=0.3)
+    assert certainty == sorted(certainty, reverse=True)
+    assert certainty[-1] < 0.01
+
+
+def test_only_the_latest_tables_are_kept(likelihood):
+    first = likelihood.table(Noise(0)).logs
+    for step in range(1, MOST_TABLES + 2):
+        likelihood.table(Noise(step))
+    assert likelihood.table(Noise(0)).logs is not first
+    assert np.array_equal(likelihood.table(Noise(0)).logs, first)
+
+
+def test_neighbours_of_a_noise_stay_between_the_least_and_the_whole_range():
+    assert CLEAN.near(1) == [CLEAN]
+    assert Noise(1).near(1) == [Noise(0), Noise(1), Noise(2), Noise(3)]
+    assert all(0.009 < near.amplitude < 1.01 for near in Noise(923).near(8))
+
+
+def test_levels_of_readings():
+    sensor = Sensor(name="s", channels=2, rate=10, low=(0, -1), high=(254, 1), unit="", duration=1)
+    readings = np.array([[0, -1], [127, 0], [254, 1], [300, -np.inf], [np.nan, 0.5]])
+    assert levels_of(readings, sensor).tolist() == [[0, 127, 254, 254, MISSING], [0, 127, 254, 0, 190]]

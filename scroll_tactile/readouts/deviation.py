@@ -23,6 +23,7 @@ FEWEST = 8  # touches left out; of fewer nothing is measured
 ASSUMED = (30.0, 10.0, 10.0)  # doubt, coherence and energy then: about what RoboSkin's and BioTac's touches have
 DOUBTS = 2.0 ** np.arange(0.0, 12.0, 0.5)
 USUAL = 0.95  # of touches left out: the odd one of them is noisy itself
+EVEN = 2.0  # times the amplitude of those: where trust is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
 
@@ -80,13 +81,16 @@ def _measured(recall: Recall, likelihood: Likelihood) -> Measured:
     apart = [recall.apart(row) for row in rows]
     place = {name: i for i, name in enumerate(recall.materials)}
     own = [place[recall.kept[row].material] for row in rows]
-    steep = 1 / (1 + DOUBTS * likelihood.table(CLEAN).certainty)
-    losses = [_losses(logs, labels == target, steep) for (logs, labels, *_), target in zip(apart, own, strict=True)]
+    certainty = likelihood.table(CLEAN).certainty
+    losses = [
+        _losses(logs, labels == target, 1 / (1 + DOUBTS * certainty * share))
+        for (logs, labels, share, *_), target in zip(apart, own, strict=True)
+    ]
     doubt = DOUBTS[np.argmin(np.sum(losses, axis=0))] if len(place) > 1 else ASSUMED[0]
-    shapes = [shape for _, _, *shape in apart]
+    shapes = [shape for _, _, _, *shape in apart]
     natural = float(np.median([coherence for _, coherence in shapes]))
     noise = [independent(energy, coherence, natural) for energy, coherence in shapes]
-    most = float(np.quantile(noise, USUAL))
+    most = EVEN**2 * float(np.quantile(noise, USUAL))
     return Measured(likelihood, float(doubt), natural, max(most, ROUNDING))
 
 

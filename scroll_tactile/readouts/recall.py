@@ -6,8 +6,8 @@ A mean over windows forgets where a reading passes the noise's edge; kept touche
 
 The sum is over all values that were read. A channel that never changes says nothing of its own and is left out, as are
 values that are missing. Beside the kept touches of a material stand blends of those that are likely: what is felt lies
-between them. β is one number, κ, of the set: readings near each other deviate together, the more of it the less noise
-hides them, so β = 1 / (1 + κ · certainty).
+between them. Values near each other deviate together, so that β = 1 / (1 + κ · certainty · share of the values): small
+where noise does not hide it. κ is measured on touches left out.
 
 All is a function of the set of kept touches, in any order.
 """
@@ -30,7 +30,7 @@ FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 SHORTLIST = 64  # kept touches that are compared value by value; with all 800 no more is right
-BLOCK_VALUES = 4800  # means of a kept touch that the shortlist is made by: four bytes each
+BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by: four bytes each
 FIRST = 3  # candidates for each rough amplitude, and for the finer ones
 FIRST_VALUES = 1000  # of a touch, by which the rough amplitude is found
 ROUGH = (CLEAN, *(Noise(step) for step in (420, 632, 784, 880)))
@@ -48,6 +48,11 @@ class _Asked:
     seen: npt.NDArray[np.bool_]
     stuck: npt.NDArray[np.bool_]
     values: int
+
+    @property
+    def share(self) -> float:
+        """The part of the values that count."""
+        return self.values / self.levels.size
 
 
 class Recall:
@@ -73,9 +78,8 @@ class Recall:
         self._edges = np.linspace(0, self.longest, blocks + 1).astype(np.intp)
         self._levels = np.full((len(self.kept), self.channels * self.longest), MISSING, dtype=np.uint8)
         self._blocks = np.empty((len(self.kept), self.channels * blocks), dtype=np.float32)
-        self._known = np.empty((len(self.kept), self.channels * blocks), dtype=np.bool_)
         self._place(before)
-        self._whole = bool(self._known.all() and (self._levels != MISSING).all())
+        self._whole = not bool((self._levels == MISSING).any())
         shape = (len(self.kept), self.channels, blocks)
         self._squares = np.einsum("ncb,ncb->nc", self._blocks.reshape(shape), self._blocks.reshape(shape))
         self.measured = measured
@@ -85,15 +89,14 @@ class Recall:
         same = before is not None and (before.channels, before.longest) == shape
         old = {touch.key: row for row, touch in enumerate(before.kept)} if before is not None and same else {}
         for row, touch in enumerate(self.kept):
+            levels = self._levels[row].reshape(shape)[:, : touch.levels.shape[1]]
+            levels[:] = touch.levels
+            self.kept[row] = Kept(touch.material, touch.key, levels)  # what was given need not be kept twice
             if before is not None and touch.key in old:
-                source = old[touch.key]
-                self._levels[row], self._blocks[row] = before._levels[source], before._blocks[source]
-                self._known[row] = before._known[source]
-                continue
-            levels = self._levels[row].reshape(shape)
-            levels[:, : touch.levels.shape[1]] = touch.levels
-            means, known = self._means(levels, levels != MISSING)
-            self._blocks[row], self._known[row] = means.ravel(), known.ravel()
+                self._blocks[row] = before._blocks[old[touch.key]]
+            else:
+                whole = self._levels[row].reshape(shape)
+                self._blocks[row] = self._means(whole, whole != MISSING)[0].ravel()
 
     def followed(self, added: Iterable[Kept], removed: Iterable[bytes] = ()) -> Recall:
         """The same with touches added, and others removed by their keys; what was measured stays.
@@ -118,12 +121,12 @@ class Recall:
                 noise, logs = finer, self._logs(rows, asked, finer)
         return self._told(asked, rows, logs, noise, levels.shape[1])
 
-    def apart(self, row: int) -> tuple[FloatArray, npt.NDArray[np.intp], float, float]:
-        """A kept touch against the others, without noise: log-likelihoods, their materials, energy and coherence."""
+    def apart(self, row: int) -> tuple[FloatArray, npt.NDArray[np.intp], float, float, float]:
+        """A kept touch against the others, without noise: log-likelihoods, materials, share, energy, coherence."""
         asked = self._asked(self._levels[row].reshape(self.channels, -1))
         rows = self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0]
         logs = self._logs(rows, asked, CLEAN)
-        return logs, self._labels[rows], *shape_of(*self._deviation(asked, rows[np.argmax(logs)], CLEAN))
+        return logs, self._labels[rows], asked.share, *shape_of(*self._deviation(asked, rows[np.argmax(logs)], CLEAN))
 
     def nearest(self, row: int) -> tuple[LevelArray, LevelArray] | None:
         """The levels of a kept touch and of the nearest other one of its material; None where there is no other."""
@@ -176,9 +179,14 @@ class Recall:
         square = np.einsum("nd,nd->n", blocks, blocks)[:, None]
         if self._whole:
             return np.asarray(square - 2 * (blocks @ guess.T))
-        both = self._known[:, columns].astype(np.float32)
+        both = self._read()[:, columns].astype(np.float32)
         far = square - 2 * (blocks @ guess.T) + both @ np.square(guess).T
         return np.asarray(far / np.maximum(both.sum(axis=1, keepdims=True), 1))
+
+    def _read(self) -> npt.NDArray[np.bool_]:
+        """Whether a kept touch has any value in a block, (touches, blocks)."""
+        values = (self._levels != MISSING).reshape(len(self.kept), self.channels, self.longest)
+        return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self.kept), -1)
 
     def _logs(self, rows: Rows, asked: _Asked, noise: Noise, values: slice | Rows = slice(None)) -> FloatArray:
         """Log-likelihood of the touch by each of some kept ones; by the same number of values, where some lack."""
@@ -228,7 +236,7 @@ class Recall:
 
     def _told(self, asked: _Asked, rows: Rows, logs: FloatArray, noise: Noise, columns: int) -> Recollection:
         table, measured = self.measured.likelihood.table(noise), self.measured
-        steep = 1 / (1 + measured.doubt * table.certainty)
+        steep = 1 / (1 + measured.doubt * table.certainty * asked.share)
         scores = self._scores(asked, rows, logs, noise, steep)
         expected = np.full((self.channels, columns), np.nan)
         expected[:, : self.longest] = self._mean(rows, np.exp(steep * (logs - logs.max()))[None])[0].reshape(

@@ -29,8 +29,8 @@ class Measured:
     """What a set of kept touches says of itself.
 
     likelihood: its tables. doubt: κ. coherence: how much larger the deviation of a channel's mean from a kept touch's
-    is, squared and times T, than that of a value; 1 for independent noise. energy: how much independent noise touches
-    left out seem to have at most, but for one in twenty, in squared levels.
+    is, squared and times T, than that of a value; 1 for independent noise. energy: of independent
+    noise that is even odds to be natural, in squared levels.
     """
 
     likelihood: Likelihood
@@ -89,7 +89,7 @@ def independent(energy: float, coherence: float, natural: float) -> float:
 
 
 def trust_in(energy: float, coherence: float, measured: Measured) -> float:
-    """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² that of touches without any."""
+    """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² where odds are even."""
     noise = independent(energy, coherence, measured.coherence)
     return noise**2 / (noise**2 + measured.energy**2) if noise else 0.0
 

@@ -147,13 +147,13 @@ def test_stuck_channels_and_missing_values_are_left_out_exactly(recall):
 
 
 def test_scores_are_sums_over_all_values():
-    alone = [one for one in kept(each=1)]
+    alone = kept(each=1)
     recall = recall_of(alone)
     asked = noisy(touch(3, 100), 0.3, 1)
     asked[1, 5:9] = MISSING
     found = recall.recollect(asked)
     table = recall.measured.likelihood.table(found.noise)
-    steep = 1 / (1 + recall.measured.doubt * table.certainty)
+    steep = 1 / (1 + recall.measured.doubt * table.certainty * (1 - 4 / asked.size))
     for place, material in enumerate(recall.materials):
         levels = next(one.levels for one in alone if one.material == material)
         total = sum(int(table.logs[256 * int(y) + int(x)]) for y, x in zip(asked.ravel(), levels.ravel(), strict=True))

@@ -1,5 +1,7 @@
 """Small random touches, memories that observe them, and what such a memory must hold."""
 
+import dataclasses
+
 import numpy as np
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
@@ -9,6 +11,12 @@ SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
 OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in "abc"]
+
+
+class Windowed(Kernels):
+    """Kernels that read windows alone, and no touch as a whole."""
+
+    capabilities = dataclasses.replace(Kernels.capabilities, reads_whole_touches=False)
 
 
 class SmallSample(TouchSample):
@@ -53,9 +61,9 @@ def contents(learner, *, exemplars=True):
     return learner.digest(), learner.exemplars if exemplars else None, pool, answers
 
 
-def require_same(learner, observed, described=(), *, exemplars=True):
+def require_same(learner, observed, described=(), *, exemplars=True, **settings):
     """All that is kept of what was observed is, to the byte, what a memory keeps that observed it in another order."""
-    whole = fed(sorted(observed), described, readout=learner.settings.readout)
+    whole = fed(sorted(observed), described, readout=learner.settings.readout, **settings)
     assert contents(learner, exemplars=exemplars) == contents(whole, exemplars=exemplars)
     assert repr(learner.descriptions) == repr(whole.descriptions)
     if described:

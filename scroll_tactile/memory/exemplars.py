@@ -121,8 +121,8 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
 class Exemplar:
     """A stream with its readings, and what herding needs of it.
 
-    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest scale,
-    int32 of shape (d,). scale: that scale.
+    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest windows,
+    int32 of shape (d,). scale: theirs.
     """
 
     material: str
@@ -134,7 +134,9 @@ class Exemplar:
     @classmethod
     def of(cls, material: str, key: bytes, packed: Arrays, stages: Stages, codes: Codes) -> Exemplar:
         """The exemplar of a stream; stages: those that it reached. codes: its rows by scale, its own first."""
-        return cls(material, key, packed, SampledTouch.of(stages, codes).rows[-1], max(stages[-1]))
+        # Not by a view: f* is trained on windows, and the candidates of compacted memories have no others.
+        windows = [{scale: rows for scale, rows in stage.items() if scale.kind == "window"} for stage in stages]
+        return cls(material, key, packed, SampledTouch.of(windows, codes).rows[-1], max(windows[-1]))
 
     @property
     def readings(self) -> Readings:

@@ -279,7 +279,7 @@ class AbsentEmbedding:
         self.capabilities = Capabilities(
             partial_windows=partial,
             judged_scales=judged,
-            reads_whole_touches=identity.views or kernels,
+            reads_whole_touches=identity.views or (kernels and not identity.gone_copies),
             embeds_windows=True,
             exact=kernels or made.gone,  # mostly; where its readings alone are there, `_made` says what to do
         )

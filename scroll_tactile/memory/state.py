@@ -299,8 +299,10 @@ class Memory:
         newest = store.latest()
         # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count, or
         # has no views, which the rows give that hold readings.
-        scales = list(map(int, self.plan.scales))
-        current = newest is None or ("pool-sums" not in newest.arrays and newest.attributes["scales"] == scales)
+        current = newest is None or (
+            "pool-sums" not in newest.arrays
+            and all(int(scale) in cast("list[int]", newest.attributes["scales"]) for scale in self.plan.scales)
+        )
         earlier = None if current else newest
         start = store.base() if newest is None or earlier is not None else newest
         if start is not None:

@@ -263,10 +263,12 @@ class Model:
         """How far each scale is believed of this touch of so many columns, judged at a stage, given its scores."""
         own = self.stages[stage]
         weights = dict(zip(own, self.calibrations[stage].weights.tolist(), strict=True))
-        if self.whole is None:
+        whole = self._is_whole(stage, columns)
+        # Where no touch could be left out, how strange a beginning looks is not known, and the views cannot be doubted.
+        if self.whole is None or not (whole or np.isfinite(self.whole.usual).all()):
             return weights
         joint = [*self.stages[len(self.calibrations) - 1], *self.views]
-        judging = joint if self._is_whole(stage, columns) else self.views
+        judging = joint if whole else self.views
         strange = np.zeros(len(joint))
         for i, scale in enumerate(joint):
             if scale in judging:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Robust, Vision
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
 from scroll_tactile.embeddings.protocol import embed_windows, is_embedding
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError

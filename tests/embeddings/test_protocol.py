@@ -1,11 +1,14 @@
 """What an embedding declares, and what one that declares nothing is taken for."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from scroll_tactile import Capabilities, Frames, Kernels, TactileLearner, sensors
+from scroll_tactile import Capabilities, Frames, Joined, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, require_rest, window_plan
 from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.signals.windows import SHAPE, WHOLE, whole_columns
 from scroll_tactile.testing import check_embedding
 
 
@@ -60,9 +63,16 @@ def test_windows_are_read_by_the_embedding_itself_only_where_it_declares_so(own)
 
 
 def test_the_plan_of_windows_follows_what_is_declared():
-    plan = window_plan(sensors.BIOTAC, Declaring(Capabilities(False, "widest", 3.0)))
+    plan = window_plan(sensors.BIOTAC, Declaring(Capabilities(False, "widest", shrinkage=3.0)))
     assert (plan.partial, plan.judged, plan.shrinkage) == (False, "widest", 3.0)
-    assert window_plan(sensors.BIOTAC, Plain()) == window_plan(sensors.BIOTAC, Kernels())
+    plain, views = window_plan(sensors.BIOTAC, Plain()), window_plan(sensors.BIOTAC, Kernels())
+    assert plain == dataclasses.replace(views, whole=0)
+    assert (plain.views, views.views) == ((), (WHOLE, SHAPE))
+    joined = Joined(Kernels(dimension=64), Kernels(seed=2, dimension=64))
+    assert window_plan(sensors.BIOTAC, joined) == views
+    assert window_plan(sensors.BIOTAC, Joined(Kernels(dimension=64), Plain())).views == ()
+    assert window_plan(sensors.GELSIGHT, Frames()).views == ()  # of cameras none
+    assert whole_columns(sensors.GELSIGHT) == 0
 
 
 def test_an_embedding_of_frames_is_refused_to_a_sensor_of_channels():

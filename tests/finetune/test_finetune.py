@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from touches import Windowed
 
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
 from scroll_tactile.datasets.simulator import Scene
@@ -22,6 +23,7 @@ from store import Store, StoreError
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
 SCENE = Scene(sensor=PAD)
 NAMES = SCENE.materials[:4]
+
 EMBEDDINGS = {
     "kernels": lambda: Kernels(dimension=64),
     "vision": lambda: Vision(None, seed=0, stages=(1, 2)),
@@ -239,9 +241,9 @@ def test_ridge_can_be_fine_tuned_too_and_the_whole_network(monkeypatch):
     assert whole.embedding.fingerprint == EMBEDDINGS["kernels+vision"]().fingerprint  # a copy was trained
 
 
-def test_the_start_is_f_itself():
+def test_the_start_is_f_itself_as_its_windows_judge():
     for readout in ("lda", "ridge"):
-        learner = learned("kernels", readout=readout)
+        learner = learned("kernels", readout=readout, embedding=Windowed(dimension=64))
         model = learner.model()
         start = training.start_of(model, model.names)
         features = TouchFeatures(learner.embedding, learner.plan)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from touches import Windowed, fed
 
 from examples.benchmarks.buffers import compare
 from scroll_tactile import Kernels, Sensor, TactileLearner
@@ -360,3 +361,11 @@ def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
     assert set(ways) == {"full", "pooled-2", "pooled-3", "pooled-4", "live", "random"}
     assert ways["pooled-3"]["overlap"] == 1
     assert all(0 <= record["tuned"] <= 1 and record["gap"] > 0 for record in ways.values())
+
+
+def test_views_change_no_exemplar():
+    """They are herded by windows, as f* is trained, and as those of memories without views were."""
+    observed = [(name, (seed, readings)) for seed, readings in enumerate((60, 10, 25, 90, 60, 60, 37)) for name in "ab"]
+    windowed = fed(observed, embedding=Windowed(seed=0, dimension=64))
+    assert fed(observed).exemplars == windowed.exemplars
+    assert sum(map(len, windowed.exemplars.values())) == 4 < len(observed)

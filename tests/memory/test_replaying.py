@@ -15,6 +15,7 @@ from store import DamageError, Store
 class OwnKernels(Kernels):
     """An embedding of a user's own, exact: a memory cannot make it, and keeps codes beside the readings."""
 
+    name = "own kernels"
     capabilities = Capabilities(embeds_windows=True, exact=True)
 
 

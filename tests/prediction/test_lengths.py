@@ -2,16 +2,34 @@
 
 import numpy as np
 import pytest
+from touches import Windowed
 
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.embeddings.protocol import window_plan
+from scroll_tactile.prediction.features import FeatureExtractor
 
 SCENE = Scene(sensor=sensors.BIOTAC, seed=3)
 
 
-def test_a_longer_touch_is_read_as_far_as_was_learned():
-    learner = TactileLearner(sensor=sensors.BIOTAC, embedding=Kernels(dimension=64))
+def test_a_longer_touch_is_viewed_whole_and_its_windows_are_read_as_far_as_was_learned():
+    embedding = Kernels(dimension=64)
+    plan = window_plan(sensors.BIOTAC, embedding)
+    features, touch = FeatureExtractor(sensors.BIOTAC, embedding, plan, None), SCENE.touch(SCENE.materials[0], 9)
+    found, part, whole = (
+        features.encode(stream, longest, lambda _: plan.scales)
+        for stream, longest in ((touch, 200), (touch.first(2.0), 200), (touch, 400))
+    )
+    assert (found.columns, found.seconds) == (200, 2.0)
+    for scale in plan.scales:
+        expected = part if scale.kind == "window" else whole
+        assert found.means.get(scale, np.zeros(0)).tobytes() == expected.means.get(scale, np.zeros(0)).tobytes()
+    assert whole.means[plan.views[0]].tobytes() != part.means[plan.views[0]].tobytes()
+
+
+def test_without_views_a_longer_touch_is_read_as_far_as_was_learned():
+    learner = TactileLearner(sensor=sensors.BIOTAC, embedding=Windowed(dimension=64))
     for name in SCENE.materials[:3]:
         for at in range(3):
             learner.observe(name, SCENE.touch(name, at).first(2.0))

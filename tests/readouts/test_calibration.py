@@ -93,7 +93,7 @@ def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
 def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
     """Of n + 1 exchangeable touches the new one lies above rank r with probability (n + 1 − r) / (n + 1)."""
-    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, touches + 1))
+    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, touches + 1), np.ones(1))
     alarms = [Fraction(touches + 1 - rank, touches + 1) for rank in range(1, touches + 1)]
     kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
     # Where not even the largest keeps it, twice that.

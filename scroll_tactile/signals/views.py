@@ -36,10 +36,10 @@ def stretched(image: Image, columns: int) -> Image:
 
 def shape_image(image: Image) -> Image:
     """Changes between columns above deviations from each channel's mean, companded: (C, T) to (2 C, T), in [-1, 1]."""
-    fine = np.rint(image * FINE)
+    fine, columns = np.rint(image * FINE).astype(np.int64), image.shape[1]  # sums of float32 would be rounded
     changes = np.diff(fine, axis=1, prepend=fine[:, :1])
-    deviations = fine - np.rint(fine.sum(axis=1, keepdims=True) / fine.shape[1])
-    return _companded(np.concatenate([changes, deviations]) / FINE)
+    means = (2 * fine.sum(axis=1, keepdims=True) + columns) // (2 * columns)  # halves up, whatever the offset
+    return _companded(np.concatenate([changes, fine - means]) / FINE)
 
 
 def _companded(values: npt.NDArray[np.float64]) -> Image:

@@ -1,6 +1,7 @@
 """What a memory says of its making: it opens from its path alone, with nothing embedded before the first touch."""
 
 import copy
+import dataclasses
 import json
 import pickle
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Augmented, Joined, Kernels, Maps, Sensor, TactileLearner, Vision
-from scroll_tactile.embeddings.protocol import capabilities_of
+from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.prediction.current import CurrentModel
@@ -248,3 +249,31 @@ def prepare(path, embedding, change):
     identity = Identity.of(PAD, embedding, None).to_json()
     change(identity)
     Store.open(path, identity=identity).close()
+
+
+class Windowed(Kernels):
+    """An embedding of a user's own, which reads windows alone."""
+
+    name = "windowed"
+    capabilities = dataclasses.replace(Kernels.capabilities, reads_whole_touches=False)
+
+
+@pytest.mark.parametrize(("embedding", "views"), [(Kernels(dimension=64), True), (Windowed(dimension=64), False)])
+def test_whether_whole_touches_are_read_is_known_without_the_embedding(tmp_path, embedding, views):
+    made = Identity.of(PAD, embedding, 4)
+    assert made.views == views
+    assert made.to_json().get("views", False) == views
+    assert Identity.model_validate(made.to_json()) == made
+    absent = AbsentEmbedding(made, tmp_path)
+    assert absent.capabilities.reads_whole_touches == views
+    assert window_plan(PAD, absent) == window_plan(PAD, embedding)
+
+
+def test_kernels_that_earlier_versions_made_a_memory_with_read_whole_touches_from_now_on(tmp_path):
+    kept = Identity.of(PAD, Kernels(dimension=64), 4).to_json()
+    del kept["views"]
+    before = Identity.model_validate(kept)
+    assert not before.views
+    assert AbsentEmbedding(before, tmp_path).capabilities.reads_whole_touches
+    other = Identity.of(PAD, Means(), 4)
+    assert not AbsentEmbedding(other, tmp_path).capabilities.reads_whole_touches

@@ -4,10 +4,19 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate, fit_weights
+from scroll_tactile.readouts.calibration import (
+    FEWEST,
+    PRIOR_WEIGHT,
+    Calibration,
+    calibrate,
+    calibrate_stage,
+    fit_weights,
+)
 from scroll_tactile.readouts.leave_one_out import left_out
 from scroll_tactile.readouts.readout import Readout, Task
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -153,8 +162,8 @@ def test_a_touch_counts_only_where_every_scale_left_it_out():
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_small_and_dull_memories_calibrate_without_a_warning(kind):
-    for settings in ({"materials": 1, "touches": 1}, {"materials": 2, "touches": 2}, {"noises": (0, 0), "unit": 0}):
-        for stage in calibrated(kind, **settings):
+    for dull in ({"materials": 1, "touches": 1}, {"materials": 2, "touches": 2}, {"noises": (0, 0), "unit": 0}):
+        for stage in calibrated(kind, **dull):
             assert np.isfinite(stage.weights).all()
             assert np.isfinite(stage.threshold(0.05))
             assert np.isfinite(stage.novelty(np.array([1.0] * len(stage.weights))))
@@ -169,3 +178,43 @@ def test_the_order_of_what_was_observed_changes_no_bit():
         assert ours.weights.tobytes() == theirs.weights.tobytes()
         assert ours.scale_novelty.tobytes() == theirs.scale_novelty.tobytes()
         assert ours.novelties.tobytes() == theirs.novelties.tobytes()
+
+
+positive = st.floats(1e-3, 1e6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4), st.floats(0.5, 2))
+def test_a_scale_is_believed_less_the_stranger_a_touch_looks_in_it(scales, power):
+    weights, usual, strange = map(np.array, zip(*scales, strict=True))
+    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), usual)
+    expected = [w if s <= u else w * (u / s) ** power for w, u, s in scales]
+    np.testing.assert_allclose(calibration.believed(strange, power), expected)
+    stranger = calibration.believed(2 * strange + 1, power)
+    assert (stranger <= calibration.believed(strange, power)).all()
+    assert calibration.believed(np.stack([strange, strange]), power).shape == (2, len(weights))
+    undoubted = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), np.full(len(weights), np.inf))
+    assert undoubted.believed(strange, power).tolist() == weights.tolist()
+
+
+@pytest.mark.parametrize("kind", ["lda", "ridge"])
+def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_will_be(kind):
+    statistics, sample = scene(noises=(20_000, 60_000), touches=60)
+    readouts = [Readout(Task.of(statistics, scale, statistics.names(scale)), statistics) for scale in SCALES]
+    apart = [left_out(readout, sample, STAGES, kind) for readout in readouts]
+    materials = [material for material, *_ in sample]
+    scales = list(zip(readouts, apart, strict=True))
+    plain, viewed = (calibrate_stage(1, materials, scales, kind, viewed=flag) for flag in (False, True))
+    assert np.isinf(plain.usual).all()
+    strange = np.array([[left.strangeness[left.rows[i, 1]] for left in apart] for i in range(60)])
+    assert viewed.usual.tolist() == np.median(strange, axis=0).tolist()
+    scores = np.array([[left.scores[left.rows[i, 1]] for left in apart] for i in range(60)])
+    doubted = scores * np.minimum(1, viewed.usual / strange)[:, :, None]
+    targets = [apart[0].names.index(material) for material in materials]
+    prior = np.full(2, PRIOR_WEIGHT[kind] / 2)
+    np.testing.assert_allclose(viewed.weights, fit_weights(doubted, targets, prior), rtol=1e-9)
+    # The windows' own novelty is left to the views.
+    near, by_first, by_second = np.array([3.0, 5.0]), np.array([10.0, 5.0]), np.array([3.0, 12.0])
+    assert viewed.novelty(near) == viewed.novelty(by_first) != viewed.novelty(by_second)
+    assert plain.novelty(near) != plain.novelty(by_first)
+    assert np.std(viewed.novelties) == pytest.approx(1, abs=1e-6)

@@ -66,6 +66,8 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     total = Fraction(int(statistics.second(SCALE).rows))
     excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
     places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
+    every = Dense(groups_of(touches), readout.penalty, readout.share)
+    variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
     judged = set()
     for i, (material, key, rows, _) in enumerate(touches):
         rest = [other for j, other in enumerate(touches) if i != j]
@@ -81,6 +83,9 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
                 scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
             require_near(found.scores[place], scores)
             require_near(found.distances[place], dense.distances(row, reference))
+            best = dense.means[reference[int(found.scores[place].argmax())]]
+            away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
+            require_near(found.strangeness[place], sum(a**2 / v for a, v in zip(away, variances, strict=True)))
     assert found.rows.keys() == judged
     assert sorted(found.rows.values()) == list(range(len(found.scores)))
 
@@ -108,7 +113,7 @@ def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(k
     task = Task.of(statistics, SCALE, ["a", "b"])
     found = left_out(Readout(task, statistics), sample, STAGES, kind)
     assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
-    assert found.scores.shape == found.z.shape == found.distances.shape == (4, 2)
+    assert found.scores.shape == found.z.shape == found.distances.shape == (*found.strangeness.shape, 2) == (4, 2)
     alone, none = learned(touches[2:])
     task = Task.of(alone, SCALE, ["b"])
     empty = left_out(Readout(task, alone), none, STAGES, kind)

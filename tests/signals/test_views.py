@@ -1,5 +1,6 @@
 """Views of a whole touch: the same bits whatever the order, the offset, the machine."""
 
+import itertools
 from fractions import Fraction
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_the_shape_is_changes_and_deviations_from_the_mean_companded(steps):
     found = shape_image(image_of(steps))
     assert found.dtype == np.float32
     rows = [row.tolist() for row in steps]
-    changes = [[0, *(after - before for before, after in zip(row, row[1:], strict=False))] for row in rows]
+    changes = [[0, *(after - before for before, after in itertools.pairwise(row))] for row in rows]
     means = [Fraction(sum(row), len(row)) + Fraction(1, 2) for row in rows]
     deviations = [[value - mean.__floor__() for value in row] for row, mean in zip(rows, means, strict=True)]
     expected = np.array([[companded(value) for value in row] for row in changes + deviations])

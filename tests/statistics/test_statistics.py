@@ -264,3 +264,31 @@ def test_fewer_touches_of_as_many_rows_do_not_contain_more():
         part.add("wool", {5: np.ones((1, 3), np.int32)})
     with pytest.raises(InputError, match="contain"):
         whole - part
+
+
+lengths = st.lists(st.sampled_from([1, 2, 9, 9, 40, 50, 400, 10**6]), max_size=60)
+
+
+@few
+@given(lengths, lengths)
+def test_the_usual_least_is_the_length_that_nineteen_of_twenty_touches_have(first, second):
+    def observed(columns):
+        statistics = Statistics(DIMENSION, SCALES)
+        for i, length in enumerate(columns):
+            statistics.add("ab"[i % 2], {5: np.zeros((1, DIMENSION), np.int32)}, length)
+        return statistics
+
+    def least(columns):
+        """The longest one that no more than one of twenty is shorter than, or any at all, where twenty are too few."""
+        had = [length for length in columns if 20 * sum(other < length for other in columns) < len(columns)]
+        return max(had, default=0)
+
+    a, b = observed(first), observed(second)
+    assert a.usual_least == least(first)
+    assert (a + b).usual_least == least(first + second)
+    assert ((a + b) - b).usual_least == least(first)
+    arrays, names = a.to_arrays()
+    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).usual_least == least(first)
+    for i, length in enumerate(first[:5]):
+        a.remove("ab"[i % 2], {5: np.zeros((1, DIMENSION), np.int32)}, length)
+    assert a.usual_least == least(first[5:])

@@ -57,7 +57,7 @@ def contents(learner, *, exemplars=True):
     """Digest, exemplars, pool and answers, to the byte."""
     pool = [(name, key, touch.rows.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
     learner.settle()
-    answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60))]
+    answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60), (9, 300))]
     return learner.digest(), learner.exemplars if exemplars else None, pool, answers
 
 

@@ -28,7 +28,7 @@ from scroll_tactile.errors import InputError, MismatchError
 from store import check_store
 
 MATERIALS = ("a", "b", "c", "ü")
-LENGTHS = (9, 16, 25, 40, 60, 90, 90)  # the widest scale needs 37, a fine-tune some of two materials
+LENGTHS = (2, 16, 25, 40, 60, 90, 120)  # the widest scale needs 37, a fine-tune some of two materials
 
 Touch = tuple[int, int]
 Constituents = tuple[tuple[str, float | bool | None], ...]

@@ -60,6 +60,8 @@ class History(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), rng=randoms)
     def change(self, kind: str, rng: Any) -> None:
+        if kind == "fine_tune" and self.learner.settings.readout != "lda":  # from which the model's f* starts
+            self.reopen("lda")
         self.do(draw(rng, self.state, self.others, kind))
         assert unsound_copies(self.path, [self.state]) == []
 

@@ -92,3 +92,11 @@ def test_a_compacted_one_comes_into_one_with_views(before, tmp_path):
         again.forget("a")
         again.observe("old", stream((40, 60)))
         assert again.model().views != []
+
+
+@pytest.mark.parametrize("keep", [None, 0, 5])
+def test_a_fine_tune_leaves_it_as_it_was(before, keep):
+    with TactileLearner.open(before(keep=keep)) as learner:
+        digest, found = learner.digest(), answers(learner)
+        assert learner.fine_tune(epochs=1).digest == learner.tuned_digest()
+        assert (learner.digest(), answers(learner)) == (digest, found)

@@ -35,9 +35,10 @@ def export_plain(
 
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
       (learned from, features given up), retracted. Only where the memory has a path.
-    - `statistics.npz`: `materials`; for each scale (a width of windows) of its rows, of which a touch adds one at each
-      stage that the scale judges at (of a camera one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d)
-      and `second-<scale>` Σ x xᵀ, int64 (d, d), of features x in units of bound · 2⁻²⁰.
+    - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
+      see `signals.views`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
+      one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
+      of features x in units of bound · 2⁻²⁰.
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
     - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given. Only
       where anything was described.

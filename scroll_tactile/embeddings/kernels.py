@@ -6,13 +6,15 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.blas import one_thread
 from scroll_tactile.embeddings.banks import (
     LEVELS,
+    ROUND,
     TAPS,
     Bank,
     bank,
@@ -20,14 +22,11 @@ from scroll_tactile.embeddings.banks import (
     to_levels,
     triangle_features,
     window_statistics,
+    workspace,
 )
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.runtimes import one_torch_thread
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = ["LEAST_FEATURES", "MOST_FEATURES", "Kernels", "angles"]
 
@@ -136,23 +135,25 @@ class Kernels:
     def _read(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]]
     ) -> dict[int, npt.NDArray[np.float32]]:
-        import torch
-
         channels, readings = levels.shape
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
-        image = torch.from_numpy(np.ascontiguousarray(levels))
         plans = {width: _plan(channels, self._proportions(width), width) for width in windows}
-        # No autocast, whatever the caller's program does: shortened floats would round our integers.
-        with torch.inference_mode(), torch.autocast("cpu", enabled=False), one_torch_thread():
-            for dilation in _dilations(max(windows)):
-                uses = {w: p.count for w, plan in plans.items() for p in plan if p.dilation == dilation}
-                where = tuple((min(width, readings), windows[width]) for width in uses)
-                counts = _counts(bank(self.seed, channels, dilation), image, max(uses.values()), readings, where)
+        uses = {
+            dilation: {w: part.count for w, plan in plans.items() for part in plan if part.dilation == dilation}
+            for dilation in _dilations(max(windows))
+        }
+        counts = tuple((dilation, max(of.values())) for dilation, of in uses.items())
+        with one_thread():
+            banks = _banks(self.seed, channels, counts)
+            np.matmul(banks.channels, levels, out=workspace.array("sums", len(banks.channels), readings))
+            for (dilation, count), of, rows in zip(counts, uses.values(), banks.rows, strict=True):
+                where = tuple((min(width, readings), windows[width]) for width in of)
+                found = _counts(bank(self.seed, channels, dilation), rows, readings, count, where)
                 first = 0
-                for width, count in uses.items():
+                for width, features in of.items():
                     last = first + len(windows[width])
                     places = min(width, readings) - (TAPS - 1) * dilation
-                    pooled[width].append(angles(places)[counts[first:last, :count]])
+                    pooled[width].append(angles(places)[found[first:last, :features]])
                     first = last
             for width, starts in windows.items():
                 if self._proportions(width) == self.dimension:
@@ -197,38 +198,54 @@ def _plan(channels: int, features: int, width: int) -> list[Part]:
     return [Part(dilation, int(count)) for dilation, count in zip(dilations, counts, strict=True) if count]
 
 
+@dataclass(frozen=True)
+class Banks:
+    """The channels of several banks below each other, for one product with an image, and the rows of each."""
+
+    channels: npt.NDArray[np.float32]
+    rows: list[slice]
+
+
+@lru_cache(maxsize=16)  # of at most 0.3 MB each
+def _banks(seed: int, channels: int, counts: tuple[tuple[int, int], ...]) -> Banks:
+    """Of each dilation's bank the rounds that so many features need."""
+    parts, rows, last = [], [], 0
+    for dilation, count in counts:
+        part = bank(seed, channels, dilation)
+        parts.append(part.channels[: -(-min(count, len(part)) // ROUND) * ROUND])
+        first, last = last, last + len(parts[-1])
+        rows.append(slice(first, last))
+    return Banks(np.concatenate(parts), rows)
+
+
 def _counts(
     kernels: Bank,
-    image: torch.Tensor,
-    count: int,
+    rows: slice,
     readings: int,
+    count: int,
     where: tuple[tuple[int, tuple[int, ...]], ...],
 ) -> npt.NDArray[np.int64]:
-    """How often each feature's threshold is exceeded in each window: integers of shape (windows, count)."""
-    import torch
+    """How often each feature's threshold is exceeded in each window: integers of shape (windows, count).
 
-    rounds = -(-count // len(kernels))
-    responses = kernels.respond(min(count, len(kernels)), image)
-    exceeded = torch.empty((count, responses.shape[1]), dtype=torch.float32, device="cpu")
-    for i in range(rounds):
-        first = i * len(kernels)
+    rows: of the sums that the workspace has, those of the bank's kernels.
+    """
+    responses = workspace.respond(rows, readings, kernels.dilation)
+    exceeded = workspace.array("exceeded", count, responses.shape[1])
+    for first in range(0, count, len(kernels)):
         size = min(len(kernels), count - first)
-        thresholds = kernels.thresholds[i, :size, None]
-        torch.gt(responses[:size], thresholds, out=exceeded[first : first + size])
-    counted = _pooling(readings, kernels.dilation, where) @ exceeded.T
-    integers: npt.NDArray[np.int64] = counted.numpy().astype(np.int64)
-    return integers
+        thresholds = kernels.thresholds[first // len(kernels), :size, None]
+        np.copyto(exceeded[first : first + size], responses[kernels.rows[:size]] > thresholds)
+    counted = exceeded @ _pooling(readings, kernels.dilation, where)
+    return counted.T.astype(np.int64)
 
 
 @lru_cache(maxsize=16)  # of at most 1 MB each
-def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> torch.Tensor:
-    """0/1 matrix of shape (windows, positions): which of the convolution's positions lie within a window."""
-    import torch
-
+def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> npt.NDArray[np.float32]:
+    """0/1 matrix of shape (positions, windows): which of the convolution's positions lie within a window."""
     span = (TAPS - 1) * dilation
-    place = torch.arange(readings - span, device="cpu")
+    place = np.arange(readings - span)
     columns = [(place >= start) & (place < start + width - span) for width, starts in where for start in starts]
-    return torch.stack(columns).float()
+    return np.stack(columns, axis=1).astype(np.float32)
 
 
 @lru_cache(maxsize=1024)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from functools import lru_cache
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import ThreadpoolController
 
+from scroll_tactile.blas import one_thread
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.statistics.grid import BITS, mean_code
 
@@ -24,50 +20,6 @@ MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass in
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
 MANY = 1024  # classes
-
-
-@lru_cache(maxsize=1)
-def _libraries() -> list[tuple[Any, Callable[[int], None]]]:
-    """The BLAS libraries of this process, and what sets the threads of each."""
-    found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
-    # From version 3.8 on, threadpoolctl lets one thread alone set them, the first that ever did, and answers to others
-    # by doing nothing; here whoever is inside is counted, of all threads, so its guard is passed by.
-    return [(library, getattr(library, "_real_set_num_threads", library.set_num_threads)) for library in found]
-
-
-class _Limit:
-    """The limit of BLAS to one thread, which is the whole process's, and those that need it."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._inside = 0
-        self._before: list[tuple[Callable[[int], None], int]] = []
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._before = [(put, library.num_threads) for library, put in _libraries()]
-                for put, _ in self._before:
-                    put(1)
-            self._inside += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if not self._inside:
-                for put, count in self._before:
-                    put(count)
-
-
-_LIMIT = _Limit()
-
-
-def one_thread() -> AbstractContextManager[None]:
-    """Run BLAS on one thread: on busy cores two made a 2 ms Cholesky take up to 439 ms.
-
-    The limit holds for the whole process until the last of those that asked for it, of whatever thread, has left.
-    """
-    return _LIMIT
 
 
 def _rows_of_triangle(dimension: int) -> Iterator[tuple[int, slice]]:

@@ -42,7 +42,7 @@ def test_the_fingerprints_of_memories_that_exist(embedding, fingerprint):
 
 
 def test_the_default_kernels_thresholds():
-    thresholds = bank(1, 3, 1).thresholds.numpy()
+    thresholds = bank(1, 3, 1).thresholds
     assert thresholds[:, 0].tolist() == THRESHOLDS
     assert thresholds.shape == (24, 378)
 

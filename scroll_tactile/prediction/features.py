@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,8 +84,15 @@ class FeatureExtractor:
         }
 
     def _stage_rows(self, image: Image) -> Codes:
-        windows = {scale: to_codes(rows, self._embedding.bound) for scale, rows in self.features(image).items()}
-        return stage_rows(self._plan.scored_stages(image.shape[1]), windows)
+        stages, places = self._plan.scored_stages(image.shape[1]), self._plan.places(image.shape[1])
+        features = self.features(image, places=places)
+        codes = {scale: to_codes(rows, self._embedding.bound) for scale, rows in features.items()}
+        among = {scale: {place: i for i, place in enumerate(chosen)} for scale, chosen in places.items()}
+        groups = [
+            {scale: [[among[scale][place] for place in group] for group in stage[scale]] for scale in stage}
+            for stage in stages
+        ]
+        return stage_rows(groups, codes)
 
     def encode(self, stream: Stream, longest: int, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
@@ -104,17 +111,27 @@ class FeatureExtractor:
         places = self._plan.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error here.
         return {
-            scale: in_units(rows[places[scale]], self._embedding.bound).mean(axis=0)
-            for scale, rows in self.features(image, scales, whole).items()
+            scale: in_units(rows, self._embedding.bound).mean(axis=0)
+            for scale, rows in self.features(image, scales, whole, places).items()
         }
 
     def features(
-        self, image: Image, scales: Sequence[Scale] | None = None, whole: Image | None = None
+        self,
+        image: Image,
+        scales: Sequence[Scale] | None = None,
+        whole: Image | None = None,
+        places: Mapping[Scale, Sequence[int]] | None = None,
     ) -> dict[Scale, npt.NDArray[np.floating]]:
-        """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales."""
+        """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
+
+        places: of the windows of each scale, those that are embedded; all unless given. Of the many with which a touch
+        begins, half are never scored.
+        """
         wanted = self._plan.scales if scales is None else scales
         extent = self._plan.extent(image.shape[1])
         windows = {scale: extent[scale.width] for scale in wanted if scale.width in extent}
+        if places is not None:
+            windows = {scale: [starts[place] for place in places[scale]] for scale, starts in windows.items()}
         views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
         width = self._plan.whole
         if WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:

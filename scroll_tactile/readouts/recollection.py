@@ -28,13 +28,12 @@ class Kept:
 class Measured:
     """What a set of kept touches says of itself.
 
-    likelihood: its tables. doubt: κ. coherence: how much larger the deviation of a channel's mean from a kept touch's
+    likelihood: its tables. coherence: how much larger the deviation of a channel's mean from a kept touch's
     is, squared and times T, than that of a value; 1 for independent noise. energy: of independent
     noise that is even odds to be natural, in squared levels.
     """
 
     likelihood: Likelihood
-    doubt: float
     coherence: float
     energy: float
 
@@ -43,8 +42,9 @@ class Measured:
 class Recollection:
     """What kept touches say of a touch.
 
-    scores: log-likelihood of each material, times β, in the order of `Recall.materials`, shape (M,): a softmax gives
-    probabilities. noise: what most likely came over it. stuck: the channels that never change, shape (C,).
+    scores: log-likelihood of each material, in the order of `Recall.materials`, shape (M,).
+    certainty: how far noise leaves it to be seen that values near each other deviate together, 1 of a clean touch.
+    noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
     trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
     evidence: the log-likelihood per value beyond that of values drawn at random from the touch's own; not above 0
@@ -53,6 +53,7 @@ class Recollection:
     """
 
     scores: FloatArray
+    certainty: float
     noise: Noise
     stuck: npt.NDArray[np.bool_]
     expected: FloatArray

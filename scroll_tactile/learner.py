@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
@@ -19,7 +20,8 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, windo
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars
+from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars, usual_recall
+from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
 from scroll_tactile.memory.reembed import finish_interrupted
@@ -29,6 +31,7 @@ from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.model import Draft, Model, enough_memory
+from scroll_tactile.prediction.recalling import judged
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -62,7 +65,7 @@ class TactileLearner:
     sensor: whose streams it reads. embedding: the frozen features; `Kernels()` unless given, and `Frames()` for a
     camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
     augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
-    settings: readout, false_alarms and exemplars, by name; see `scroll_tactile.settings.Settings`.
+    settings: readout, false_alarms, recall and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
     any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
@@ -83,7 +86,8 @@ class TactileLearner:
         chosen = usual_embedding(sensor) if embedding is None else embedding
         given = Settings(**settings)
         exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
-        self._set_up(sensor, chosen, augmentation, given, exemplars)
+        recall = usual_recall(sensor, chosen) if given.recall is None else given.recall
+        self._set_up(sensor, chosen, augmentation, given, exemplars, recall)
         self._ledger = Ledger(self._empty_memory)
 
     def _set_up(
@@ -93,11 +97,12 @@ class TactileLearner:
         augmentation: Augmented | None,
         settings: Settings,
         exemplars: int,
+        recall: int,
     ) -> None:
         self._sensor = sensor
         self._embedding = embedding
         self._augmentation = augmentation
-        self._settings = settings.model_copy(update={"exemplars": exemplars})
+        self._settings = settings.model_copy(update={"exemplars": exemplars, "recall": recall})
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
@@ -106,7 +111,8 @@ class TactileLearner:
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self) -> Memory:
-        return Memory(self._embedding.dimension, self._plan, self._settings.exemplars or 0)
+        keeping = Keeping(self._sensor, self._settings.recall or 0)
+        return Memory(self._embedding.dimension, self._plan, self._settings.exemplars or 0, keeping=keeping)
 
     @classmethod
     def open(
@@ -133,7 +139,7 @@ class TactileLearner:
         finish_interrupted(Path(path))
         if sensor is None and not Path(path).exists():
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, mode)
+        store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.recall, mode)
         try:
             identity = Identity.read(store)
             identity.require_current(store.path, embedding, mode)
@@ -146,11 +152,13 @@ class TactileLearner:
                 identity.require_embedding(store.path, found)
             exemplars = identity.exemplar_count(store, chosen.exemplars)
             learner = cls.__new__(cls)
-            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars)
+            keeping = identity.keeping(store.path, found, chosen.recall)
+            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars, keeping.capacity)
             learner._unverified = (identity, store.path) if embedding is None else None
             bare = identity.embedding.bare
             plan, encode = learner._plan, learner._codes_of if bare or capabilities_of(found).exact else None
-            learner._ledger = Ledger(lambda: Memory.load(store, found.dimension, plan, exemplars, encode), store, bare)
+            load = partial(Memory.load, store, found.dimension, plan, exemplars, encode, keeping)
+            learner._ledger = Ledger(load, store, bare)
         except BaseException:
             store.close()
             raise
@@ -172,7 +180,7 @@ class TactileLearner:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
-        self._set_up(sensor, embedding, augmentation, settings, settings.exemplars)
+        self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.recall)
         self._unverified, self._snapshot_of = state["unverified"], state["of"]
         self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]))
         logger.info("a snapshot of %s, in memory only", state["of"])
@@ -369,7 +377,7 @@ class TactileLearner:
                 carried.copy(progress or _silent)
                 self.close()
                 before = carried.put_in_place()
-                own: dict[str, Any] = self._settings.model_dump(exclude={"exemplars"})
+                own: dict[str, Any] = self._settings.model_dump(exclude={"exemplars", "recall"})
                 self.__dict__.update(type(self).open(store.path, embedding=chosen, **own).__dict__)
         finally:
             carried.close()
@@ -492,7 +500,10 @@ class TactileLearner:
         self, model: Model, candidates: Sequence[str], encoded: Encoded, logits: Mapping[str, float] | None
     ) -> Prediction:
         with one_thread():
-            judgement = model.judge(candidates, encoded.means, encoded.columns, logits)
+            if logits is None:
+                judgement = judged(model, self._extractor, candidates, encoded)
+            else:
+                judgement = model.judge(candidates, encoded.means, encoded.columns, logits)
         order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
         names = [candidates[place] for place in order.tolist()]
         ranking = tuple(zip(names, judgement.probability[order].tolist(), strict=True))

@@ -17,6 +17,7 @@ from scroll_tactile.embeddings.protocol import Capabilities, Embedding, embed_wi
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
 from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
 from scroll_tactile.memory.earlier import gone_copies, gone_embedding, is_gone, split_copies
+from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.statistics.grid import BITS
@@ -30,6 +31,7 @@ __all__ = [
     "open_store",
     "usual_embedding",
     "usual_exemplars",
+    "usual_recall",
 ]
 
 USUAL_EXEMPLARS = 400  # streams
@@ -90,6 +92,7 @@ class Identity(_Kept):
     reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
     exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
     views: whether whole touches are read beside windows; earlier versions, whose kernels do so from now on, had none.
+    recall: touches kept for recall; None in memories older than that.
     gone_copies: the settings of copies that only an earlier version can make; of no new memory.
     """
 
@@ -100,6 +103,7 @@ class Identity(_Kept):
     exemplars: tuple[int | None, int | None] | None = None
     augmentation: Augmented | None = None
     views: bool = False
+    recall: int | None = None
     gone_copies: dict[str, Any] = Field(default_factory=dict, exclude=True)
 
     @model_validator(mode="before")
@@ -113,12 +117,17 @@ class Identity(_Kept):
 
     @classmethod
     def of(
-        cls, sensor: Sensor, embedding: Embedding, exemplars: int | None, augmentation: Augmented | None = None
+        cls,
+        sensor: Sensor,
+        embedding: Embedding,
+        exemplars: int | None,
+        augmentation: Augmented | None = None,
+        recall: int | None = None,
     ) -> Self:
         """The identity of a new memory.
 
-        exemplars: streams in its buffer; None: the usual number, and none for a camera. Raises InputError for an
-        embedding that cannot read the sensor.
+        exemplars: streams in its buffer, recall: kept touches; None: the usual numbers, none for a camera. Raises
+        InputError for an embedding that cannot read the sensor.
         """
         require_rest(embedding, sensor)
         plan = window_plan(sensor, embedding)
@@ -130,6 +139,7 @@ class Identity(_Kept):
             exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
             augmentation=augmentation,
             views=bool(plan.whole),
+            recall=usual_recall(sensor, embedding) if recall is None else recall,
         )
 
     @classmethod
@@ -151,7 +161,9 @@ class Identity(_Kept):
 
     def to_json(self) -> dict[str, Any]:
         """Its fields in JSON's types, as a store keeps them; absent ones are left out, as earlier versions did."""
-        kept = self.model_dump(mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars", "views"})
+        kept = self.model_dump(
+            mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars", "views", "recall"}
+        )
         kept["grid"] = self.grid.model_dump(mode="json", exclude={"frames"} if not self.grid.frames else None)
         if self.exemplars is not None:
             kept["exemplars"] = list(self.exemplars)
@@ -159,6 +171,8 @@ class Identity(_Kept):
             kept["augmentation"] = self.augmentation.model_dump(mode="json")
         if self.views:
             kept["views"] = True
+        if self.recall:
+            kept["recall"] = self.recall
         kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
         return kept
 
@@ -180,6 +194,22 @@ class Identity(_Kept):
                 "kept are gone: leave exemplars out"
             )
         return count
+
+    def keeping(self, path: Path, embedding: Embedding, asked: int | None) -> Keeping:
+        """Which touches are kept for recall, as the memory was made; one older than that keeps the usual number.
+
+        Raises MismatchError where `asked` is another number.
+        """
+        made = self.recall
+        if made is None:
+            # Where there are views it is older, or keeps none.
+            made = 0 if self.views else usual_recall(self.sensor, embedding)
+        if asked not in (None, made):
+            raise MismatchError(
+                f"{path} was made with recall={made}; it was opened with {asked}. Which touches are kept is a function "
+                "of all that were observed: leave recall out"
+            )
+        return Keeping(self.sensor, made)
 
     def own_embedding(self, path: Path) -> Embedding:
         """The memory's embedding, made again from its configuration; nothing is embedded.
@@ -315,6 +345,11 @@ def usual_embedding(sensor: Sensor) -> Embedding:
     return Frames() if sensor.camera else Kernels()
 
 
+def usual_recall(sensor: Sensor, embedding: Embedding) -> int:
+    """The default number of touches kept for recall; none without views, beside which a touch is recalled."""
+    return usual_kept(sensor) if window_plan(sensor, embedding).whole else 0
+
+
 def usual_exemplars(sensor: Sensor) -> int:
     """The default number of streams in the buffer: none for a camera, whose streams are large."""
     return 0 if sensor.camera else USUAL_EXEMPLARS
@@ -326,6 +361,7 @@ def open_store(
     embedding: Embedding | None,
     augmentation: Augmented | None,
     exemplars: int | None,
+    recall: int | None,
     mode: Literal["write", "read"],
 ) -> Store:
     """The store in a folder; a new one where there is none and a sensor is given."""
@@ -336,5 +372,5 @@ def open_store(
             raise
     require_augmentable(sensor, augmentation)
     chosen = usual_embedding(sensor) if embedding is None else embedding
-    identity = Identity.of(sensor, chosen, exemplars, augmentation)
+    identity = Identity.of(sensor, chosen, exemplars, augmentation, recall)
     return Store.open(path, identity=identity.to_json(), mode=mode)

@@ -147,17 +147,17 @@ class Ledger:
     def _append(self, material: str, stream: Stream, columns: int, codes: Codes) -> int:
         memory = self._memory
         # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
-        kept = self._bare or memory.exemplars is not None
+        kept = self._bare or memory.exemplars is not None or memory.kept is not None
         packed = pack_readings(stream.readings) if kept else {}
         if self.store is None:
             sequence, stages = memory.sequence + 1, memory.plan.scored_stages(columns)
             held = Exemplar.of(material, stream.key, packed, stages, codes) if kept else None
-            memory.add(material, stream.key, columns, codes, sequence, held)
+            memory.add(material, stream.key, columns, codes, sequence, held, stream.readings)
             return sequence
         attributes = {"columns": columns, "nbytes": stream.readings.nbytes} if kept else {"columns": columns}
         arrays = packed if self._bare else packed | pack_codes(codes)
         sequence = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays).sequence
-        memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None)
+        memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None, stream.readings)
         return sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
@@ -194,12 +194,12 @@ class Ledger:
         # opening would have to read them.
         store.base()
         memory, sequences = self._memory, spans(record.sequence for record in records)
-        before = memory.sample, memory.exemplars, memory.tuned
+        before = memory.sample, memory.kept, memory.exemplars, memory.tuned
 
         def revert() -> None:
             for record in records:
                 memory.put_back(record)
-            memory.sample, memory.exemplars, memory.tuned = before
+            memory.sample, memory.kept, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
             retracted = [memory.retract(record) for record in records]

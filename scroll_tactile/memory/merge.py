@@ -219,6 +219,11 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
             f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
             f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
         )
+    if whole and memory.kept is not None and mine.recall != other.recall:
+        raise MismatchError(
+            f"{theirs.path} was compacted and keeps {other.recall or 0} touches for recall; {ours.path} keeps "
+            f"{mine.recall or 0}, and the readings for the others are gone"
+        )
 
 
 def _without_configuration(part: Any) -> Any:

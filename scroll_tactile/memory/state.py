@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -14,10 +15,21 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
-from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, only_readings, row_codes, unspanned
+from scroll_tactile.memory.kept import Keeping, KeptTouches
+from scroll_tactile.memory.rows import (
+    Added,
+    Arrays,
+    Codes,
+    Encode,
+    Readings,
+    only_readings,
+    row_codes,
+    unpack_readings,
+    unspanned,
+)
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
-from scroll_tactile.statistics.sample import SampledTouch, TouchSample
+from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import CompactedError, DamageError, Generation, Head, Record, Store
 
@@ -49,12 +61,13 @@ class Memory:
 
     dimension: d, of the features. plan: which windows of a touch are read. exemplars: streams in the buffer, or 0;
     kept as `capacity`. encode: readings → the rows of codes that the touch adds, by scale, for rows of the journal that
-    have readings alone; None where all rows have codes.
+    have readings alone; None where all rows have codes. keeping: which touches are kept for recall; None keeps none.
 
     What was learned:
 
     - statistics: exact sums by scale.
     - sample: the touches that readouts are calibrated on.
+    - kept: touches for recall; None without `keeping`.
     - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
     - descriptions: material → what it is made of; the material need not have been observed.
     - tuned: f*; None before a fine-tune, or after one of the observations behind it was retracted.
@@ -70,12 +83,21 @@ class Memory:
     - generation, saved: the generation that it was loaded from, and the last row in that; None and 0 without one.
     """
 
-    def __init__(self, dimension: int, plan: WindowPlan, exemplars: int = 0, encode: Encode | None = None) -> None:
+    def __init__(
+        self,
+        dimension: int,
+        plan: WindowPlan,
+        exemplars: int = 0,
+        encode: Encode | None = None,
+        keeping: Keeping | None = None,
+    ) -> None:
         self.plan = plan
+        self.keeping = keeping
         self.capacity = exemplars
         self.encode = encode
         self.statistics = Statistics(dimension, plan.scales)
         self.sample = TouchSample()
+        self.kept = KeptTouches(keeping) if keeping is not None and keeping.capacity else None
         self.exemplars = ExemplarSample(exemplars) if exemplars else None
         self.tuned: Tuned | None = None
         self.tuned_upto = 0
@@ -90,7 +112,14 @@ class Memory:
         self._stale = False
 
     def add(
-        self, material: str, key: bytes, columns: int, codes: Codes, sequence: int, source: Source | None = None
+        self,
+        material: str,
+        key: bytes,
+        columns: int,
+        codes: Codes,
+        sequence: int,
+        source: Source | None = None,
+        readings: Readings | None = None,
     ) -> None:
         """Add an observation: a touch of so many columns, its rows of codes by scale, and the row that it is.
 
@@ -100,6 +129,8 @@ class Memory:
         self.statistics.add(material, codes, columns)
         if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes))
+        if self.kept is not None:
+            self.kept.take(material, key, readings)
         if self.exemplars is not None and source is not None:
             self.exemplars.add(material, key, source)
         self.sequence = sequence
@@ -113,7 +144,7 @@ class Memory:
         if record.kind == OBSERVE:
             columns, codes = self.codes(record)
             source = record.sequence if only_readings(record.arrays) else None
-            self.add(record.label, record.key, columns, codes, record.sequence, source)
+            self.add(record.label, record.key, columns, codes, record.sequence, source, self._to_keep(record))
             changed = [(record.label, codes, 1)]
         elif record.kind == RETRACT:
             gone = unspanned(record.attributes["sequences"])
@@ -150,7 +181,9 @@ class Memory:
         self.statistics.remove(material, codes, columns)
         self.retracted.add(record.sequence)
         self.retractions += 1
-        if self.sample.holds(material, key) or (self.exemplars and self.exemplars.holds(material, key)):
+        if any(
+            sample.holds(material, key) for sample in (self.sample, self.kept, self.exemplars) if sample is not None
+        ):
             self._stale = True
         if record.sequence <= self.tuned_upto:
             self.tuned = None
@@ -173,7 +206,8 @@ class Memory:
         if self._stale:
             # Rows that a writer appended since this memory was read are left for the next `load`.
             chosen = self._chosen(store, self.sequence)
-            self.sample, self.exemplars, self._stale = chosen.sample, chosen.exemplars, False
+            self.sample, self.kept, self.exemplars = chosen.sample, chosen.kept, chosen.exemplars
+            self._stale = False
 
     def _chosen(self, store: Store, upto: int) -> Memory:
         """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
@@ -188,14 +222,33 @@ class Memory:
             return touches.get((material, key)) or self._touch(*self.codes(store.record(sequence)))
 
         fresh.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
+        if fresh.kept is not None:
+            self._keep_again(fresh.kept, store, heads)
         if fresh.exemplars is not None:
             kept = ((head.label, head.key, head.sequence) for head in heads if head.attributes.get("nbytes"))
             fresh.exemplars.update(kept)
         return fresh
 
+    def _keep_again(self, kept: KeptTouches, store: Store, heads: Sequence[Head]) -> None:
+        """Take in those of some observations that belong to the kept touches, as far as their readings are there."""
+        mine = {(material, key): levels for material, key, levels in self.kept or ()}
+        rows: Sample[int | None] = Sample(kept.capacity)
+        rows.update((material, key, None) for material, key, _ in kept)
+        rows.update((head.label, head.key, head.sequence) for head in heads)
+        for material, key, sequence in rows:
+            if (levels := mine.get((material, key))) is not None:
+                kept.add(material, key, levels)
+            elif sequence is not None:
+                kept.take(material, key, unpack_readings(store.record(sequence).arrays))
+
+    def _to_keep(self, record: Record) -> Readings | None:
+        """The readings of an observation, where it belongs to the kept touches and its row holds them."""
+        wanted = self.kept is not None and self.kept.wants(record.label, record.key)
+        return unpack_readings(record.arrays) if wanted else None
+
     def _empty(self) -> Memory:
         """Another memory of the same making."""
-        return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode)
+        return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode, self.keeping)
 
     def _base_samples(self, store: Store) -> Memory:
         """A memory with what the base holds; an empty one without a base."""
@@ -213,6 +266,8 @@ class Memory:
             heads = (head for head in store.heads() if head.sequence <= self.base and head.kind in (OBSERVE, MEMBER))
             compacted = {(head.label, head.key) for head in heads}
             fresh.sample.update(item for item in self.sample if item[:2] in compacted)
+            if fresh.kept is not None and self.kept is not None:
+                fresh.kept.update(item for item in self.kept if item[:2] in compacted)
             if fresh.exemplars is not None and self.exemplars is not None:
                 fresh.exemplars.update(item for item in self.exemplars if item[:2] in compacted)
             return fresh
@@ -239,6 +294,8 @@ class Memory:
         other._take(record.arrays, record.attributes, record.sequence)
         self.statistics = self.statistics + other.statistics
         self.sample.update(other.sample)
+        if self.kept is not None and other.kept is not None:
+            self.kept.update(other.kept)
         if self.exemplars is not None and other.exemplars is not None and "exemplar-readings" in record.arrays:
             self.exemplars.update(other.exemplars)
 
@@ -263,6 +320,9 @@ class Memory:
             "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= sampled
+        if self.kept is not None:
+            levels, attributes["kept"] = self.kept.to_arrays()
+            arrays |= levels
         # The rows after a base are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if base_at is None else ())
         excluded = sorted(row for row in self.retracted | self.excluded if base_at is not None and row <= base_at)
@@ -279,29 +339,36 @@ class Memory:
 
     @classmethod
     def load(
-        cls, store: Store, dimension: int, plan: WindowPlan, exemplars: int = 0, encode: Encode | None = None
+        cls,
+        store: Store,
+        dimension: int,
+        plan: WindowPlan,
+        exemplars: int = 0,
+        encode: Encode | None = None,
+        keeping: Keeping | None = None,
     ) -> Memory:
         """The memory that a store holds: its newest generation, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
             try:
-                memory = cls(dimension, plan, exemplars, encode)._loaded(store)
+                memory = cls(dimension, plan, exemplars, encode, keeping)._loaded(store)
             except CompactedError:  # a writer compacted it between two reads
                 continue
             # A generation that came between the reads may hold an f* from before the rows that were read.
             if store.newest == newest:
                 return memory
-        return cls(dimension, plan, exemplars, encode)._loaded(store)
+        return cls(dimension, plan, exemplars, encode, keeping)._loaded(store)
 
     def _loaded(self, store: Store) -> Memory:
         self.base = store.compacted
         # Without a sound generation the base raises what is lost; without a base the journal has every row.
         newest = store.latest()
         # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count, or
-        # has no views, which the rows give that hold readings.
+        # has no views or kept touches, which the rows give that hold readings.
         current = newest is None or (
             "pool-sums" not in newest.arrays
             and all(int(scale) in cast("list[int]", newest.attributes["scales"]) for scale in self.plan.scales)
+            and (self.kept is None or "kept" in newest.attributes)
         )
         earlier = None if current else newest
         start = store.base() if newest is None or earlier is not None else newest
@@ -345,6 +412,8 @@ class Memory:
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         sample = TouchSample.from_arrays(arrays, attributes["pool"])
         self.sample = sample_of_windows(sample, attributes["scales"], self.plan)
+        if self.kept is not None and "kept" in attributes:
+            self.kept.fill(arrays, attributes["kept"])
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))

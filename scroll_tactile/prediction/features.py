@@ -31,9 +31,11 @@ Image = npt.NDArray[np.float32]
 class Encoded:
     """A touch as it is evaluated.
 
-    image: (C, T) in [-1, 1]. means: scale → mean features in the codes' unit, (d,). seconds: how much touch it is.
+    stream: the whole touch. image: (C, T) in [-1, 1], of as much of it as is judged. means: scale → mean features in
+    the codes' unit, (d,). seconds: how much touch is judged.
     """
 
+    stream: Stream
     image: Image
     means: dict[Scale, npt.NDArray[np.float64]]
     seconds: float
@@ -102,7 +104,7 @@ class FeatureExtractor:
         within = self._within(stream, longest)
         image = self.image(within)
         whole = image if len(within) == len(stream) else self.image(stream)
-        return Encoded(image, self.means(image, needed(image.shape[1]), whole), within.seconds)
+        return Encoded(stream, image, self.means(image, needed(image.shape[1]), whole), within.seconds)
 
     def means(
         self, image: Image, scales: Sequence[Scale], whole: Image | None = None

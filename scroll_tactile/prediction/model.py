@@ -12,9 +12,12 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, InputError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
-from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage
+from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage, common_names, judged_touches
+from scroll_tactile.readouts.deviation import recall_of
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
+from scroll_tactile.readouts.pooled import Apart, Pooled, pool
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
+from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
@@ -47,11 +50,15 @@ def enough_memory() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Judgement:
-    """probability: of each candidate, shape (C,). novelty: see Prediction. calibration: of the stage judged at."""
+    """probability: of each candidate, shape (C,). novelty: see Prediction. calibration: of the stage judged at.
+
+    strange: the least strangeness of any scale that was asked, beside the usual; 0 where none is measured.
+    """
 
     probability: FloatArray
     novelty: float
     calibration: Calibration
+    strange: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,7 @@ class Draft:
     views: list[Scale]
     tasks: dict[Scale, Task]
     sample: list[tuple[str, bytes, SampledTouch]]
+    kept: list[Kept]
     longest: int
     touches: int
 
@@ -87,7 +95,8 @@ class Draft:
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
         # What was compacted before there were views cannot be viewed: then it is judged by its windows alone.
         views = [view for view in memory.plan.views if len(statistics.names(view)) == len(names)]
-        return cls(kind, memory, names, stages, views, tasks, sample, statistics.longest, statistics.touches)
+        kept = memory.kept.touches() if memory.kept is not None and views else []
+        return cls(kind, memory, names, stages, views, tasks, sample, kept, statistics.longest, statistics.touches)
 
     def fit(self) -> Model:
         """Solve the readouts and calibrate them."""
@@ -102,8 +111,32 @@ class Draft:
                 scales = [(readouts[scale], apart[scale]) for scale in [*self.stages[last], *self.views]]
                 materials = [material for material, *_ in self.sample]
                 whole = calibrate_stage(last, materials, scales, self.kind, viewed=True)
+            pooled = None
+            if whole is not None and self.kept:
+                pooled = pool(recall_of(self.kept), self._left_out(readouts, apart, len(calibrations) - 1, whole))
         give_back_scratch()
-        return Model(self, readouts, calibrations, apart, whole)
+        return Model(self, readouts, calibrations, apart, whole, pooled)
+
+    def _left_out(
+        self, readouts: Mapping[Scale, Readout], apart: Mapping[Scale, LeftOut], last: int, whole: Calibration
+    ) -> dict[bytes, Apart]:
+        """What the readouts say of sampled touches that they never observed, by key, at the last stage."""
+        scales = [*self.stages[last], *self.views]
+        said = [apart[scale] for scale in scales]
+        names, found = common_names(said), {}
+        places = [[left.names.index(name) for name in names] for left in said]
+        for touch in judged_touches(last, said):
+            material, key, _ = self.sample[touch]
+            rows = [left.rows[touch, last] for left in said]
+            strange = np.array([left.strangeness[row] for left, row in zip(said, rows, strict=True)])
+            weights = whole.believed(strange)
+            logits = sum(
+                weight * left.scores[row][own]
+                for weight, left, row, own in zip(weights, said, rows, places, strict=True)
+            )
+            relative = float((strange / whole.usual).min())
+            found[key] = Apart(material, dict(zip(names, np.asarray(logits).tolist(), strict=True)), relative)
+        return found
 
 
 class Model:
@@ -111,6 +144,7 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
     views: the views that judge beside them; whole: the calibration of both, for whole touches at the last stage.
+    pooled: the kept touches beside it, if any. least: the columns of all but the shortest touches that were learned.
     readouts: scale → its readout. calibrations: of the stages, as far as any touch reached them. apart: scale → the
     sampled touches left out. longest: the columns of the longest touch that was learned. fitted_to: the touches that it
     was fitted to.
@@ -123,6 +157,7 @@ class Model:
         calibrations: list[Calibration],
         apart: dict[Scale, LeftOut],
         whole: Calibration | None,
+        pooled: Pooled | None,
     ) -> None:
         self.kind: ReadoutName = draft.kind
         self.plan: WindowPlan = draft.memory.plan
@@ -134,7 +169,8 @@ class Model:
         self.calibrations = calibrations
         self.stages = draft.stages
         self.views, self.whole = draft.views if whole else [], whole
-        self._least = draft.memory.statistics.usual_least
+        self.pooled = pooled
+        self.least = draft.memory.statistics.usual_least
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
@@ -147,10 +183,19 @@ class Model:
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
                 return False
+        if self.pooled is not None and not self._recalls(memory):
+            return False
         self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
         self.known = frozenset(self.names)
         self._of_all = {}
         return True
+
+    def _recalls(self, memory: Memory) -> bool:
+        """Take in what is kept in the memory now."""
+        assert self.pooled is not None and memory.kept is not None
+        kept, held = {(material, key) for material, key, _ in memory.kept}, self.pooled.recall.held
+        added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
+        return self.pooled.recall.follow(added, held - kept)
 
     @property
     def crowded(self) -> bool:
@@ -172,30 +217,34 @@ class Model:
         means: Mapping[Scale, FloatArray],
         columns: int,
         tuned: Mapping[str, float] | None = None,
+        *,
+        whole: bool | None = None,
     ) -> Judgement:
         """Weigh the candidates for a touch.
 
         means: for each scale that is `needed`, its mean features in the codes' unit, (d,). columns: observed so far.
-        tuned: logits of f*, by material, in place of the last stage's scores.
+        tuned: logits of f*, by material, in place of the last stage's scores. whole: whether it is a whole touch, and
+        not the beginning of one; by its length unless given.
 
         A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
         the probability that is left goes to the others, which later stages weigh again.
         """
         decided = self._decided(candidates, len(self.plan.stages(columns)))
-        probability, mass = np.ones(len(candidates)), 1.0
+        whole = columns >= self.least if whole is None else whole
+        probability, mass, strange = np.ones(len(candidates)), 1.0, 0.0
         for i, (stage, members) in enumerate(decided):
             names = candidates if len(members) == len(candidates) else [candidates[place] for place in members]
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
-                logits = self._weighted(stage, columns, means, names)
+                logits, strange = self._weighted(stage, whole, means, names)
             probability[np.asarray(members)] = _chances(logits) * mass
             later = np.asarray(decided[i + 1][1] if i + 1 < len(decided) else [], dtype=np.intp)
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
         stage = max(stage for stage, members in decided if best in members)
-        novelty = self.novelty(stage, columns, means, candidates)
-        return Judgement(probability, novelty, self._calibration(stage, columns))
+        novelty = self.novelty(stage, whole, means, candidates)
+        return Judgement(probability, novelty, self._calibration(stage, whole), strange)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
@@ -225,9 +274,9 @@ class Model:
         return self._of_all[scale]
 
     def _weighted(
-        self, stage: int, columns: int, means: Mapping[Scale, FloatArray], names: Sequence[str]
-    ) -> FloatArray:
-        """The logits of some materials, weighed as the stage is calibrated."""
+        self, stage: int, whole: bool, means: Mapping[Scale, FloatArray], names: Sequence[str]
+    ) -> tuple[FloatArray, float]:
+        """The logits of some materials, weighed as the stage is calibrated, and the strangeness of `Judgement`."""
         scales = [*self.stages[stage], *self.views]
         places = {scale: self._places(scale, names) for scale in scales}
         chosen, logits = np.arange(len(names)), np.zeros(len(names))
@@ -235,9 +284,8 @@ class Model:
             coarse = {
                 scale: [part[places[scale]] for part in self.readouts[scale].coarse(means[scale])] for scale in scales
             }
-            weights = self._believed(
-                stage, columns, means, places, {scale: scores for scale, (scores, _) in coarse.items()}
-            )
+            rough = {scale: scores for scale, (scores, _) in coarse.items()}
+            weights, strange = self._believed(stage, whole, means, places, rough)
             bounds = np.zeros(len(names))
             for scale, weight in weights.items():
                 logits += weight * coarse[scale][0]
@@ -247,49 +295,49 @@ class Model:
             logits[chosen] = 0.0
         exact = {scale: self.readouts[scale].scores(means[scale], places[scale][chosen], self.kind) for scale in scales}
         if len(names) <= EAGER:
-            weights = self._believed(stage, columns, means, places, exact)
+            weights, strange = self._believed(stage, whole, means, places, exact)
         for scale, weight in weights.items():
             logits[chosen] += weight * exact[scale]
-        return logits
+        return logits, strange
 
     def _believed(
         self,
         stage: int,
-        columns: int,
+        whole: bool,
         means: Mapping[Scale, FloatArray],
         places: Mapping[Scale, npt.NDArray[np.intp]],
         scores: Mapping[Scale, FloatArray],
-    ) -> dict[Scale, float]:
-        """How far each scale is believed of this touch of so many columns, judged at a stage, given its scores."""
+    ) -> tuple[dict[Scale, float], float]:
+        """How far each scale is believed of this touch, judged at a stage, and the strangeness of `Judgement`."""
         own = self.stages[stage]
         weights = dict(zip(own, self.calibrations[stage].weights.tolist(), strict=True))
-        whole = self._is_whole(stage, columns)
-        # Where no touch could be left out, how strange a beginning looks is not known, and the views cannot be doubted.
-        if self.whole is None or not (whole or np.isfinite(self.whole.usual).all()):
-            return weights
         joint = [*self.stages[len(self.calibrations) - 1], *self.views]
-        judging = joint if whole else self.views
+        judging = joint if self._is_whole(stage, whole) else self.views
+        # Where no touch could be left out, how strange a beginning looks is not known, and the views cannot be doubted.
+        if self.whole is None or not (judging is joint or np.isfinite(self.whole.usual).all()):
+            return weights, 0.0
         strange = np.zeros(len(joint))
         for i, scale in enumerate(joint):
-            if scale in judging:
+            if scale in scores:
                 best = int(places[scale][int(scores[scale].argmax())])
                 strange[i] = self.readouts[scale].strangeness(means[scale], best)
-        believed = self.whole.believed(strange, 1.0 if columns >= self._least else DOUBT)
-        return weights | {scale: believed[i] for i, scale in enumerate(joint) if scale in judging}
+        believed = self.whole.believed(strange, 1.0 if whole else DOUBT)
+        least = float((strange / self.whole.usual)[[scale in scores for scale in joint]].min())
+        return weights | {scale: believed[i] for i, scale in enumerate(joint) if scale in judging}, least
 
-    def _is_whole(self, stage: int, columns: int) -> bool:
+    def _is_whole(self, stage: int, whole: bool) -> bool:
         """Whether a touch is judged as those that the calibration of the whole was measured on."""
-        return self.whole is not None and stage == len(self.calibrations) - 1 and columns >= self._least
+        return self.whole is not None and whole and stage == len(self.calibrations) - 1
 
-    def novelty(self, stage: int, columns: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
+    def novelty(self, stage: int, whole: bool, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
-        whole = self._is_whole(stage, columns)
-        scales = [*self.stages[stage], *self.views] if whole else self.stages[stage]
+        viewed = self.views if self._is_whole(stage, whole) else []
+        scales = [*self.stages[stage], *viewed]
         distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
-        return float(self._calibration(stage, columns).novelty(np.array(distances)))
+        return float(self._calibration(stage, whole).novelty(np.array(distances)))
 
-    def _calibration(self, stage: int, columns: int) -> Calibration:
-        return self.whole if self.whole is not None and self._is_whole(stage, columns) else self.calibrations[stage]
+    def _calibration(self, stage: int, whole: bool) -> Calibration:
+        return self.whole if self.whole is not None and self._is_whole(stage, whole) else self.calibrations[stage]
 
 
 def _chances(logits: FloatArray) -> FloatArray:

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.memory.identity import Identity, usual_embedding
+from scroll_tactile.memory.identity import Identity, usual_embedding, usual_recall
+from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
@@ -49,7 +50,9 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
     """What carries the memory in a store over to another embedding."""
     made = Identity.read(store)
     exemplars = made.exemplar_count(store, None)
-    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation)
+    recall = made.recall if made.recall is not None else usual_recall(made.sensor, embedding)
+    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation, recall)
+    keeping = Keeping(made.sensor, recall)
     plan = window_plan(made.sensor, embedding)
     extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
 
@@ -59,6 +62,6 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
         return image.shape[1], extractor.codes(image, touch.key)
 
     def load(draft: Store) -> Memory:
-        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1])
+        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1], keeping)
 
     return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)

@@ -28,6 +28,7 @@ from scroll_tactile.signals.windows import Scale
 
 __all__ = [
     "FEWEST",
+    "UNMEASURED",
     "Calibration",
     "calibrate",
     "calibrate_stage",
@@ -169,10 +170,13 @@ def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[i
     return picked
 
 
-def fit_weights(scores: FloatArray, targets: Sequence[int], prior: FloatArray) -> FloatArray:
+def fit_weights(
+    scores: FloatArray, targets: Sequence[int], prior: FloatArray, touches: float = PRIOR_TOUCHES
+) -> FloatArray:
     """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
 
-    scores: of touches left out, shape (touches, scales, classes). targets: the class of each.
+    scores: of touches left out, shape (touches, scales, classes). targets: the class of each. touches: that the prior
+    counts as.
     """
     gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
 
@@ -184,9 +188,9 @@ def fit_weights(scores: FloatArray, targets: Sequence[int], prior: FloatArray) -
         chances /= total
         mean = np.einsum("tsc,tc->ts", gap, chances)
         pull = weights / prior - 1
-        value = float((np.log(total) + top).sum()) + PRIOR_TOUCHES * float(pull @ pull) / 2
+        value = float((np.log(total) + top).sum()) + touches * float(pull @ pull) / 2
         curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ mean
-        return value, mean.sum(axis=0) + PRIOR_TOUCHES * pull / prior, curve + np.diag(PRIOR_TOUCHES / prior**2)
+        return value, mean.sum(axis=0) + touches * pull / prior, curve + np.diag(touches / prior**2)
 
     # Newton's steps, projected (Bertsekas 1982), in one to three weights: scipy.optimize is 20 MB and a tenth of a
     # second to import, of the quarter of a second in which a memory that was just opened answers.

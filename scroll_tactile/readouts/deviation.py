@@ -5,7 +5,7 @@ Each of some touches is left out and compared with the others. All is a function
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sized
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +39,7 @@ def recall_of(touches: Iterable[Kept]) -> Recall:
     return recall
 
 
-def spaced(recall: Recall, count: int) -> list[int]:
+def spaced(recall: Sized, count: int) -> list[int]:
     """Places of at most so many touches, spread evenly over their keys: at random, but the same of the same set."""
     return list(range(0, len(recall), max(1, -(-len(recall) // count))))
 

@@ -130,9 +130,9 @@ class Recall:
         self._named()
 
     @property
-    def keys(self) -> set[bytes]:
-        """The keys of what is kept."""
-        return {key for _, key in self._touches}
+    def held(self) -> set[tuple[str, bytes]]:
+        """What is kept, by material and key."""
+        return set(self._touches)
 
     @property
     def materials(self) -> list[str]:
@@ -146,17 +146,22 @@ class Recall:
         """The material of a kept touch."""
         return self._touches[row][0]
 
+    def levels(self, row: int) -> LevelArray:
+        """The levels of a kept touch, (C, T), as many columns as were kept."""
+        levels: LevelArray = self._levels[row].reshape(self.channels, -1)[:, : self._columns[row]]
+        return levels
+
     def rows(self) -> dict[bytes, int]:
         """Key → row of what is kept."""
         return {key: row for row, (_, key) in enumerate(self._touches)}
 
-    def follow(self, added: Iterable[Kept], removed: Iterable[bytes] = ()) -> bool:
+    def follow(self, added: Iterable[Kept], removed: Iterable[tuple[str, bytes]] = ()) -> bool:
         """Take in touches that came, and let others go; what was measured stays. False where it has to be made again:
 
         a touch is longer than all that were kept, or none is left.
         """
-        rows = self.rows()
-        for row in sorted((rows[key] for key in removed), reverse=True):
+        rows = {touch: row for row, touch in enumerate(self._touches)}
+        for row in sorted((rows[touch] for touch in removed), reverse=True):
             last = len(self._touches) - 1
             self._held.move(last, row)
             self._touches[row] = self._touches[last]

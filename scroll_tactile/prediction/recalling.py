@@ -1,0 +1,103 @@
+"""Kept touches asked beside the model, where a touch is not as those that were learned.
+
+A touch that the model knows well is its alone. One that looks strange to it, that it is not sure of, or that has
+another length than those learned, is compared with kept touches as well (see `readouts.recall`): with their beginnings,
+and with the whole of each, as one made at another speed. Channels that never change are filled in with what the kept
+touches have there, and the touch is judged again. Then, for each way to compare it,
+
+    p_y ∝ exp(g (1 − t) log d_y + β S_y),    β = 1 / (1 + (1/r − 1) c),
+
+d the model's probabilities, S the log-likelihoods of the kept touches, t which part of how the touch differs from them
+is noise (`Recollection.trust`), c how far noise leaves it to be seen that neighbouring values deviate together. g and r
+are fitted to touches left out. The two ways weigh exp(COUNTED e), e the evidence for each, per value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.readouts.likelihood import levels_of
+from scroll_tactile.readouts.recollection import Recollection
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["judged"]
+
+FloatArray = npt.NDArray[np.float64]
+
+SURE = 0.99  # of the probability: less than that is looked up
+COUNTED = 30.0  # values, as which the evidence for a way to compare a touch counts: neighbours say the same
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What a question is about: the touch, as it was encoded, and the materials that it may be of."""
+
+    model: Model
+    extractor: FeatureExtractor
+    candidates: Sequence[str]
+    stream: Stream
+
+
+def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
+    """What a model says of an encoded touch, and what kept touches add to it where it is not sure."""
+    judgement = model.judge(candidates, encoded.means, encoded.columns)
+    pooled = model.pooled
+    if pooled is None or (
+        judgement.probability.max() >= SURE
+        and judgement.strange <= pooled.familiar
+        and model.least <= len(encoded.stream) <= model.longest
+    ):
+        return judgement
+    asked = _Asked(model, extractor, candidates, encoded.stream)
+    levels = levels_of(_seen(encoded.stream), encoded.stream.sensor)
+    own_time = pooled.recall.recollect(levels)
+    ways = [(own_time, encoded.columns >= model.least)]
+    if levels.shape[1] != pooled.recall.longest and levels.shape[1] > 1:
+        ways.append((pooled.recall.recollect(levels, whole=True), True))
+    filled = _filled(asked, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))
+    answers = [(_answer(asked, filled, way, whole), way.evidence) for way, whole in ways]
+    weights = np.exp(COUNTED * np.array([evidence - max(e for _, e in answers) for _, evidence in answers]))
+    weights /= weights.sum()
+    probability = np.sum(
+        [w * judgement.probability for w, (judgement, _) in zip(weights, answers, strict=True)], axis=0
+    )
+    best = answers[int(weights.argmax())][0]
+    return Judgement(probability / probability.sum(), best.novelty, best.calibration, best.strange)
+
+
+def _seen(stream: Stream) -> npt.NDArray[np.floating]:
+    """The readings (T, C), NaN where one was missing."""
+    return stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
+
+
+def _filled(asked: _Asked, encoded: Encoded, recollection: Recollection) -> Encoded:
+    """The touch with its stuck channels as kept touches have them, where that changes any of its levels."""
+    stream = encoded.stream
+    readings = recollection.filled(stream.readings, stream.sensor)
+    if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
+        return encoded
+    readings.setflags(write=False)
+    needed = [*encoded.means]
+    return asked.extractor.encode(Stream(stream.sensor, readings), asked.model.longest, lambda columns: needed)
+
+
+def _answer(asked: _Asked, encoded: Encoded, recollection: Recollection, whole: bool) -> Judgement:
+    """What the model and the kept touches say together, compared in one way."""
+    model, pooled = asked.model, asked.model.pooled
+    assert pooled is not None
+    judgement = model.judge(asked.candidates, encoded.means, encoded.columns, whole=whole)
+    places = {name: i for i, name in enumerate(pooled.recall.materials)}
+    least = float(recollection.scores.min())
+    scores = np.array([recollection.scores[places[name]] if name in places else least for name in asked.candidates])
+    heard = pooled.trusted * (1 - recollection.trust) * np.log(np.maximum(judgement.probability, TINY))
+    logits = heard + scores / (1 + (1 / pooled.recalled - 1) * recollection.certainty)
+    chances = np.exp(logits - logits.max())
+    novelty = (1 - recollection.trust) * judgement.novelty + recollection.trust * pooled.novelty(recollection)
+    return Judgement(chances / chances.sum(), float(novelty), judgement.calibration, judgement.strange)

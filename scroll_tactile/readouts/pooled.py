@@ -1,0 +1,78 @@
+"""How far a model and the kept touches are believed beside each other, by touches left out of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED, fit_weights
+from scroll_tactile.readouts.deviation import spaced
+from scroll_tactile.readouts.recall import Recall
+from scroll_tactile.readouts.recollection import Recollection
+
+__all__ = ["Apart", "Pooled", "pool"]
+
+FloatArray = npt.NDArray[np.float64]
+
+LEFT_OUT = 48  # kept touches that are left out, each compared with all others
+PRIOR = np.array([1.0, 1 / 600])  # of the model's logits, and of values that say the same as their neighbours
+PRIOR_TOUCHES = 5.0
+USUAL = 0.95  # of touches left out are familiar
+MOST_SPREAD = 1e-9
+
+
+@dataclass(frozen=True)
+class Apart:
+    """What a model says of a touch left out: logits by material, and its strangeness beside the usual."""
+
+    material: str
+    logits: Mapping[str, float]
+    strange: float
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Kept touches beside a model.
+
+    recall: the kept touches. trusted, recalled: g and r, see `prediction.recalling`. familiar: the strangeness that 19
+    of 20 touches left out do not exceed. usual, spread: of the surprise of touches left out.
+    """
+
+    recall: Recall
+    trusted: float
+    recalled: float
+    familiar: float
+    usual: float
+    spread: float
+
+    def novelty(self, recollection: Recollection) -> float:
+        """The surprise of a touch, in units of its spread in known ones, as novelty is."""
+        return (recollection.surprise - self.usual) / self.spread
+
+
+def pool(recall: Recall, apart: Mapping[bytes, Apart]) -> Pooled:
+    """Fit g and r to kept touches that were left out of both. apart: by key, what the model says of those."""
+    rows = [row for key, row in sorted(recall.rows().items()) if key in apart]
+    rows = [rows[i] for i in spaced(rows, LEFT_OUT)]
+    names = recall.materials
+    if len(rows) < FEWEST or len(names) < 2:
+        return Pooled(recall, float(PRIOR[0]), float(PRIOR[1]), np.inf, 0.0, 1.0 / UNMEASURED)
+    keys = {row: key for key, row in recall.rows().items()}
+    told = [apart[keys[row]] for row in rows]
+    found = [recall.recollect(recall.levels(row), left_out=row) for row in rows]
+    common = [i for i, name in enumerate(names) if all(name in touch.logits for touch in told)]
+    targets = [[names[i] for i in common].index(touch.material) for touch in told]
+    scores = np.array(
+        [
+            [[touch.logits[names[i]] for i in common], recollection.scores[common]]
+            for touch, recollection in zip(told, found, strict=True)
+        ]
+    )
+    trusted, recalled = fit_weights(scores, targets, PRIOR, PRIOR_TOUCHES).tolist()
+    surprise = np.array([recollection.surprise for recollection in found])
+    familiar = float(np.quantile([touch.strange for touch in told], USUAL))
+    spread = max(float(surprise.std()), MOST_SPREAD)
+    return Pooled(recall, trusted, max(recalled, 1e-6), familiar, float(surprise.mean()), spread)

@@ -1,10 +1,13 @@
 """Memories made before whole touches were viewed: they are as those of now, as far as the readings are there."""
 
+import numpy as np
 import pytest
 from touches import OBSERVED, SETTINGS, Windowed, contents, fed, filled, require_same, stream, without
 
 from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.memory.rows import pack_readings, row_codes
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.signals.windows import Scale, WindowPlan
 
 WINDOWED = Windowed(seed=0, dimension=64)
 NAMES = ("a", "b", "c")
@@ -92,6 +95,23 @@ def test_a_compacted_one_comes_into_one_with_views(before, tmp_path):
         again.forget("a")
         again.observe("old", stream((40, 60)))
         assert again.model().views != []
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_rows_of_windows_are_embedded_again_where_they_hold_readings(kept):
+    """Those of the first versions hold the codes of all windows, and readings for exemplars."""
+    plan, calls = WindowPlan((15, 37), whole=50), []
+    arrays = {"codes-15": np.zeros((len(plan.extent(20)[15]), 64), np.int32)}
+    again = {scale: np.ones((1, 64), np.int32) for scale in (Scale("window", 15), *plan.views)}
+    found = row_codes(
+        arrays | (pack_readings(np.ones((20, 2), np.float32)) if kept else {}),
+        20,
+        plan,
+        lambda readings: calls.append(readings.shape) or again,
+    )
+    assert calls == ([(20, 2)] if kept else [])
+    assert (found is again) == kept
+    assert set(found) == (set(again) if kept else {Scale("window", 15)})
 
 
 @pytest.mark.parametrize("keep", [None, 0, 5])

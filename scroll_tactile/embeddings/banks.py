@@ -244,7 +244,6 @@ def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Float
     return thresholds
 
 
-@lru_cache(maxsize=4)
 def _simulated(channels: int, readings: int) -> list[npt.NDArray[np.float32]]:
     """Autoregressive noise of many amplitudes and offsets over the whole range, as integer levels.
 

@@ -99,9 +99,10 @@ class Draft:
         return cls(kind, memory, names, stages, views, tasks, sample, kept, statistics.longest, statistics.touches)
 
     def fit(self) -> Model:
-        """Solve the readouts and calibrate them."""
+        """Solve the readouts and calibrate them, once: the tasks are let go."""
         with one_thread():
-            readouts = {scale: Readout(task, self.memory.statistics) for scale, task in self.tasks.items()}
+            # One after the other, each task let go: of all at once the memory would be twice a model's.
+            readouts = {scale: Readout(self.tasks.pop(scale), self.memory.statistics) for scale in sorted(self.tasks)}
             asked = [[*stage, *self.memory.plan.views] for stage in self.stages]
             apart = {scale: left_out(readouts[scale], self.sample, asked, self.kind) for scale in readouts}
             calibrations = calibrate(self.sample, self.stages, readouts, apart, self.kind)

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -80,9 +79,9 @@ class Task:
         packed, (counts, sums) = statistics.second(scale).packed().copy(), statistics.totals(scale)
         return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
 
-    @cached_property
+    @property
     def scatter(self) -> FloatArray:
-        """S_w, shape (d, d): the lower triangle."""
+        """S_w, shape (d, d): the lower triangle, formed anew each time."""
         return within_scatter(self.packed, self.counts, self.sums)
 
     @property
@@ -117,7 +116,7 @@ class Readout:
         self.origin = task.origin
         self.counts = task.counts.astype(np.float64)
         self._statistics = statistics
-        matrix = task.scatter.copy()
+        matrix = task.scatter
         trace, dimension = float(np.trace(matrix)), len(matrix)
         self.share = shrinkage(matrix, task.touches, task.times) if trace > 0 else 0.0
         all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)

@@ -20,6 +20,7 @@ MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass in
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
 MANY = 1024  # classes
+ROWS = 128  # of a product: the whole of one is 8 MB for every step
 
 
 def _rows_of_triangle(dimension: int) -> Iterator[tuple[int, slice]]:
@@ -147,13 +148,24 @@ def _take_exactly(centred: IntArray, rounded: FloatArray, counts: IntArray, sums
             mean, rest = means.astype(np.float64), (total - rows * means).astype(np.float64)
             if limbs:
                 high = total >> LIMB
-                product = (high.astype(np.float64).T @ mean).astype(np.int64)
-                product <<= LIMB
-                centred -= product
+                for part, product in _lower_products(high.astype(np.float64), mean):
+                    centred[part] -= product.astype(np.int64) << LIMB
                 total = total - (high << LIMB)
-            centred -= (total.astype(np.float64).T @ mean + mean.T @ rest).astype(np.int64)
+            for part, product in _lower_products(total.astype(np.float64), mean):
+                centred[part] -= product.astype(np.int64)
+            for part, product in _lower_products(mean, rest):
+                centred[part] -= product.astype(np.int64)
             rest /= np.sqrt(rows)
-            rounded += rest.T @ rest
+            for part, product in _lower_products(rest, rest):
+                rounded[part] += product
+
+
+def _lower_products(left: FloatArray, right: FloatArray) -> Iterator[tuple[tuple[slice, slice], FloatArray]]:
+    """The product leftᵀ · right in blocks of rows, each as far as the lower triangle, and where it lies."""
+    dimension = left.shape[1]
+    for first in range(0, dimension, ROWS):
+        last = min(first + ROWS, dimension)
+        yield (slice(first, last), slice(0, last)), left[:, first:last].T @ right[:, :last]
 
 
 def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:

@@ -111,7 +111,11 @@ class CurrentModel:
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""
         late = abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, ADOPT * model.fitted_to // 16)
-        return late and (model.fitted_to <= FEW or (self._coming is not None and self._coming.done()))
+        if late and model.fitted_to <= FEW:
+            return True
+        # Not only where it can follow no further: until then two models would be held most of the time.
+        pressed = any(readout.pressed for readout in model.readouts.values())
+        return (late or pressed) and self._coming is not None and self._coming.done()
 
     def _adopted(self, memory: Memory) -> Model:
         """The coming model, followed to the memory as it is; a new one where there is none, or it cannot follow."""

@@ -154,6 +154,11 @@ class Readout:
         """Whether half of the columns have come that may come before it has to be solved again."""
         return self.system.rank > self.system.room
 
+    @property
+    def pressed(self) -> bool:
+        """Whether three quarters of them have."""
+        return self.system.rank > 3 * self.system.room
+
     def means_solved(self) -> tuple[FloatArray, FloatArray]:
         """The means of the reference materials about the origin, and K⁻¹ times them, each of shape (R, d)."""
         count = len(self.reference)

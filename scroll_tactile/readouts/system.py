@@ -6,7 +6,8 @@ what was retracted (Woodbury 1950):
 
     (K + Uᵀ D U)⁻¹ = L⁻ᵀ (I − Wᵀ E W) L⁻¹,    K = L Lᵀ,    W = U L⁻ᵀ,    E = (D + W Wᵀ)⁻¹,
 
-at 2 d² operations a column; W is all that is kept of them. Nothing drifts: U grows to a part of d, and then K is inverted again from the integers.
+at 2 d² operations a column; W is all that is kept of them. Nothing drifts: U grows to a part of d, and then K is
+inverted again from the integers.
 """
 
 from __future__ import annotations
@@ -59,9 +60,9 @@ class System:
         dimension = len(matrix)
         # numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import.
         self._inverse = InverseTriangle(np.asarray(np.linalg.cholesky(matrix), dtype=np.float64))
-        room = max(LEAST_RANK, dimension // LARGEST_RANK)
-        self._white = np.empty((room, dimension))  # L⁻¹ times the columns
-        self._e = np.empty((room, room))
+        self._most = max(LEAST_RANK, dimension // LARGEST_RANK)
+        self._white = np.empty((0, dimension))  # L⁻¹ times the columns, and room for more
+        self._e = np.empty((0, 0))
         self._largest = 1.0  # entry of what E is the inverse of
         self.rank = 0
 
@@ -74,7 +75,7 @@ class System:
     @property
     def room(self) -> int:
         """How many columns more can come."""
-        return len(self._white) - self.rank
+        return self._most - self.rank
 
     def solve(self, rows: FloatArray) -> FloatArray:
         """(K + Uᵀ D U)⁻¹ times each of the rows, shape (k, d)."""
@@ -88,9 +89,17 @@ class System:
         """L⁻¹ times each of the rows, shape (k, d), not regarding what came since: their products are those of K⁻¹."""
         return self._inverse.times(rows)
 
+    def _grow(self, rank: int) -> None:
+        size, held = max(rank, min(self._most, max(LEAST_RANK, 2 * len(self._white)))), self.rank
+        white, e = np.empty((size, self._white.shape[1])), np.empty((size, size))
+        white[:held], e[:held, :held] = self._white[:held], self._e[:held, :held]
+        self._white, self._e = white, e
+
     def border(self, columns: FloatArray, sign: int) -> tuple[FloatArray, FloatArray]:
         """Take in columns, shape (k, d), of one sign; gives W, (k, d), and C, (k, k): Wᵀ C W leaves the inverse."""
         first, last = self.rank, self.rank + len(columns)
+        if last > len(self._white):
+            self._grow(last)
         self._white[first:last] = white = self.whiten(columns)
         cross = self._white[:last] @ white.T
         self._largest = max(self._largest, float(np.abs(cross).max(initial=0.0)))

@@ -20,7 +20,7 @@ MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass in
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
 LIMB = 22  # bits
 MANY = 1024  # classes
-ROWS = 128  # of a product: the whole of one is 8 MB for every step
+ROWS = 128  # of a scatter that are formed at once
 
 
 def _rows_of_triangle(dimension: int) -> Iterator[tuple[int, slice]]:
@@ -122,50 +122,49 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     """
     # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
     dimension = sums.shape[1]
+    if len(counts) <= MANY:
+        return _exactly(packed, counts, sums)
     centred = np.zeros((dimension, dimension), dtype=np.int64)
     for row, place in _rows_of_triangle(dimension):
         centred[row, : row + 1] = packed[place]
     rounded = np.zeros((dimension, dimension))
-    if len(counts) > MANY:
-        _take_about_the_mean(centred, rounded, counts, sums)
-    else:
-        _take_exactly(centred, rounded, counts, sums)
+    _take_about_the_mean(centred, rounded, counts, sums)
     rounded *= -1.0
     rounded += centred
     return rounded
 
 
-def _take_exactly(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:
-    """Take Σ_y c_y c_yᵀ / n_y off `centred`, but for Σ_y r_y r_yᵀ / n_y, which is added to `rounded`."""
+def _exactly(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+    """The scatter, block of rows after block: of the whole square every step would take 8 MB more."""
     # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
     largest = int(np.abs(sums).max(initial=1))
-    block = min(1024, 2 ** (53 - BITS) // largest)
-    limbs, block = (False, block) if block >= 64 else (True, 1024)
+    together = min(1024, 2 ** (53 - BITS) // largest)
+    limbs, together = (False, together) if together >= 64 else (True, 1024)
+    parts = []
+    for first in range(0, len(counts), together):
+        rows, total = counts[first : first + together, None], sums[first : first + together]
+        means = mean_code(total, rows)
+        rest = (total - rows * means).astype(np.float64)
+        high = (total >> LIMB).astype(np.float64) if limbs else None
+        low = (total - (total >> LIMB << LIMB) if limbs else total).astype(np.float64)
+        parts.append((high, low, means.astype(np.float64), rest, np.sqrt(rows)))
+    dimension = sums.shape[1]
+    scatter = np.zeros((dimension, dimension))
+    places = list(_rows_of_triangle(dimension))
     with one_thread():
-        for first in range(0, len(counts), block):
-            rows, total = counts[first : first + block, None], sums[first : first + block]
-            means = mean_code(total, rows)
-            mean, rest = means.astype(np.float64), (total - rows * means).astype(np.float64)
-            if limbs:
-                high = total >> LIMB
-                for part, product in _lower_products(high.astype(np.float64), mean):
-                    centred[part] -= product.astype(np.int64) << LIMB
-                total = total - (high << LIMB)
-            for part, product in _lower_products(total.astype(np.float64), mean):
-                centred[part] -= product.astype(np.int64)
-            for part, product in _lower_products(mean, rest):
-                centred[part] -= product.astype(np.int64)
-            rest /= np.sqrt(rows)
-            for part, product in _lower_products(rest, rest):
-                rounded[part] += product
-
-
-def _lower_products(left: FloatArray, right: FloatArray) -> Iterator[tuple[tuple[slice, slice], FloatArray]]:
-    """The product leftᵀ · right in blocks of rows, each as far as the lower triangle, and where it lies."""
-    dimension = left.shape[1]
-    for first in range(0, dimension, ROWS):
-        last = min(first + ROWS, dimension)
-        yield (slice(first, last), slice(0, last)), left[:, first:last].T @ right[:, :last]
+        for first in range(0, dimension, ROWS):
+            last = min(first + ROWS, dimension)
+            centred, rounded = np.zeros((last - first, last), dtype=np.int64), np.zeros((last - first, last))
+            for row, place in places[first:last]:
+                centred[row - first, : row + 1] = packed[place]
+            for high, low, mean, rest, root in parts:
+                if high is not None:
+                    centred -= (high[:, first:last].T @ mean[:, :last]).astype(np.int64) << LIMB
+                centred -= (low[:, first:last].T @ mean[:, :last]).astype(np.int64)
+                centred -= (mean[:, first:last].T @ rest[:, :last]).astype(np.int64)
+                rounded += (rest[:, first:last] / root).T @ (rest[:, :last] / root)
+            np.subtract(centred, rounded, out=scatter[first:last, :last])
+    return scatter
 
 
 def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:

@@ -200,7 +200,7 @@ class Model:
 
     @property
     def crowded(self) -> bool:
-        """Whether half of what the readouts can follow has come."""
+        """Whether five eighths of what the readouts can follow has come."""
         return any(readout.crowded for readout in self.readouts.values())
 
     def is_last(self, columns: int) -> bool:

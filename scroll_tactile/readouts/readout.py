@@ -52,7 +52,7 @@ MOST_HELD = 2 * EAGER  # then those that were asked for are let go
 
 @dataclass(frozen=True)
 class Task:
-    """What a readout is solved from, copied from the statistics at one moment, so that solving waits for nobody.
+    """What a readout is solved from: the statistics at one moment, so that solving waits for nobody.
 
     packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
     shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
@@ -76,7 +76,7 @@ class Task:
         # Of no touch that was sampled may any have rows here: then the first materials that have.
         known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
         own = np.array(known, dtype=np.intp)
-        packed, (counts, sums) = statistics.second(scale).packed().copy(), statistics.totals(scale)
+        packed, (counts, sums) = statistics.second(scale).lend(), statistics.totals(scale)
         return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
 
     @property
@@ -151,8 +151,8 @@ class Readout:
 
     @property
     def crowded(self) -> bool:
-        """Whether half of the columns have come that may come before it has to be solved again."""
-        return self.system.rank > self.system.room
+        """Whether five eighths of the columns have come that may come before it has to be solved again."""
+        return 3 * self.system.rank > 5 * self.system.room
 
     @property
     def pressed(self) -> bool:

@@ -24,10 +24,10 @@ FloatArray = npt.NDArray[np.float64]
 
 LARGEST_RANK = 3  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
+MORE = 64  # columns that room is made for at once
 # Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much
 # louder than all before, or one retracted on which the scatter rests, have K inverted again: scores keep their 1e-9.
 LARGEST_CONDITION = 256.0
-SMALL = 64  # rows of a triangle
 BLOCKS = 8  # of rows of a triangle: then seven sixteenths of the square are left out
 FEW = 8  # rows that are solved for one by one: a fifth of the time of a product of matrices
 
@@ -59,7 +59,7 @@ class System:
     def __init__(self, matrix: FloatArray) -> None:
         dimension = len(matrix)
         # numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import.
-        self._inverse = InverseTriangle(np.asarray(np.linalg.cholesky(matrix), dtype=np.float64))
+        self._inverse = InverseTriangle(matrix)
         self._most = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._white = np.empty((0, dimension))  # L⁻¹ times the columns, and room for more
         self._e = np.empty((0, 0))
@@ -90,7 +90,7 @@ class System:
         return self._inverse.times(rows)
 
     def _grow(self, rank: int) -> None:
-        size, held = max(rank, min(self._most, max(LEAST_RANK, 2 * len(self._white)))), self.rank
+        size, held = max(rank, min(self._most, len(self._white) + MORE)), self.rank
         white, e = np.empty((size, self._white.shape[1])), np.empty((size, size))
         white[:held], e[:held, :held] = self._white[:held], self._e[:held, :held]
         self._white, self._e = white, e
@@ -116,15 +116,39 @@ class System:
 
 
 class InverseTriangle:
-    """L⁻¹ of a lower triangle L, shape (d, d), which is overwritten: kept in blocks of rows, without what is zero.
+    """L⁻¹ of K = L Lᵀ, shape (d, d), of which the lower triangle is read: in blocks of rows, without what is zero.
 
-    A block stays in the processor's cache for all rows that are multiplied by it.
+    A block stays in the processor's cache for all rows that are multiplied by it, and nothing takes a square more.
+
+    Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """
 
-    def __init__(self, lower: FloatArray) -> None:
-        _invert_triangle(lower)
-        edges = np.linspace(0, len(lower), min(len(lower), BLOCKS) + 1).astype(int).tolist()
-        self._blocks = [(first, last, lower[first:last, :last].copy()) for first, last in pairwise(edges)]
+    def __init__(self, matrix: FloatArray) -> None:
+        edges = np.linspace(0, len(matrix), min(len(matrix), BLOCKS) + 1).astype(int).tolist()
+        self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in pairwise(edges)]
+        self._factorise()
+        self._invert()
+
+    def _factorise(self) -> None:
+        """Turn the blocks of K into those of L, block of columns after block."""
+        for i, (first, last, block) in enumerate(self._blocks):
+            own = np.linalg.cholesky(block[:, first:])
+            block[:, first:] = own
+            for _, _, below in self._blocks[i + 1 :]:
+                below[:, first:last] = np.linalg.solve(own, below[:, first:last].T).T
+            for j, (start, stop, row) in enumerate(self._blocks[i + 1 :], i + 1):
+                for _, _, below in self._blocks[j:]:
+                    below[:, start:stop] -= below[:, first:last] @ row[:, first:last].T
+
+    def _invert(self) -> None:
+        """Turn the blocks of L into those of L⁻¹, from above: a block needs those before it, inverted already."""
+        for i, (first, _, block) in enumerate(self._blocks):
+            own = np.tril(np.linalg.inv(block[:, first:]))
+            sums = np.zeros((len(block), first))
+            for start, stop, above in self._blocks[:i]:
+                sums[:, :stop] += block[:, start:stop] @ above
+            block[:, :first] = -own @ sums
+            block[:, first:] = own
 
     def times(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times each of the rows, shape (k, d)."""
@@ -147,16 +171,3 @@ class InverseTriangle:
             for row, into in zip(rows, product, strict=True):
                 into[:last] += row[first:last] @ block
         return product
-
-
-def _invert_triangle(lower: FloatArray) -> None:
-    """Overwrite a lower triangle by its inverse, by halves: nearly all of it is products of matrices."""
-    count = len(lower)
-    if count <= SMALL:
-        lower[:] = np.tril(np.linalg.inv(lower))
-        return
-    half = count // 2
-    first, last, below = lower[:half, :half], lower[half:, half:], lower[half:, :half]
-    _invert_triangle(first)
-    _invert_triangle(last)
-    below[:] = -last @ (below @ first)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
 
 import numpy as np
@@ -53,6 +54,7 @@ class SecondMoment:
         self._packed: IntArray | None = None
         self._waiting: npt.NDArray[np.int32] | None = None
         self._count = 0
+        self._lent: list[weakref.ref[IntArray]] = []
 
     def add(self, codes: npt.NDArray[np.int32]) -> None:
         """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
@@ -71,7 +73,8 @@ class SecondMoment:
 
     def remove(self, codes: npt.NDArray[np.int32]) -> None:
         """Take rows out again that were added, shape (rows, d): as if they had never been."""
-        packed = self.packed()
+        self._flush()
+        packed = self._own()
         for first in range(0, len(codes), BLOCK):
             _add_product(packed, codes[first : first + BLOCK], np.subtract)
         self.rows -= len(codes)
@@ -81,8 +84,22 @@ class SecondMoment:
             self._packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
         if self._count:
             assert self._waiting is not None
-            _add_product(self._packed, self._waiting[: self._count], np.add)
+            _add_product(self._own(), self._waiting[: self._count], np.add)
             self._count = 0
+
+    def _own(self) -> IntArray:
+        """The lower triangle, to be changed: another where one that was lent is still in use."""
+        assert self._packed is not None
+        if any(lent() is not None for lent in self._lent):
+            self._packed = self._packed.copy()
+        self._lent = []
+        return self._packed
+
+    def lend(self) -> IntArray:
+        """The lower triangle as `packed`, as it is now: it stays so, whatever comes, for as long as it is held."""
+        lent = self.packed().view()
+        self._lent = [*(before for before in self._lent if before() is not None), weakref.ref(lent)]
+        return lent
 
     def packed(self) -> IntArray:
         """The lower triangle of A, row after row, shape (d·(d+1)/2,): the memory itself, not a copy."""

@@ -87,6 +87,23 @@ def test_a_full_moment_refuses_before_anything_is_added():
         moment.add(codes(1, 4))
 
 
+@pytest.mark.parametrize("change", ["add", "remove"])
+def test_what_was_lent_stays_as_it_was_for_as_long_as_it_is_held(change):
+    batch = codes(4, 3)
+    moment = added(batch, dimension=3)
+    before = moment.packed().tolist()
+    first, second = moment.lend(), moment.lend()
+    del second
+    getattr(moment, change)(batch[:1])
+    own = moment.packed()
+    assert own.tolist() != before
+    assert first.tolist() == before
+    del first
+    getattr(moment, change)(batch[1:2])
+    assert moment.packed() is own  # nobody holds what was lent: no copy is made
+
+
+
 # The scatter within classes
 
 

@@ -231,7 +231,7 @@ def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Float
     count = len(kernels)
     # Quantiles in a golden-ratio sequence: any number of a kernel's thresholds, from the first on, is well spread.
     quantiles = (rng.random(count) + np.arange(THRESHOLDS)[:, None] * GOLDEN) % 1
-    chosen = rng.integers(0, len(streams), size=(THRESHOLDS, count))
+    chosen = rng.integers(0, SIMULATED, size=(THRESHOLDS, count))
     thresholds = np.empty((THRESHOLDS, count), dtype=np.float32)
     for i, stream in enumerate(streams):  # one by one: the responses to all would fill ten times the memory
         round_, kernel = np.nonzero(chosen == i)
@@ -244,7 +244,7 @@ def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Float
     return thresholds
 
 
-def _simulated(channels: int, readings: int) -> list[npt.NDArray[np.float32]]:
+def _simulated(channels: int, readings: int) -> Iterator[Floats]:
     """Autoregressive noise of many amplitudes and offsets over the whole range, as integer levels.
 
     Amplitudes are log-uniform from 0.6 % to 50 % of half the range; channels differ and partly move together.
@@ -265,7 +265,8 @@ def _simulated(channels: int, readings: int) -> list[npt.NDArray[np.float32]]:
     noise = noise[:, 64:]
     noise *= amplitude[:, None]  # in place: one array more is 5 MB
     noise += offset[:, None]
-    return [np.ascontiguousarray(to_levels(np.clip(stream, -1, 1)).T) for stream in noise]
+    for stream in noise:
+        yield np.ascontiguousarray(to_levels(np.clip(stream, -1, 1)).T)
 
 
 @dataclass(frozen=True)

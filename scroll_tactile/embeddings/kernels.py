@@ -230,7 +230,7 @@ def _counts(
     rows: of the sums that the workspace has, those of the bank's kernels.
     """
     responses = workspace.respond(rows, readings, kernels.dilation)
-    exceeded = workspace.array("exceeded", count, responses.shape[1])
+    exceeded = workspace.array("second", count, responses.shape[1])  # the responses are made
     for first in range(0, count, len(kernels)):
         size = min(len(kernels), count - first)
         thresholds = kernels.thresholds[first // len(kernels), :size, None]

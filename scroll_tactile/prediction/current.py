@@ -121,9 +121,10 @@ class CurrentModel:
         """The coming model, followed to the memory as it is; a new one where there is none, or it cannot follow."""
         coming = self._coming
         if coming is not None and coming.exception() is None:  # it waits; interrupted there, the next call does
-            model, self._exact, self._coming = coming.result(), not self._since, None
+            model, since = coming.result(), self._since
+            self._exact, self._coming, self._since = not since, None, []
             del coming
-            if not self._due(model, memory) and model.follow(memory, self._since):
+            if not self._due(model, memory) and model.follow(memory, since):
                 give_back_scratch()
                 return model
         self._coming = None

@@ -19,9 +19,10 @@ FloatArray = npt.NDArray[np.float64]
 
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
+FIRST = 64  # of them that there is room for at once
 LIMB = 22  # bits
 MANY = 1024  # classes
-ROWS = 128  # of a scatter that are formed at once
+ROWS = 128  # of a product that are formed at once: the whole of one is 8 MB
 
 
 def _rows_of_triangle(dimension: int) -> Iterator[tuple[int, slice]]:
@@ -66,10 +67,14 @@ class SecondMoment:
     def _wait(self, codes: npt.NDArray[np.int32]) -> None:
         if self._count + len(codes) > BLOCK:
             self._flush()
-        if self._waiting is None:
-            self._waiting = np.empty((BLOCK, self.dimension), dtype=np.int32)
-        self._waiting[self._count : self._count + len(codes)] = codes
-        self._count += len(codes)
+        last = self._count + len(codes)
+        if self._waiting is None or len(self._waiting) < last:
+            longer = np.empty((min(BLOCK, max(2 * self._count, last, FIRST)), self.dimension), dtype=np.int32)
+            if self._waiting is not None:
+                longer[: self._count] = self._waiting[: self._count]
+            self._waiting = longer
+        self._waiting[self._count : last] = codes
+        self._count = last
 
     def remove(self, codes: npt.NDArray[np.int32]) -> None:
         """Take rows out again that were added, shape (rows, d): as if they had never been."""
@@ -123,10 +128,13 @@ class SecondMoment:
 def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) -> None:
     """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
     rows = codes.astype(np.float64)
-    with one_thread():
-        product = (rows.T @ rows).astype(np.int64)  # of one matrix with itself: numpy takes half of the operations
-    for row, place in _rows_of_triangle(codes.shape[1]):
-        put(packed[place], product[row, : row + 1], out=packed[place])
+    places = list(_rows_of_triangle(codes.shape[1]))
+    for first in range(0, len(places), ROWS):
+        last = min(first + ROWS, len(places))
+        with one_thread():
+            product = (rows[:, first:last].T @ rows[:, :last]).astype(np.int64)
+        for row, place in places[first:last]:
+            put(packed[place], product[row - first, : row + 1], out=packed[place])
 
 
 def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:

@@ -103,7 +103,6 @@ def test_what_was_lent_stays_as_it_was_for_as_long_as_it_is_held(change):
     assert moment.packed() is own  # nobody holds what was lent: no copy is made
 
 
-
 # The scatter within classes
 
 

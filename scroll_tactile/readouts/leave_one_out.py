@@ -34,6 +34,8 @@ FloatArray = npt.NDArray[np.float64]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
 """Material, key and rows of the touches that readouts are calibrated on: a `TouchSample`, or what was copied of it."""
 
+TOGETHER = 32  # touches: each step of all at once takes 8 MB
+
 
 @dataclass(frozen=True)
 class LeftOut:
@@ -75,7 +77,7 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
     index: dict[tuple[int, int], int] = {}
     parts = []
     leaving = _Leaving(readout, kind) if groups else None
-    for members in groups.values():
+    for members in (group[i : i + TOGETHER] for group in groups.values() for i in range(0, len(group), TOGETHER)):
         for number, at, *_ in members:
             for stage in at:
                 index[number, stage] = len(index)

@@ -75,22 +75,20 @@ class _Asked:
 
 @dataclass
 class _Room:
-    """Rows of kept touches.
+    """What is made of kept touches, row by row.
 
-    levels: (touches, C · T). blocks: means, (touches, C · B). squares: sums of their squares by channel, (touches, C).
+    blocks: means, (touches, C · B). squares: sums of their squares by channel, (touches, C).
     columns: the length of each. gapless: whether it has a value everywhere.
     """
 
-    levels: LevelArray
     blocks: npt.NDArray[np.float32]
     squares: npt.NDArray[np.float32]
     columns: npt.NDArray[np.intp]
     gapless: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, count: int, channels: int, columns: int, blocks: int) -> _Room:
+    def of(cls, count: int, channels: int, blocks: int) -> _Room:
         return cls(
-            np.empty((count, channels * columns), np.uint8),
             np.empty((count, channels * blocks), np.float32),
             np.empty((count, channels), np.float32),
             np.empty(count, np.intp),
@@ -98,11 +96,11 @@ class _Room:
         )
 
     def take(self, other: _Room, count: int) -> None:
-        for name in ("levels", "blocks", "squares", "columns", "gapless"):
+        for name in ("blocks", "squares", "columns", "gapless"):
             getattr(self, name)[:count] = getattr(other, name)[:count]
 
     def move(self, row: int, to: int) -> None:
-        for name in ("levels", "blocks", "squares", "columns", "gapless"):
+        for name in ("blocks", "squares", "columns", "gapless"):
             getattr(self, name)[to] = getattr(self, name)[row]
 
 
@@ -124,7 +122,8 @@ class Recall:
         blocks = max(1, min(self.longest, BLOCK_VALUES // self.channels))
         self._edges = np.linspace(0, self.longest, blocks + 1).astype(np.intp)
         self._touches: list[tuple[str, bytes]] = []
-        self._held = _Room.of(len(kept), self.channels, self.longest, blocks)
+        self._levels: list[LevelArray] = []  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
+        self._held = _Room.of(len(kept), self.channels, blocks)
         for touch in kept:
             self._add(touch)
         self._named()
@@ -148,8 +147,7 @@ class Recall:
 
     def levels(self, row: int) -> LevelArray:
         """The levels of a kept touch, (C, T), as many columns as were kept."""
-        levels: LevelArray = self._levels[row].reshape(self.channels, -1)[:, : self._columns[row]]
-        return levels
+        return self._levels[row]
 
     def rows(self) -> dict[bytes, int]:
         """Key → row of what is kept."""
@@ -164,8 +162,9 @@ class Recall:
         for row in sorted((rows[touch] for touch in removed), reverse=True):
             last = len(self._touches) - 1
             self._held.move(last, row)
-            self._touches[row] = self._touches[last]
+            self._touches[row], self._levels[row] = self._touches[last], self._levels[last]
             self._touches.pop()
+            self._levels.pop()
         for touch in added:
             if touch.levels.shape[1] > self.longest:
                 return False
@@ -175,28 +174,29 @@ class Recall:
 
     def _room(self, count: int) -> None:
         """Room for so many touches, with those that are kept already."""
-        room = _Room.of(count, self.channels, self.longest, len(self._edges) - 1)
+        room = _Room.of(count, self.channels, len(self._edges) - 1)
         room.take(self._held, len(self._touches))
         self._held = room
 
     def _add(self, touch: Kept) -> None:
         row, held = len(self._touches), self._held
-        if row == len(held.levels):
+        if row == len(held.blocks):
             self._room(row + max(8, row // 8))
             held = self._held
         whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
         whole[:, : touch.levels.shape[1]] = touch.levels
         means = _means(whole, self._edges)[0].astype(np.float32)
-        held.levels[row], held.blocks[row], held.squares[row] = whole.ravel(), means.ravel(), (means**2).sum(axis=1)
+        held.blocks[row], held.squares[row] = means.ravel(), (means**2).sum(axis=1)
         held.columns[row], held.gapless[row] = touch.levels.shape[1], not bool((whole == MISSING).any())
         self._touches.append((touch.material, touch.key))
+        self._levels.append(touch.levels)
 
     def _named(self) -> None:
         count, held = len(self._touches), self._held
         self._materials = sorted({material for material, _ in self._touches})
         place = {name: i for i, name in enumerate(self._materials)}
         self._labels = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
-        self._levels, self._blocks, self._squares = held.levels[:count], held.blocks[:count], held.squares[:count]
+        self._blocks, self._squares = held.blocks[:count], held.squares[:count]
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
         self._brought: npt.NDArray[np.float32] | None = None
 
@@ -221,8 +221,7 @@ class Recall:
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
-        levels = self._levels[row].reshape(self.channels, -1)
-        asked = _Asked.of(levels, self.longest, whole=False)
+        asked = _Asked.of(self._levels[row], self.longest, whole=False)
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
         best = beside[np.argmax(self._logs(beside, asked, CLEAN))]
         return shape_of(*self._deviation(asked, best, CLEAN))
@@ -233,18 +232,27 @@ class Recall:
         if not len(others):
             return None
         far = self._squares[others].sum(axis=1) - 2 * (self._blocks[others] @ self._blocks[row])
-        return self._levels[row], self._levels[others[np.argmin(far)]]
+        own, other = self._rows([row, int(others[np.argmin(far)])])
+        return own, other
+
+    def _rows(self, rows: Iterable[int]) -> LevelArray:
+        """The levels of kept touches one below the other, as long as the longest, (rows, C · T)."""
+        kept = [self._levels[row] for row in rows]
+        beside = np.full((len(kept), self.channels, self.longest), MISSING, dtype=np.uint8)
+        for levels, into in zip(kept, beside, strict=True):
+            into[:, : levels.shape[1]] = levels
+        return beside.reshape(len(kept), -1)
 
     def _beside(self, rows: Rows, asked: _Asked) -> LevelArray:
         """The levels that a touch is compared with, of some kept ones, (rows, C · T)."""
         if not asked.whole:
-            return self._levels[rows]
+            return self._rows(rows)
         columns = asked.levels.shape[1]
         places = np.arange(columns)[None, :] * ((self._columns[rows] - 1) / max(columns - 1, 1))[:, None]
         first = places.astype(np.intp)
         after = np.minimum(first + 1, self._columns[rows, None] - 1)
         part = (places - first)[:, None, :].astype(np.float32)
-        kept = self._levels[rows].reshape(len(rows), self.channels, -1)
+        kept = self._rows(rows).reshape(len(rows), self.channels, -1)
         low, high = (np.take_along_axis(kept, place[:, None, :], axis=2) for place in (first, after))
         brought: LevelArray = np.rint(low * (1 - part) + high * part).astype(np.uint8)
         brought[(low == MISSING) | (high == MISSING)] = MISSING
@@ -287,14 +295,13 @@ class Recall:
         if (brought := self._brought) is None:
             means = []
             for row, columns in enumerate(self._columns.tolist()):
-                levels = self._levels[row].reshape(self.channels, -1)[:, :columns]
-                means.append(_means(levels, self._edges[::COARSER] * columns // self.longest)[0].ravel())
+                means.append(_means(self._levels[row], self._edges[::COARSER] * columns // self.longest)[0].ravel())
             brought = self._brought = np.array(means, dtype=np.float32)
         return brought
 
     def _read(self) -> npt.NDArray[np.bool_]:
         """Whether a kept touch has any value in a block, (touches, C · B)."""
-        values = (self._levels != MISSING).reshape(len(self), self.channels, self.longest)
+        values = (self._rows(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
         return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
 
     def _logs(self, beside: LevelArray, asked: _Asked, noise: Noise, values: slice | Rows = slice(None)) -> FloatArray:

@@ -1,10 +1,10 @@
 """The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
 
 Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is
-fitted, the shrinkage and the calibration, follows when the memory has grown by three sixteenths: a sixteenth before, a
-thread begins to fit it, to the integers. A call waits for that thread only where the readouts can follow no further,
-and in a memory of few touches, where each of them counts. Otherwise touches that come faster than the thread fits have
-an earlier calibration a little longer.
+fitted, the shrinkage and the calibration, follows when the memory has grown by three sixteenths, or three quarters of
+what the readouts can follow has come: a sixteenth before, or an eighth, a thread begins to fit it, to the integers. A
+call waits for that thread only where the readouts can follow no further, and in a memory of few touches, where each of
+them counts. Otherwise touches that come faster than the thread fits have an earlier calibration a little longer.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Identity(_Kept):
     reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
     exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
     views: whether whole touches are read beside windows; earlier versions, whose kernels do so from now on, had none.
-    recall: touches kept for recall; None in memories older than that.
+    recall: touches kept for recall; None where none are, and in memories older than that.
     gone_copies: the settings of copies that only an earlier version can make; of no new memory.
     """
 
@@ -139,7 +139,7 @@ class Identity(_Kept):
             exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
             augmentation=augmentation,
             views=bool(plan.whole),
-            recall=usual_recall(sensor, embedding) if recall is None else recall,
+            recall=(usual_recall(sensor, embedding) if recall is None else recall) or None,
         )
 
     @classmethod
@@ -202,7 +202,7 @@ class Identity(_Kept):
         """
         made = self.recall
         if made is None:
-            # Where there are views it is older, or keeps none.
+            # Where it has views it keeps none; without, it is older or has no use for any.
             made = 0 if self.views else usual_recall(self.sensor, embedding)
         if asked not in (None, made):
             raise MismatchError(

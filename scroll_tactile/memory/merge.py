@@ -219,10 +219,11 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
             f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
             f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
         )
-    if whole and memory.kept is not None and mine.recall != other.recall:
+    older = other.recall is None and not other.views  # than recall: what it compacted is of no kept touch
+    if whole and memory.kept is not None and not older and (other.recall or 0) != memory.kept.capacity:
         raise MismatchError(
             f"{theirs.path} was compacted and keeps {other.recall or 0} touches for recall; {ours.path} keeps "
-            f"{mine.recall or 0}, and the readings for the others are gone"
+            f"{memory.kept.capacity}, and the readings for the others are gone"
         )
 
 

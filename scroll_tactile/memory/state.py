@@ -222,15 +222,15 @@ class Memory:
             return touches.get((material, key)) or self._touch(*self.codes(store.record(sequence)))
 
         fresh.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
+        read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
         if fresh.kept is not None:
-            self._keep_again(fresh.kept, store, heads)
+            self._keep_again(fresh.kept, store, read)
         if fresh.exemplars is not None:
-            kept = ((head.label, head.key, head.sequence) for head in heads if head.attributes.get("nbytes"))
-            fresh.exemplars.update(kept)
+            fresh.exemplars.update((head.label, head.key, head.sequence) for head in read)
         return fresh
 
     def _keep_again(self, kept: KeptTouches, store: Store, heads: Sequence[Head]) -> None:
-        """Take in those of some observations that belong to the kept touches, as far as their readings are there."""
+        """Take in those of some observations, whose rows hold readings, that belong to the kept touches."""
         mine = {(material, key): levels for material, key, levels in self.kept or ()}
         rows: Sample[int | None] = Sample(kept.capacity)
         rows.update((material, key, None) for material, key, _ in kept)

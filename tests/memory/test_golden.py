@@ -4,6 +4,7 @@
 and `expected.json`, what was in it. A release adds its own and never touches those of others.
 """
 
+import hashlib
 import json
 import shutil
 import sqlite3
@@ -16,12 +17,20 @@ import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner, __version__
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.state import Memory
 from store import Store, VersionError
 
 DATA = Path(__file__).parents[1] / "data"
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
-# Of what releases before 0.3 observed: their windows count as the stages they make, but for what was compacted.
-EARLIER = dict.fromkeys(("0.1.0", "0.2.0"), "404affb8415708c5b8c2abb080374079e5b305734800051334127358b264f93e")
+# Of what earlier releases observed: it is viewed and kept as now, but for what was compacted. Windows of those before 0.3
+# count as the stages they make, but for the same.
+EARLIER = {
+    "0.1.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
+    "0.2.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
+    "0.3.0": "fd4382a21ead3d6d3a1a7e110ebc593960402bd1d8fe83188c99697183a73705",
+}
+NAMES = ("felt", "Samt ü/√", "cork")
+COMPACTED = (0, 1, 2, 3, 6, 7, 8, 9, 11)  # seeds of the touches whose readings are gone, of 60 readings each
 ASKED = [(100 + seed, readings) for seed in range(3) for readings in (9, 30, 60)]
 
 
@@ -46,14 +55,36 @@ def content(learner):
         "tuned": learner.tuned_digest(),
         "descriptions": learner.descriptions,
         "answers": [[answer.material, round(answer.probability, 6)] for answer in answers],
+        "kept": kept(learner),
     }
+
+
+def kept(learner):
+    """The touches kept for recall, each as its material and key, and a digest of their levels."""
+    touches = learner.memory.kept.touches()
+    levels = hashlib.sha256(b"".join(touch.levels.tobytes() for touch in touches)).hexdigest()
+    return [[touch.material, touch.key.hex()] for touch in touches], levels
+
+
+def fresh(seeds):
+    """A memory without a path that observes now what is in a golden store: touches of some seeds, and the last."""
+    learner = TactileLearner(sensor=PAD, embedding=Kernels(seed=0, dimension=64), exemplars=4)
+    for seed in seeds:
+        learner.observe(NAMES[seed % 3], stream(seed, 60))
+    learner.observe("cork", stream(20, 40))
+    return learner
+
+
+def arrays_of(learner, endings):
+    """The arrays of the statistics whose names end so, to the byte."""
+    arrays, _ = learner.memory.statistics.to_arrays()
+    return {name: array.tobytes() for name, array in arrays.items() if name.endswith(tuple(endings))}
 
 
 def require(learner, expected):
-    found = content(learner)
-    assert {name: found[name] for name in found if name != "answers"} == {
-        name: expected[name] for name in expected if name not in ("answers", "earlier")
-    }
+    found = json.loads(json.dumps(content(learner)))
+    exact = [name for name in expected if name not in ("answers", "earlier")]
+    assert {name: found[name] for name in exact} == {name: expected[name] for name in exact}
     if not expected.get("earlier"):  # their readouts were others
         for (name, probability), (material, share) in zip(found["answers"], expected["answers"], strict=True):
             assert name == material
@@ -63,14 +94,13 @@ def require(learner, expected):
 def write(folder):
     """Make the store: felt, retracted, merged, compacted, fine-tuned, and left as a killed process leaves it."""
     shutil.rmtree(folder, ignore_errors=True)
-    names = ["felt", "Samt ü/√", "cork"]
     with open_golden(folder / "other") as other:
         for seed in range(6):
-            other.observe(names[seed % 3], stream(seed, 60))
+            other.observe(NAMES[seed % 3], stream(seed, 60))
         other.compact(keep=2)
     learner = open_golden(folder / "memory")
     with learner.batch():
-        receipts = [learner.observe(names[seed % 3], stream(seed, 60)) for seed in range(6, 18)]
+        receipts = [learner.observe(NAMES[seed % 3], stream(seed, 60)) for seed in range(6, 18)]
     learner.retract(receipts[4])
     learner.describe("felt", {"wool": 0.75, "viscose": 0.25})
     learner.describe("cork", {"soft": False, "natural": True})
@@ -95,7 +125,7 @@ def golden(request, tmp_path):
     shutil.copytree(DATA / request.param / "store", tmp_path / "m")
     expected = json.loads((DATA / request.param / "expected.json").read_text(encoding="utf-8"))
     if request.param in EARLIER:
-        expected |= {"digest": EARLIER[request.param], "earlier": True}
+        expected |= {"digest": EARLIER[request.param], "earlier": request.param}
     return tmp_path / "m", expected
 
 
@@ -123,6 +153,29 @@ def test_it_is_written_on(golden):
         require(learner, expected)
 
 
+def test_it_is_upgraded_to_what_its_touches_give_now_once(golden, monkeypatch):
+    path, expected = golden
+    earlier, embedded = expected.get("earlier"), []
+    codes = Memory.codes
+    monkeypatch.setattr(Memory, "codes", lambda self, record: embedded.append(record) or codes(self, record))
+    there = [seed for seed in range(18) if seed != 10]
+    now = fresh([seed for seed in there if not (earlier and seed in COMPACTED)])
+    with open_golden(path) as learner:
+        views = [f"-{view}" for view in learner.plan.views]
+        assert arrays_of(learner, views) == arrays_of(now, views)
+        if earlier in (None, "0.3.0"):
+            widths = ["observations", "lengths", *(f"-{width}" for width in learner.plan.widths)]
+            assert arrays_of(learner, widths) == arrays_of(fresh(there), widths)
+        assert kept(learner) == kept(now)
+        assert (learner.digest() == now.digest()) == (not earlier)
+    assert embedded
+    embedded.clear()
+    with open_golden(path) as learner:
+        assert kept(learner) == kept(now)
+        assert learner.digest() == expected["digest"]
+    assert not embedded
+
+
 def test_every_kind_of_row_and_generation_is_in_it(golden):
     path, _ = golden
     assert (path / "journal.sqlite-wal").stat().st_size > 0
@@ -138,7 +191,7 @@ def test_it_is_what_this_release_writes(tmp_path):
     current = DATA / __version__
     write(tmp_path / "again")
     again, expected = (json.loads((one / "expected.json").read_text()) for one in (tmp_path / "again", current))
-    for exact in ("digest", "materials", "exemplars", "descriptions"):  # an f* is not the same on every machine
+    for exact in ("digest", "materials", "exemplars", "descriptions", "kept"):  # an f* is not the same on every machine
         assert again[exact] == expected[exact]
     shutil.copytree(current / "store", tmp_path / "golden")  # a look with SQLite empties its log
     shapes = []

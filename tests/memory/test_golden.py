@@ -22,8 +22,8 @@ from store import Store, VersionError
 
 DATA = Path(__file__).parents[1] / "data"
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
-# Of what earlier releases observed: it is viewed and kept as now, but for what was compacted. Windows of those before 0.3
-# count as the stages they make, but for the same.
+# Of what earlier releases observed: it is viewed and kept as now, but for what was compacted. Before 0.3 its windows
+# count as the stages that they make, but for the same.
 EARLIER = {
     "0.1.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
     "0.2.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",

@@ -53,12 +53,18 @@ def without(*places):
     return [pair for i, pair in enumerate(OBSERVED) if i not in places]
 
 
+def kept_of(learner):
+    """The touches kept for recall, to the byte; None of a memory that keeps none."""
+    kept = learner.memory.kept
+    return None if kept is None else [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
+
+
 def contents(learner, *, exemplars=True):
-    """Digest, exemplars, pool and answers, to the byte."""
+    """Digest, exemplars, pool, kept touches and answers, to the byte."""
     pool = [(name, key, touch.rows.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
     learner.settle()
     answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60), (9, 300))]
-    return learner.digest(), learner.exemplars if exemplars else None, pool, answers
+    return learner.digest(), learner.exemplars if exemplars else None, pool, kept_of(learner), answers
 
 
 def require_same(learner, observed, described=(), *, exemplars=True, **settings):

@@ -50,7 +50,8 @@ def warm() -> None:
     from numcodecs import blosc  # noqa: F401
 
 
-_settings: dict[str, Any] = dict(SETTINGS)
+# Fewer kept touches than are observed, so that what was left out of them has to come back.
+_settings: dict[str, Any] = SETTINGS | {"recall": 5}
 
 
 def settings() -> dict[str, Any]:
@@ -302,6 +303,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
         "exemplars": {name: [key.hex() for key in keys] for name, keys in learner.exemplars.items()},
         "tuned": learner.tuned_digest(),
         "pool": _pool(learner),
+        "kept": _kept(learner),
         "last": memory.sequence,
         "base": memory.base if store is None else store.compacted,
     }
@@ -311,6 +313,15 @@ def _pool(learner: TactileLearner) -> str:
     digest = hashlib.sha256()
     for name, key, touch in learner._ledger.memory.sample:
         digest.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes())).encode())
+    return digest.hexdigest()
+
+
+def _kept(learner: TactileLearner) -> str:
+    """A digest of the arrays of the touches kept for recall."""
+    arrays, materials = learner._ledger.memory.kept.to_arrays()
+    digest = hashlib.sha256(repr(materials).encode())
+    for name in sorted(arrays):
+        digest.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())
     return digest.hexdigest()
 
 

@@ -10,6 +10,7 @@ from examples.paper.commands.paper_command import activation, efficiency, everyt
 from examples.paper.commands.replay_command import replay
 from examples.paper.commands.robustness_command import robustness
 from examples.paper.commands.schedules_command import schedules
+from examples.paper.commands.strengths_command import strengths
 from examples.paper.commands.transfer_command import transfer
 from scroll_tactile.cli.terminal import Commands
 
@@ -21,7 +22,7 @@ app = typer.Typer(
     add_completion=False,
     help="Measure what the paper measured, and ours beside it, on your copy of the data; figures: RESULTS.md.",
 )
-for command in (table1, efficiency, activation, robustness, replay, continual, schedules):
+for command in (table1, efficiency, activation, robustness, strengths, replay, continual, schedules):
     app.command()(command)
 app.add_typer(fabric, name="fabric")
 app.add_typer(transfer, name="transfer")

@@ -16,9 +16,9 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.signals.augmentation import Image, changed, resize
 from scroll_tactile.signals.stream import Stream, fewest_readings
 
-__all__ = ["dead", "drift", "length", "noise", "speed"]
+__all__ = ["dead", "drift", "gaussian", "length", "noise", "speed"]
 
-_KINDS = {"noise": 0, "dead": 1, "drift": 2}
+_KINDS = {"noise": 0, "dead": 1, "drift": 2, "gaussian": 3}
 
 
 def length(stream: Stream, seconds: float, seed: int = 0) -> Stream:
@@ -51,6 +51,11 @@ def noise(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
     leaves the range is clipped to it, as a converter does.
     """
     return _drawn(stream, "noise", amplitude, seed, lambda image, rng: _hiss(image, amplitude, rng))
+
+
+def gaussian(stream: Stream, amplitude: float, seed: int = 0) -> Stream:
+    """Gaussian noise of the energy of `noise`: its standard deviation is amplitude / √3 of the range; clipped to it."""
+    return _drawn(stream, "gaussian", amplitude, seed, lambda image, rng: _blur(image, amplitude / math.sqrt(3), rng))
 
 
 def dead(stream: Stream, share: float, seed: int = 0) -> Stream:
@@ -93,6 +98,16 @@ def _hiss(image: Image, amplitude: float, rng: np.random.Generator) -> Image:
     """
     noise = rng.random(image.shape, dtype=np.float32) * np.float32(2) - np.float32(1)
     noisy: Image = np.clip(image + noise * np.float32(2 * amplitude), np.float32(-1), np.float32(1))
+    return noisy
+
+
+def _blur(image: Image, deviation: float, rng: np.random.Generator) -> Image:
+    """The touch observed by a noisy sensor: Gaussian noise of this standard deviation, a share of the range; clipped.
+
+    image: float32 of shape (C, T) in [-1, 1], twice the share. Every value has noise of its own.
+    """
+    noise = rng.standard_normal(image.shape, dtype=np.float32)
+    noisy: Image = np.clip(image + noise * np.float32(2 * deviation), np.float32(-1), np.float32(1))
     return noisy
 
 

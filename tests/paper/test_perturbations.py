@@ -6,10 +6,10 @@ from paper_touches import PAD
 
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError, StreamTooShortError
-from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
+from scroll_tactile.pipelines.robustness import dead, drift, gaussian, length, noise, speed
 from scroll_tactile.signals.stream import validate
 
-DRAWN = (noise, dead, drift)
+DRAWN = (noise, gaussian, dead, drift)
 
 
 def touch(seed=0, readings=100):
@@ -51,6 +51,15 @@ def test_noise_is_as_wide_as_it_says():
     assert 1.98 < np.abs(added).max() <= 2.001  # a quarter of the range of 8
     assert abs(added.std() - 2 / 3**0.5) < 0.02
     loud = noise(stream, 1.0, 0).readings
+    assert (loud.min(), loud.max()) == (-2, 6)
+
+
+def test_gaussian_noise_has_the_energy_of_the_uniform():
+    stream = validate(np.full((2000, 10), 2.0), PAD)
+    added = gaussian(stream, 0.25, 0).readings - 2
+    assert abs(added.std() - noise(stream, 0.25, 0).readings.std()) < 0.03
+    assert np.abs(added).max() > 3.9  # has tails, of a range of 8 about the middle
+    loud = gaussian(stream, 1.0, 0).readings
     assert (loud.min(), loud.max()) == (-2, 6)
 
 

@@ -156,7 +156,7 @@ def patched(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, reader in sets.items():
         monkeypatch.setitem(SETS, name, reader)
     monkeypatch.setattr(
-        "examples.paper.commands.robustness_command.read", lambda dataset, data, seed: sets[dataset.value](data, seed)
+        "examples.paper.commands.strengths_command.read", lambda dataset, data, seed: sets[dataset.value](data, seed)
     )
 
 
@@ -186,9 +186,9 @@ class TestCommand:
             (("table1", "--systems", "svm", "--sets", "roboskin-20", "--folds", "9"), "out of [0, 1, 2]"),
             (("table1", "--sets", "gelsight", "--systems", "svm"), "github.com/clear-nus/octopi"),
             (("table1", "--systems", "svm", "--json", "none/x.json"), "folder that exists"),
-            (("robustness", "speed", "--systems", "least-squares"), "ours, svm, svm-spikes, conv-lstm, snn, resnet"),
-            (("robustness", "speed", "--systems", "resnet-pretrained"), "give --weights"),
-            (("robustness", "speed", "--systems", "svm", "--sets", "roboskin-20", "--folds", "9"), "out of [0, 1, 2]"),
+            (("strengths", "speed", "--systems", "least-squares"), "ours, svm, svm-spikes, conv-lstm, snn, resnet"),
+            (("strengths", "speed", "--systems", "resnet-pretrained"), "give --weights"),
+            (("strengths", "speed", "--systems", "svm", "--sets", "roboskin-20", "--folds", "9"), "out of [0, 1, 2]"),
         ],
     )
     def test_what_cannot_be_is_one_red_line(self, tmp_path: Path, words: tuple[str, ...], message: str):
@@ -235,12 +235,12 @@ class TestCommand:
     def test_noise_is_measured_of_the_papers_systems_and_ours(self, tmp_path: Path):
         pytest.importorskip("matplotlib")
         file = tmp_path / "noise.json"
-        words = ("robustness", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")
+        words = ("strengths", "noise", "--data", tmp_path, "--quick", "--epochs", 1, "--run", tmp_path / "run")
         result = run(*words, "--systems", "svm,conv-lstm", "--json", file, "--plot", tmp_path / "noise.png")
         assert result.exit_code == 0, result.output
         assert "73.0 %" in result.output and "80.0 %" in result.output
         kept = json.loads(file.read_text())
-        assert kept["command"].startswith("python -m examples.paper robustness noise --data DATA --sets biotac-20,")
+        assert kept["command"].startswith("python -m examples.paper strengths noise --data DATA --sets biotac-20,")
         means = {(item["dataset"], item["strength"], item["system"], item["augmented"]): item for item in kept["means"]}
         assert len(means) == 16
         assert means["RoboSkin-20", 0.0, "svm", False]["mean"] > 0.5  # of three materials
@@ -257,15 +257,15 @@ class TestCommand:
         module = sys.modules["examples.paper.commands.paper_command"]
         monkeypatch.setattr(module, "SYSTEMS", {"svm-spikes": "SVM on spikes"})
         monkeypatch.setattr(module, "CURVES", ("kernels-lda",))
-        monkeypatch.setattr("examples.paper.commands.robustness_command.CHOICES", ("svm-spikes",))
+        monkeypatch.setattr("examples.paper.commands.strengths_command.CHOICES", ("svm-spikes",))
         words = ("all", "--data", tmp_path, "--out", tmp_path, "--quick", "--run", tmp_path / "run")
         for _ in range(2):
             result = run(*words)
             assert result.exit_code == 0, result.output
         made = {file.name for file in tmp_path.iterdir() if file.is_file()}
-        pictures = {f"robustness-{name}.png" for name in ("biotac-20", "roboskin-20")}
-        assert made == {"table1.json", "efficiency.json", "efficiency.png", "robustness.json", *pictures}
-        studies = {item["study"] for item in json.loads((tmp_path / "robustness.json").read_text())["means"]}
+        pictures = {f"strengths-{name}.png" for name in ("biotac-20", "roboskin-20")}
+        assert made == {"table1.json", "efficiency.json", "efficiency.png", "strengths.json", *pictures}
+        studies = {item["study"] for item in json.loads((tmp_path / "strengths.json").read_text())["means"]}
         assert studies == {"length", "speed", "noise"}
 
 

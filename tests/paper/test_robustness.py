@@ -1,93 +1,121 @@
-"""Studies test systems that were trained on clean touches on perturbed ones, and resume where they were."""
+"""The default learner on every row: resumable, by folds, beside another checkout's, and on series of other sensors."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run
-from paper_touches import PAD
+from commands import refused, run
+from paper_touches import PATCH, recorded
 
-from examples.paper import drawing as plots
-from examples.paper.plots import draw_robustness, robustness_curves
-from examples.paper.studies.robustness_study import Robustness, ours, summary
+from examples.paper.studies.default_learner import Checkout, answers
+from examples.paper.studies.robustness_study import NOVELTY, PERTURBED, SESSION, Robustness, Series, summary
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
-from scroll_tactile.errors import DatasetError, InputError
-from scroll_tactile.signals.stream import validate
+from scroll_tactile.errors import InputError
 
-MATERIALS = ("dull", "loud", "lost")
-
-
-def recordings(*, ordered=True):
-    rng = np.random.default_rng(0)
-    streams, names = [], []
-    for i, name in enumerate(MATERIALS):
-        for _ in range(20):
-            rhythm = np.sin(np.arange(100)[:, None] * (i + 1) / 5 + rng.uniform(0, 6, (1, 10)))
-            streams.append(validate(2 + rhythm + 0.1 * rng.standard_normal((100, 10)), PAD))
-            names.append(name)
-    repetition = np.tile(np.arange(20), 3)
-    return Recordings("made up", PAD, streams, names, repetition, repetition % 2, ordered)
+HERE = Path(__file__).resolve().parents[2]
+ROWS = [*PERTURBED, NOVELTY]
 
 
-class Loudest:
-    """Knows the material by the spread of its readings; `made` counts how often one was trained."""
-
-    made = 0
-
-    def __init__(self, train, augmented, progress):
-        type(self).made += 1
-        self.means = {name: np.mean([s.readings.std() for m, s in train if m == name]) for name in MATERIALS}
-
-    def predict(self, streams):
-        return [min(self.means, key=lambda m: abs(self.means[m] - s.readings.std())) for s in streams]
+def few(*, ordered: bool = False) -> Recordings:
+    return recorded(PATCH, materials=5, each=10, folds=5, ordered=ordered)
 
 
-def study(folder=None, **settings):
-    Loudest.made = 0
-    return Robustness(recordings(), {"loudest": Loudest}, quick=True, folder=folder, **settings)
-
-
-def test_a_system_is_trained_once_a_fold_for_all_studies_and_once_for_another_session():
-    task = study(augmented=(False,))
-    (records,) = task.run([0])
-    assert Loudest.made == 2
-    assert [item["study"] for item in records if item["strength"] == 0] == ["noise", "dead", "drift", "session"]
-    assert {item["tested"] for item in records} == {30}
-    assert all(0 <= item["accuracy"] <= 1 for item in records)
-
-
-def test_records_are_of_the_perturbed_touches_of_their_fold():
-    task = study(studies=["noise"], augmented=(False,))
-    (records,) = task.run([1])
-    train, test = task._split(1, False)
-    assert len(train) + len(test) == 60
-    system = Loudest(train, False, print)
-    for record in records:
-        evaluated = task._perturbed(test, "noise", record["strength"])
-        predicted = system.predict([stream for _, stream in evaluated])
-        right = np.mean([name == item for (name, _), item in zip(evaluated, predicted, strict=True)])
-        assert record["accuracy"] == right
-    assert task._perturbed(test, "noise", 0.5)[0][1] != test[0][1]
-
-
-def test_an_interrupted_run_goes_on(tmp_path):
+def test_every_row_has_its_figures_and_what_is_noted_is_read_back(tmp_path):
     def stop(what, done, of):
-        if "dead" in what:
+        if "noise-quarter" in what:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(study(tmp_path / "run").run([0], stop))
+        list(Robustness(few(), folder=tmp_path / "run").run([0], stop))
     kept = json.loads((tmp_path / "run" / "robustness.json").read_text())["notes"]
-    assert 0 < len(kept) < len(study().cells(0))
-    reported = []
-    whole = list(study(tmp_path / "run").run([0], lambda what, done, of: reported.append(what)))
-    assert whole == list(study().run([0]))
-    again = study(tmp_path / "run")
-    assert list(again.run([0])) == whole
-    assert Loudest.made == 0  # all was read back
+    assert "now/noise-half/0" in kept and "now/noise-quarter/0" not in kept
+    asked = []
+    (resumed,) = Robustness(few(), folder=tmp_path / "run").run([0], lambda what, done, of: asked.append(what))
+    assert not any("clean" in what for what in asked)
+    (records,) = Robustness(few()).run([0])
+    assert resumed == records
+    assert [record["row"] for record in records] == ROWS
+    assert records[0]["accuracy"] == 1 and records[0]["tested"] == 10
+    assert all(0 <= record["calibration_error"] <= 1 and 0 <= record["known"] <= 1 for record in records[:-1])
+    assert 0.5 < records[-1]["novelty_auroc"] <= 1 and records[-1]["tested"] == 50
     with pytest.raises(InputError, match="another run"):
-        list(study(tmp_path / "run", seed=1).run([0]))
+        list(Robustness(few(), seed=1, folder=tmp_path / "run").run([0]))
+
+
+def test_the_session_is_successive_repetitions_where_their_order_is_known():
+    sets = recorded(PATCH, materials=2, each=50, folds=5, ordered=True)
+    _, session, *rotated = Robustness(sets).fits(4)
+    assert [*session.tests] == [SESSION]
+    last = {stream.key for _, stream in session.tests[SESSION]}
+    assert last == {sets.streams[i].key for i in [*range(40, 50), *range(90, 100)]}
+    assert last.isdisjoint(stream.key for _, stream in session.train)
+    assert [{material for material, _ in fit.train} for fit in rotated] == [{sets.materials[50]}, {sets.materials[0]}]
+    assert all(SESSION not in fit.tests for fit in Robustness(few()).fits(0))
+
+
+def test_means_are_over_folds():
+    figures = {"calibration_error": 0.0, "known": 1.0, "tested": 4}
+    rows = [{"side": "now", "row": "clean", "fold": i, "accuracy": share} | figures for i, share in enumerate((0.5, 1))]
+    assert summary(rows)["now"]["clean"]["accuracy"] == {"mean": 0.75, "sd": pytest.approx(0.125**0.5), "folds": 2}
+
+
+def test_another_checkout_answers_the_same_touches():
+    sets = few()
+    train = [(name, stream.readings) for name, stream in zip(sets.materials[::2], sets.streams[::2], strict=True)]
+    tests = {"whole": [stream.readings for stream in sets.streams[1::20]], "none": [sets.streams[3].readings[:2]]}
+    said = []
+    there = dict(Checkout(HERE)(sets.sensor, train, tests, lambda *progress: said.append(progress)))
+    assert there == dict(answers(sets.sensor, train, tests, lambda *progress: None))
+    assert ("learning", 0, 25) in said
+    with pytest.raises(InputError, match="no scroll_tactile"):
+        Checkout(HERE / "tests")
+    with pytest.raises(InputError, match="ended with 1"):
+        list(Checkout(HERE)(sets.sensor, [("", train[0][1])], tests, lambda *progress: None))
+
+
+def made_up_series(path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    lengths = rng.integers(20, 40, 24)
+    label = np.arange(24) % 2
+    touches = [
+        np.sin(np.arange(n) * (1 + kind) / 3 + rng.uniform(0, 6)) for n, kind in zip(lengths, label, strict=True)
+    ]
+    arrays = {"lengths": lengths, "label": label, "test": np.arange(24) >= 16, "range": np.array([-1.0, 1.0])}
+    readings = np.concatenate(touches).astype(np.float32)[:, None]
+    np.savez(path, **{f"Waves/{part}": array for part, array in (arrays | {"readings": readings}).items()})
+    return path
+
+
+def test_series_have_the_split_and_range_that_they_come_with(tmp_path):
+    study = Series(made_up_series(tmp_path / "series.npz"))
+    fit = study.fits()["Waves"]
+    assert (fit.sensor.low, fit.sensor.high, fit.sensor.rate, len(fit.train)) == (-1, 1, 100, 16)
+    assert fit.sensor.duration == pytest.approx(np.median([len(stream) for _, stream in fit.train]) / 100)
+    (record,) = study.run()
+    assert record["name"] == "Waves" and record["tested"] == 8 and record["accuracy"] > 0.8
+    (tmp_path / "text.npz").write_text("none")
+    with pytest.raises(InputError, match="cannot be read"):
+        Series(tmp_path / "text.npz").fits()
+
+
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr("examples.paper.commands.robustness_command.read", lambda dataset, data, seed: few())
+    words = ("robustness", "--data", tmp_path, "--set", "roboskin-20", "--folds", "0", "--run", tmp_path / "run")
+    words = (*words, "--series", made_up_series(tmp_path / "series.npz"))
+    result = run(*words, "--before", HERE, "--json", tmp_path / "r.json")
+    assert result.exit_code == 0, result.output
+    assert "folds 0" in result.output and "AUROC" in result.output and "Waves" in result.output
+    kept = json.loads((tmp_path / "r.json").read_text())
+    assert kept["folds"] == {"roboskin-20": [0]} and "--before CHECKOUT" in kept["command"]
+    assert kept["now"] == kept["before"]  # it is this checkout
+    assert list(kept["now"]["roboskin-20"]) == ROWS
+    assert kept["now"]["series"]["mean"]["accuracy"] == kept["now"]["series"]["Waves"]["accuracy"]
+    assert run(*words).exit_code == 0
+    assert "out of [0, 1, 2, 3, 4]" in refused(*words[:6], "7")
+    assert "came 'biotac-50'" in refused(*words[:4], "biotac-50")
+    assert "no such file" in refused(*words[:3], "--series", tmp_path / "none.npz")
 
 
 def test_a_cameras_frames_are_refused():
@@ -96,59 +124,15 @@ def test_a_cameras_frames_are_refused():
     within = np.tile(np.arange(4), 2)
     frames = Recordings("gel", streams[0].sensor, streams, [*"aaaabbbb"], within, within % 2, ordered=False)
     with pytest.raises(InputError, match="of camera 'gelsight'"):
-        Robustness(frames, {"loudest": Loudest}, studies=["noise"])
-
-
-def test_what_cannot_be_is_refused():
-    with pytest.raises(InputError, match=r"came \['weather'"):
-        study(studies=["weather"])
-    with pytest.raises(InputError, match=r"folds out of \[0, 1\]"):
-        list(study().run([5]))
-    with pytest.raises(DatasetError, match="blocked"):
-        Robustness(recordings(ordered=False), {"loudest": Loudest})
-
-
-def test_ours_learns_as_it_is_and_others_with_augmentation_too():
-    make, settings = ours(PAD)
-    assert "Kernels" in settings["embedding"]
-    systems = {"ours": make, "loudest": Loudest}
-    task = Robustness(recordings(), systems, {"ours": settings}, studies=["dead"], plain=["ours"], quick=True)
-    (records,) = task.run([0])
-    found = {(item["system"], item["strength"], item["augmented"]): item["accuracy"] for item in records}
-    assert found["ours", 0.0, False] == 1
-    assert {key[2] for key in found if key[0] == "ours"} == {False}
-    assert {key[2] for key in found if key[0] == "loudest"} == {False, True}
-
-
-def test_the_picture(tmp_path):
-    rows = summary([record for fold in study().run([0, 1]) for record in fold])
-    lines = robustness_curves(rows)
-    assert list(lines) == ["length", "speed", "noise", "dead", "drift", "session"]
-    assert [strength for strength, *_ in lines["speed"]["loudest", True]] == [0.5, 1, 2]
-    if plots.available():
-        draw_robustness(tmp_path / "p.png", rows, title="made up")
-        assert (tmp_path / "p.png").stat().st_size > 10_000
-    with pytest.raises(InputError):
-        draw_robustness(tmp_path / "p.png", [], title="nothing")
+        Robustness(frames)
+    with pytest.raises(InputError, match="0 or more; came -1"):
+        Robustness(few(), seed=-1)
 
 
 def test_the_command_on_real_touches(real_data, tmp_path):
-    words = [
-        "robustness",
-        "dead",
-        "--sets",
-        "roboskin-20",
-        "--data",
-        real_data,
-        "--quick",
-        "--materials",
-        2,
-        "--folds",
-        0,
-    ]
-    result = run(*words, "--json", tmp_path / "r.json", "--plot", tmp_path / "r.png", "--run", tmp_path / "run")
+    words = ("robustness", "--set", "biotac-20", "--data", real_data, "--materials", 5, "--folds", 0)
+    result = run(*words, "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.output
-    reported = json.loads((tmp_path / "r.json").read_text())
-    assert {row["strength"] for row in reported["means"]} == {0.0, 0.2}
-    assert min(row["mean"] for row in reported["means"]) > 0.8
-    assert run(*words, "--run", tmp_path / "run").exit_code == 0
+    rows = json.loads((tmp_path / "r.json").read_text())["now"]["biotac-20"]
+    assert list(rows) == [*PERTURBED, SESSION, NOVELTY]
+    assert rows["clean"]["accuracy"]["mean"] > 0.9

@@ -35,8 +35,8 @@ from examples.paper.commands.options import (
     read_sets,
     say_conditions,
 )
-from examples.paper.commands.robustness_command import StudyChoice, robustness
 from examples.paper.commands.sets import draw_into, require_folders
+from examples.paper.commands.strengths_command import StudyChoice, strengths
 from examples.paper.plots import draw_activation, draw_efficiency
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.activation_study import ActivationStudy
@@ -194,7 +194,7 @@ def everything(
     quick: Quick = False,
     run: Run = None,
 ) -> None:
-    """All of it, one after the other: table1, efficiency, robustness paper, and with weights activation."""
+    """All of it, one after the other: table1, efficiency, strengths paper, and with weights activation."""
     require_folders(out / "table1.json")
     shared: dict[str, Any] = {"data": data, "weights": weights, "epochs": epochs, "device": device, "seed": seed}
     shared |= {"precision": precision, "quick": quick}
@@ -205,7 +205,7 @@ def everything(
 
     table1(**shared, folds=folds, **files("table1", picture=False))
     efficiency(**shared, folds=folds, **files("efficiency"))
-    robustness(StudyChoice.PAPER, systems="all", **shared, folds=folds, **files("robustness"))
+    strengths(StudyChoice.PAPER, systems="all", **shared, folds=folds, **files("strengths"))
     if weights is not None:
         activation(**shared, **files("activation"))
 

@@ -1,38 +1,19 @@
-"""`robustness`: systems trained on clean touches, tested on shorter, faster, noisier ones."""
+"""`robustness`: the default learner, told nothing, on shorter, faster, noisier touches, and never touched materials."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.table import Table
 
-from examples.paper.commands.options import (
-    QUICK_EPOCHS,
-    QUICK_SETS,
-    Data,
-    Device,
-    Epochs,
-    FewMaterials,
-    Folds,
-    InPrecision,
-    Json,
-    Plot,
-    PrecisionChoice,
-    Run,
-    Seed,
-    Weights,
-    Where,
-)
+from examples.paper.commands.options import Data, FewMaterials, Folds, Json, Run, Seed
 from examples.paper.commands.sets import (
     Dataset,
     command_line,
-    draw_into,
-    leave_out,
     named,
     origin,
     parse_folds,
@@ -40,184 +21,107 @@ from examples.paper.commands.sets import (
     require_folders,
     write_result,
 )
-from examples.paper.plots import draw_robustness
-from examples.paper.runs.study import columns_averaged, weights_digest
-from examples.paper.studies.baselines import BASELINES, baseline
+from examples.paper.studies.default_learner import Answering, Checkout, answers
 from examples.paper.studies.replay import subset
-from examples.paper.studies.robustness_study import NAMES, PAPER, SESSION, Make, Robustness, ours, summary
-from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, Catalogue
-from examples.paper.systems.descent import Course
-from examples.paper.systems.trained import require_device
+from examples.paper.studies.robustness_study import FIGURES, NOW, Robustness, Series, summary
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
-__all__ = ["IN_THE_PAPER", "robustness"]
+__all__ = ["robustness"]
 
-IN_THE_PAPER = ("length", "speed", "noise")
-"""The studies that the paper has a figure of."""
-
-OURS = "ours"
-CHOICES = (OURS, *BASELINES)
-
-
-class StudyChoice(StrEnum):
-    """The studies, those of the paper, and all of them."""
-
-    LENGTH = "length"
-    SPEED = "speed"
-    NOISE = "noise"
-    DEAD = "dead"
-    DRIFT = "drift"
-    SESSION = "session"
-    PAPER = "paper"
-    ALL = "all"
+USUAL = (Dataset.BIOTAC, Dataset.ROBOSKIN, Dataset.UNMIXED)
+BEFORE = "before"
 
 
 def robustness(
-    study: Annotated[
-        StudyChoice, typer.Argument(help="How test touches differ; paper: length, speed, noise.", show_default=False)
-    ],
     data: Data,
-    sets: Annotated[
-        str, typer.Option(help=f"Which data sets, of {', '.join(Dataset)}; a picture for each.")
-    ] = ",".join(QUICK_SETS),
-    systems: Annotated[str, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; or all.")] = OURS,
-    weights: Weights = None,
+    sets: Annotated[str, typer.Option("--set", "--sets", help=f"Which data sets, of {', '.join(Dataset)}.")] = ",".join(
+        USUAL
+    ),
     folds: Folds = "all",
-    epochs: Epochs = None,
-    device: Where = Device.CPU,
-    precision: InPrecision = PrecisionChoice.FLOAT32,
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="The first of these folds, few strengths, 6 epochs of networks on small images."),
-    ] = False,
+    series: Annotated[
+        Path | None, typer.Option(help="An .npz of series of other sensors: also measure these, split as published.")
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(help="An older checkout of the project, whose default learner is measured beside.")
+    ] = None,
     seed: Seed = 0,
     run: Run = None,
     json: Json = None,
-    plot: Plot = None,
     materials: FewMaterials = 20,
 ) -> None:
-    """Train on clean touches, test on shorter, faster, noisier ones; ours as it is, others with augmentation, too.
+    """Train the default learner on clean touches, nothing told to it, and test it on all that can befall a touch.
 
-    A system learns a fold once, with one setting, for all studies; only another recording session has folds of its own.
+    Figures of a run's folder are read back: a changed project needs another.
     """
-    require_folders(json, plot)
-    require_device(device.value)
-    keys = _choose(systems, weights)
-    passes = epochs or (QUICK_EPOCHS if quick else 100)
-    course = Course.in_proportion(passes, precision.value)
-    kept: dict[str, Any] = {}
-    means: list[dict[str, Any]] = []
+    require_folders(json)
+    sides: dict[str, Answering] = {NOW: answers}
+    if before is not None:
+        sides[BEFORE] = Checkout(before)
+    if series is not None and not series.is_file():
+        raise InputError(f"expected sets of series in {series}; there is no such file")
+    found: dict[str, dict[str, Any]] = {side: {} for side in sides}
+    tested: dict[str, list[int]] = {}
     records: list[dict[str, Any]] = []
     with progress_bar() as progress:
-        for name in named("--sets", sets, list(Dataset)):
+        for name in named("--set", sets, list(Dataset)):
             progress("reading", 0, 1)
             recordings = read(Dataset(name), data, seed)
             if materials < 20:
                 recordings = subset(recordings, materials)
-            every = columns_averaged(recordings.sensor) if quick else 1
-            makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
-            folder = None if run is None else run / recordings.name
-            studies = _studies(study, recordings)
-            task = Robustness(
-                recordings, makes, settings, studies, plain=(OURS,), seed=seed, quick=quick, folder=folder
-            )
-            about = {"dataset": recordings.name}
-            chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
-            found = [about | record for fold in task.run(chosen, progress) for record in fold]
-            sensor = recordings.sensor.model_dump(mode="json")
-            kept[recordings.name] = {**task.plan, "settings": settings, "sensor": sensor}
-            records += found
-            means += [about | row for row in summary(found)]
-    for name in kept:
-        _show(name, [row for row in means if row["dataset"] == name])
-    networks: dict[str, Any] = {}
-    if any(key in EPOCHAL for key in keys):
-        networks = {"epochs": passes, "device": device.value, "precision": precision.value}
-        say(f"networks: {passes} epochs, on {device.value}, ResNets in {precision.value}")
-    if quick:
-        say("[yellow]quick:[/] one fold, few strengths; the ResNets' images averaged to about 50 columns")
+            chosen = parse_folds(folds or "all", recordings)
+            task = Robustness(recordings, sides, seed, None if run is None else run / recordings.name)
+            own = [record for fold in task.run(chosen, progress) for record in fold]
+            for side, rows in summary(own).items():
+                found[side][name] = rows
+            tested[name] = chosen
+            records += [{"dataset": name} | record for record in own]
+        if series is not None:
+            study = Series(series, sides, None if run is None else run / "series")
+            for record in study.run(progress):
+                rows = found[record["side"]].setdefault("series", {})
+                rows[record["name"]] = {figure: record[figure] for figure in FIGURES if figure in record}
+                records.append(record)
+    for side in sides:
+        if "series" in found[side]:
+            shares = [row["accuracy"] for row in found[side]["series"].values()]
+            found[side]["series"]["mean"] = {"accuracy": float(np.mean(shares))}
+    for name, chosen in tested.items():
+        _show(name, chosen, {side: rows[name] for side, rows in found.items()})
+    if series is not None:
+        _show_series({side: rows["series"] for side, rows in found.items()})
     if json is not None:
-        options: dict[str, Any] = {"data": "DATA", "sets": sets, "systems": ",".join(keys), "folds": folds or "all"}
-        options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
-        made = origin(command_line("robustness", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
-        write_result(json, made | {"sets": kept, "means": means, "records": records})
-    _draw(plot, list(kept), means)
+        options: dict[str, Any] = {"data": "DATA", "sets": sets, "folds": folds or "all", "series": series}
+        options |= {
+            "before": None if before is None else "CHECKOUT",
+            "seed": seed,
+            "run": None if run is None else "RUN",
+        }
+        made = origin(command_line("robustness", **options)) | {"seed": seed, "folds": tested}
+        write_result(json, made | found | {"records": records})
 
 
-def _choose(systems: str, weights: str | None) -> tuple[str, ...]:
-    """The systems of --systems; of "all" those that can be made, and a word on the others.
-
-    Raises InputError for systems that there are not, and those that need weights which are not given.
-    """
-    if systems == "all":
-        return CHOICES if weights is not None else leave_out(CHOICES, NEED_WEIGHTS, "--weights")
-    keys = named("--systems", systems, CHOICES)
-    if weights is None and (lacking := [key for key in keys if key in NEED_WEIGHTS]):
-        raise InputError(f"{', '.join(lacking)} need the weights of a trained ResNet: give --weights")
-    return keys
-
-
-def _systems(
-    keys: Sequence[str], catalogue: Catalogue, recordings: Recordings, seed: int
-) -> tuple[dict[str, Make], dict[str, Any]]:
-    """The systems by name, and what each depends on."""
-    needed = {} if catalogue.weights is None else {"weights": weights_digest(str(catalogue.weights))}
-    makes: dict[str, Make] = {}
-    settings: dict[str, Any] = {}
-    for key in keys:
-        makes[key], given = ours(recordings.sensor) if key == OURS else baseline(key, catalogue, seed)
-        settings[key] = given | (needed if key in NEED_WEIGHTS else {})
-    return makes, settings
-
-
-def _studies(study: StudyChoice, recordings: Recordings) -> list[str]:
-    if study is StudyChoice.PAPER:
-        return list(IN_THE_PAPER)
-    if study is not StudyChoice.ALL:
-        return [study.value]
-    if not recordings.ordered:
-        say(f"[yellow]not measured:[/] {SESSION}: {recordings.name} is published without its order of recording")
-    return [name for name in NAMES if name != SESSION or recordings.ordered]
-
-
-def _draw(plot: Path | None, sets: Sequence[str], means: Sequence[Mapping[str, Any]]) -> None:
-    if plot is None:
-        return
-    for name in sets:
-        # One picture a set: lines of two sensors in one panel cannot be distinguished.
-        file = plot if len(sets) == 1 else plot.with_stem(f"{plot.stem}-{name.lower()}")
-        rows = [row for row in means if row["dataset"] == name]
-        if not draw_into(file, partial(draw_robustness, rows=rows, title=f"{name}, trained on clean touches")):
-            return
-
-
-def _show(dataset: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    systems = list(dict.fromkeys((row["system"], row["augmented"]) for row in rows))
-    folds = max(row["folds"] for row in rows)
-    heads = [f"{system}, augmented" if augmented else system for system, augmented in systems]
-    title = f"{dataset}, trained on clean touches, {folds} fold{'s' * (folds > 1)}"
-    quoted = any((row["study"], row["strength"]) in PAPER for row in rows)
-    table = Table("study", "strength", *heads, *(["paper", "ours − paper"] if quoted else []), title=title)
-    cells = {(row["study"], row["strength"], row["system"], row["augmented"]): row for row in rows}
-    for study in dict.fromkeys(row["study"] for row in rows):
-        for strength in dict.fromkeys(row["strength"] for row in rows if row["study"] == study):
-            own = [cells[study, strength, *system] for system in systems]
-            shown = [percent(row["mean"]) + (f" ± {100 * row['sd']:.1f}" if row["folds"] > 1 else "") for row in own]
-            mine = cells.get((study, strength, OURS, False))
-            shown += _beside(dataset, PAPER.get((study, strength), {}), mine) if quoted else []
-            table.add_row(study, "" if study == SESSION else f"{strength:g}", *shown)
-        table.add_section()
+def _show(name: str, folds: Sequence[int], sides: Mapping[str, Mapping[str, Any]]) -> None:
+    heads = [f"{figure}{f', {side}' * (side != NOW)}" for side in sides for figure in ("right", "ECE", "known")]
+    table = Table("test touches", *heads, title=f"{name}, trained on clean touches, folds {', '.join(map(str, folds))}")
+    for row in sides[NOW]:
+        cells: list[str] = []
+        for rows in sides.values():
+            figures = rows[row]
+            if "novelty_auroc" in figures:
+                cells += [f"AUROC {figures['novelty_auroc']['mean']:.4f}", "", ""]
+                continue
+            share = figures["accuracy"]
+            spread = f" ± {100 * share['sd']:.1f}" if share["folds"] > 1 else ""
+            error, known = figures["calibration_error"]["mean"], figures["known"]["mean"]
+            cells += [percent(share["mean"]) + spread, f"{error:.3f}", percent(known)]
+        table.add_row(row, *cells)
     console().print(table)
 
 
-def _beside(dataset: str, paper: Mapping[str, float], mine: Mapping[str, Any] | None) -> list[str]:
-    """The paper's figure, of this set or, named, of another of the sensor; and the difference where it is this one."""
-    sensor = dataset.partition("-")[0]
-    for name, share in paper.items():
-        if name == dataset:
-            return [percent(share), "" if mine is None else f"{100 * (mine['mean'] - share):+.1f}"]
-        if name.partition("-")[0] == sensor:
-            return [f"{percent(share)} ({name})", ""]
-    return ["", ""]
+def _show_series(sides: Mapping[str, Mapping[str, Any]]) -> None:
+    table = Table("series, split as published", *sides)
+    for name in sides[NOW]:
+        table.add_row(name, *(percent(rows[name]["accuracy"]) for rows in sides.values()))
+    console().print(table)
+    say("series come without a rate: 100 Hz is taken, and the median training length as the usual duration")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from examples.paper.runs.cells import held_back
-from examples.paper.studies.robustness_study import Make, Progress
+from examples.paper.studies.strengths_study import Make, Progress
 from examples.paper.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
 from examples.paper.systems.system_protocol import System
 from scroll_tactile.errors import InputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -22,7 +22,7 @@ from scroll_tactile.pipelines.metrics import calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 
-__all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "subset", "summary"]
+__all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "novelty_area", "rotations", "subset", "summary"]
 
 Progress = Callable[[str, int, int], object]
 """Receives (what is being done, steps done, steps in all)."""
@@ -159,26 +159,34 @@ class _ReplayFold:
 
     def _novelty(self) -> float:
         """Mean AUROC over five rotations, a fifth of the materials held out in each. Needs scikit-learn."""
-        from scipy.stats import rankdata
-        from sklearn.metrics import roc_auc_score
-
-        names = sorted({name for name, _ in self.train}, key=_number)
         areas = []
-        for rotation in range(_ROTATIONS):
-            out = set(names[rotation::_ROTATIONS])
+        for rotation, out in enumerate(rotations([name for name, _ in self.train])):
             learner = self._learner()
             train = [touch for touch in self.train if touch[0] not in out]
             self._train(learner, train, f"novelty {rotation + 1}/{_ROTATIONS}")
             answers = evaluate(learner, self.test)
-            novelty = np.array([prediction.novelty for prediction in answers.predictions])
-            new = np.array([name in out for name in answers.truth])
-            areas.append(roc_auc_score(new, rankdata(novelty)))  # ranks: a novelty may be infinite
+            novelty = [prediction.novelty for prediction in answers.predictions]
+            areas.append(novelty_area(novelty, [name in out for name in answers.truth]))
         return float(np.mean(areas))
 
     def _train(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:
         for done, (name, stream) in enumerate(touches):
             learner.observe(name, stream)
             self.progress(what, done + 1, len(touches))
+
+
+def rotations(materials: Iterable[str]) -> list[set[str]]:
+    """Which materials are held out in each of five rotations: every fifth, by their numbers."""
+    names = sorted(set(materials), key=_number)
+    return [set(names[rotation::_ROTATIONS]) for rotation in range(_ROTATIONS)]
+
+
+def novelty_area(novelty: Sequence[float], new: Sequence[bool]) -> float:
+    """AUROC of N novelties, by whether each touch is of a new material. Needs scikit-learn."""
+    from scipy.stats import rankdata
+    from sklearn.metrics import roc_auc_score
+
+    return float(roc_auc_score(new, rankdata(novelty)))  # ranks: a novelty may be infinite
 
 
 def _number(name: str) -> tuple[int, str]:

@@ -1,142 +1,119 @@
-"""Robustness: systems that trained on clean touches, tested on touches that were made or recorded otherwise.
+"""Whether one default holds: a learner told nothing but its sensor, trained on clean touches, on every kind of test.
 
-A study is a grid of strengths, systems, without augmentation and with it where they have any, and folds. A system
-learns a fold once, for all of its studies; only "session" (folds of successive repetitions: tomorrow's touches) has
-training touches of its own. Each cell is written down when it is finished, and an interrupted run resumes with the
-next.
+A row is a way in which test touches differ; "session" and "novelty" are rows with learners of their own. Each cell, a
+row of a fold of a side, is written down when it is finished, and an interrupted run resumes with the next.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from examples.paper.runs.cells import require_data
+from examples.paper.studies.default_learner import Answering, Answers, answers
+from examples.paper.studies.replay import novelty_area, rotations
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
-from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
+from scroll_tactile.pipelines.classification import Labelled, hold_out
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.robustness import dead, drift, gaussian, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["NAMES", "PAPER", "PERTURBED", "SESSION", "Learned", "Make", "Robustness", "TestedSystem", "ours", "summary"]
+__all__ = ["FIGURES", "NOVELTY", "NOW", "PERTURBED", "SESSION", "Robustness", "Series", "summary"]
+
+PERTURBED: dict[str, Callable[[Stream, int], Stream]] = {
+    "clean": lambda stream, seed: stream,
+    "first": lambda stream, seed: stream.first(0.3),
+    "half": lambda stream, seed: stream.first(stream.seconds / 2),
+    "slow": lambda stream, seed: speed(stream, 0.5),
+    "fast": lambda stream, seed: speed(stream, 2.0),
+    "dead-fifth": lambda stream, seed: dead(stream, 0.2, seed),
+    "dead-two-fifths": lambda stream, seed: dead(stream, 0.4, seed),
+    "noise-half": lambda stream, seed: noise(stream, 0.5, seed),
+    "noise-quarter": lambda stream, seed: noise(stream, 0.25, seed),
+    "gaussian": lambda stream, seed: gaussian(stream, 0.5, seed),
+    "drift": lambda stream, seed: drift(stream, 0.05, seed),
+}
+"""Row → how its test touches are made of clean ones."""
+
+SESSION = "session"  # ten successive repetitions of fifty held out; nothing is perturbed
+NOVELTY = "novelty"  # four of twenty materials never touched, five rotations; nothing is perturbed
+NOW = "now"
+FIGURES = ("accuracy", "calibration_error", "known", "novelty_auroc")
+"""Of a cell: shares of right answers and of touches called known, expected calibration error; of novelty its AUROC."""
+
+RATE = 100.0  # readings a second of series that come without one
+
+Progress = Callable[[str, int, int], object]
+Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Perturbation:
-    """A way in which test touches differ, and how strongly.
+class Fit:
+    """What one learner learns, and on what it is tested: row → touches."""
 
-    perturb: makes a stream of a stream, a strength and a seed. strengths: those of a full study. quick: of a quick one.
-    """
-
-    perturb: Callable[[Stream, float, int], Stream]
-    strengths: tuple[float, ...]
-    quick: tuple[float, ...]
-
-    def of(self, sensor: Sensor, *, quick: bool = False) -> tuple[float, ...]:
-        """The strengths for a sensor: of lengths those below the usual one, and then it."""
-        chosen = self.quick if quick else self.strengths
-        if self.perturb is not length:
-            return chosen
-        return (*(seconds for seconds in chosen if seconds < sensor.duration), sensor.duration)
+    sensor: Sensor
+    train: Sequence[Labelled]
+    tests: Mapping[str, Sequence[Labelled]]
 
 
-PERTURBED = {
-    "length": Perturbation(length, (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0), (0.3,)),
-    "speed": Perturbation(speed, (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0), (0.5, 1.0, 2.0)),
-    "noise": Perturbation(noise, (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0), (0.0, 0.5)),
-    "dead": Perturbation(dead, (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5), (0.0, 0.2)),
-    "drift": Perturbation(drift, (0.0, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, 0.05)),
-}
-"""Study → how its test touches differ."""
-
-SESSION = "session"  # folds of successive repetitions; nothing is perturbed
-NAMES = (*PERTURBED, SESSION)
-"""The names of the studies."""
-
-PAPER = {("noise", 0.5): {"RoboSkin-20": 0.80, "BioTac-50": 0.73}}
-"""(study, strength) → data set → the paper's accuracy, of its pre-trained network with its augmentation. It has BioTac
-with fifty materials, which are not ours to compare with, and of length and speed curves without numbers."""
-
-Progress = Callable[[str, int, int], object]
+def _measure(
+    notes: RunFile, side: str, answering: Answering, fit: Fit, place: object, progress: Progress
+) -> dict[str, Figures]:
+    """Row → figures of a fit's tests: read back where they are noted, else measured and noted one by one."""
+    keys = {row: f"{side}/{row}/{place}" for row in fit.tests}
+    left = {row: test for row, test in fit.tests.items() if keys[row] not in notes.notes}
+    if left:
+        train = [(material, stream.readings) for material, stream in fit.train]
+        touches = {row: [stream.readings for _, stream in test] for row, test in left.items()}
+        for row, found in answering(fit.sensor, train, touches, progress):
+            truth = [material for material, _ in left[row]]
+            notes.note(keys[row], _figures(truth, found, {material for material, _ in fit.train}))
+    return {row: notes.notes[key] for row, key in keys.items()}
 
 
-class TestedSystem(Protocol):
-    """Whatever names the materials of touches."""
-
-    def predict(self, streams: Sequence[Stream]) -> Sequence[str | None]:
-        """The material of each of N streams."""
-        ...
+def _below(progress: Progress, where: str) -> Progress:
+    return lambda what, i, of: progress(f"{where}: {what}", i, of)
 
 
-Make = Callable[[Sequence[Labelled], bool, Progress], TestedSystem]
-"""Makes a system that has learned these touches, with its augmentation (True) or without; reports how far it is."""
-
-
-class Learned:
-    """A learner as a system: the material of the most probable answer, known or not."""
-
-    def __init__(self, learner: TactileLearner) -> None:
-        self.learner = learner
-
-    def predict(self, streams: Sequence[Stream]) -> list[str | None]:
-        """The material of each of N streams."""
-        return [self.learner.predict(stream).material for stream in streams]
-
-
-def ours(sensor: Sensor) -> tuple[Make, dict[str, Any]]:
-    """The default learner of a sensor, and what it depends on; it has no augmentation."""
-
-    def make(train: Sequence[Labelled], augmented: bool, progress: Progress) -> TestedSystem:
-        learner = TactileLearner(sensor=sensor, exemplars=0)
-        done = count()
-        observe_all(learner, train, lambda: progress("learning", next(done) + 1, len(train)))
-        return Learned(learner)
-
-    return make, {"embedding": repr(TactileLearner(sensor=sensor).embedding)}
+def _figures(truth: Sequence[str], found: Answers, learned: set[str]) -> Figures:
+    new = [material not in learned for material in truth]
+    if any(new):
+        return {"novelty_auroc": novelty_area(found["novelty"], new), "tested": len(truth)}
+    right = [true == guess for true, guess in zip(truth, found["material"], strict=True)]
+    return {
+        "accuracy": accuracy(truth, found["material"]),
+        "calibration_error": calibration_error(found["probability"], right),
+        "known": float(np.mean(found["known"])),
+        "tested": len(truth),
+    }
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """What to study.
+    """All rows of a recorded set.
 
-    recordings: the touches. systems: by name, what makes and trains each. settings: by name, all that a system's
-    answers depend on beside its name, in JSON's types, so that what other settings gave is not mixed in.
-    studies: out of NAMES. augmented: with augmentation (True), without, or both. plain: the systems that have none.
-    seed: of what perturbations draw. quick: fewer strengths. folder: where finished cells are kept, or None.
+    sides: by name, whose default learner answers. seed: of what perturbations draw. folder: where finished cells are
+    kept, or None; a changed project's figures belong into another.
 
-    Raises InputError for studies that there are not and for a camera's frames, and DatasetError for "session" where the
-    order of recording is not known.
+    Raises InputError for a negative seed and for a camera's frames.
     """
 
     recordings: Recordings
-    systems: Mapping[str, Make]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    studies: Sequence[str] = NAMES
-    augmented: Sequence[bool] = (False, True)
-    plain: Sequence[str] = ()
+    sides: Mapping[str, Answering] = field(default_factory=lambda: {NOW: answers})
     seed: int = 0
-    quick: bool = False
     folder: Path | None = None
 
     def __post_init__(self) -> None:
-        strange = [name for name in self.studies if name not in NAMES]
-        if strange or not self.studies:
-            raise InputError(f"expected studies out of {', '.join(NAMES)}; came {strange or 'none'}")
         if self.seed < 0:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
-        if SESSION in self.studies:
-            self.recordings.blocked()
         if self.recordings.sensor.camera:
             raise InputError(
                 f"expected touches of channels, which are cut, resampled and made noisy along time; "
@@ -145,102 +122,126 @@ class Robustness:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """What all figures depend on, in JSON's types; studies, folds and systems can be added to a run later."""
+        """What all figures depend on, in JSON's types; folds and sides can be added to a run later."""
         size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        return {"run": "robustness", "dataset": self.recordings.name, **size, "seed": self.seed}
+        embedding = repr(TactileLearner(sensor=self.recordings.sensor).embedding)
+        about = {"run": "robustness", "dataset": self.recordings.name, "embedding": embedding}
+        return about | size | {"seed": self.seed}
 
     def run(
         self, folds: Sequence[int], progress: Progress = lambda what, done, of: None
     ) -> Iterator[list[dict[str, Any]]]:
-        """The records of each fold in turn, as they are finished; cells finished before are read back.
+        """The records of each fold in turn: side, row, fold, `tested`, and the figures of FIGURES that the row has.
 
-        A record holds study, strength, system, augmented, fold, accuracy (a share) and tested (touches).
-
-        Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
-        under other settings.
+        Raises InputError for a fold that is not there or a folder of another run.
         """
         there = sorted(set(self.recordings.fold.tolist()))
         if not folds or set(folds) - set(there):
             raise InputError(f"expected folds out of {there}; came {list(folds)}")
         notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
         require_data(notes, self.recordings)
-        for name in self.systems:
-            self._require_settings(notes, name)
         for fold in folds:
-            cells = self.cells(fold)
+            fits = self.fits(fold)
             yield [
-                record
-                for system in self.systems
-                for augmented in ((False,) if system in self.plain else self.augmented)
-                for record in self._records(system, augmented, cells, notes, progress)
+                {"side": side, "row": row, "fold": fold} | figures
+                for side, answering in self.sides.items()
+                for row, figures in self._rows(notes, side, answering, fits, fold, progress).items()
             ]
 
-    def cells(self, fold: int) -> list[tuple[str, float, int]]:
-        """(study, strength, fold) of all that is asked of a system in a fold."""
-        sensor = self.recordings.sensor
-        return [
-            (study, strength, fold)
-            for study in self.studies
-            for strength in ((0.0,) if study == SESSION else PERTURBED[study].of(sensor, quick=self.quick))
-        ]
+    def fits(self, fold: int) -> list[Fit]:
+        """What is learned and tested in a fold: the perturbed rows, the session if its order is known, rotations."""
+        recordings = self.recordings
+        train, test = hold_out(recordings, recordings.fold == fold)
+        tests = {
+            row: [(material, perturb(stream, self.seed)) for material, stream in test]
+            for row, perturb in PERTURBED.items()
+        }
+        fits = [Fit(recordings.sensor, train, tests)]
+        if recordings.ordered:
+            earlier, later = hold_out(recordings, recordings.blocked() == fold)
+            fits.append(Fit(recordings.sensor, earlier, {SESSION: later}))
+        for rotation, out in enumerate(rotations(recordings.materials)):
+            if out:
+                known = [touch for touch in train if touch[0] not in out]
+                fits.append(Fit(recordings.sensor, known, {f"{NOVELTY} {rotation}": test}))
+        return fits
 
-    def _require_settings(self, notes: RunFile, name: str) -> None:
-        given = json.loads(json.dumps(self.settings.get(name)))
-        kept = notes.notes.setdefault(f"settings of {name}", given)
-        if kept != given:
-            raise InputError(
-                f"the run in {notes.path} was begun with other settings of {name}: {kept} there, {given} here. Ask for "
-                "the same, or take another folder"
-            )
-
-    def _records(
-        self,
-        name: str,
-        augmented: bool,
-        cells: Sequence[tuple[str, float, int]],
-        notes: RunFile,
-        progress: Progress,
-    ) -> Iterator[dict[str, Any]]:
-        systems: dict[bool, TestedSystem] = {}  # by whether it has learned for "session"
-        what = f"{name}{', augmented' if augmented else ''}"
-        for done, (study, strength, fold) in enumerate(cells):
-            where = f"fold {fold}: {what}: {study} {strength:g}"
-            progress(where, done, len(cells))
-            key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
-            if key not in notes.notes:
-                session = study == SESSION
-                train, test = self._split(fold, session)
-                if session not in systems:
-
-                    def report(step: str, i: int, of: int, where: str = where) -> None:
-                        progress(f"{where}: {step}", i, of)
-
-                    systems[session] = self.systems[name](train, augmented, report)
-                asked = test if session else self._perturbed(test, study, strength)
-                predicted = systems[session].predict([stream for _, stream in asked])
-                share = accuracy([material for material, _ in asked], list(predicted))
-                notes.note(key, {"accuracy": share, "tested": len(asked)})
-            about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
-            yield about | notes.notes[key]
-
-    def _perturbed(self, test: Sequence[Labelled], study: str, strength: float) -> list[Labelled]:
-        perturb = PERTURBED[study].perturb
-        return [(material, perturb(stream, strength, self.seed)) for material, stream in test]
-
-    def _split(self, fold: int, session: bool) -> tuple[list[Labelled], list[Labelled]]:
-        places: npt.NDArray[np.int64] = self.recordings.blocked() if session else self.recordings.fold
-        return hold_out(self.recordings, places == fold)
+    def _rows(
+        self, notes: RunFile, side: str, answering: Answering, fits: Sequence[Fit], fold: int, progress: Progress
+    ) -> dict[str, Figures]:
+        rows: dict[str, Figures] = {}
+        for i, fit in enumerate(fits):
+            where = f"{self.recordings.name}, fold {fold}, {side}, learner {i + 1} of {len(fits)}"
+            rows |= _measure(notes, side, answering, fit, fold, _below(progress, where))
+        turned = [rows.pop(row) for row in list(rows) if row.startswith(NOVELTY)]
+        area = float(np.mean([figures["novelty_auroc"] for figures in turned]))
+        return rows | {NOVELTY: {"novelty_auroc": area, "tested": sum(figures["tested"] for figures in turned)}}
 
 
-def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Mean and standard deviation over folds of each (study, strength, system, augmented), in the records' order."""
-    groups: dict[tuple[Any, ...], list[float]] = {}
-    for record in records:
-        cell = tuple(record[name] for name in ("study", "strength", "system", "augmented"))
-        groups.setdefault(cell, []).append(record["accuracy"])
-    rows = []
-    for (study, strength, system, augmented), values in groups.items():
-        mean, spread = mean_and_spread(values)
-        about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
-        rows.append(about | {"mean": mean, "sd": spread, "folds": len(values)})
-    return rows
+@dataclass(frozen=True)
+class Series:
+    """Sets of series of other kinds of sensors, each with its published split.
+
+    file: an .npz with, for each set NAME, `NAME/readings` (ΣT, n), `/lengths`, `/label`, `/test` (N each) and `/range`
+    (low, high). They come without a rate, so 100 Hz is taken, and as the usual duration the median training length.
+
+    Raises InputError where the file cannot be read.
+    """
+
+    file: Path
+    sides: Mapping[str, Answering] = field(default_factory=lambda: {NOW: answers})
+    folder: Path | None = None
+
+    def fits(self) -> dict[str, Fit]:
+        """Name → what is learned and tested."""
+        try:
+            with np.load(self.file) as kept:
+                arrays = {key: kept[key] for key in kept.files}
+            names = list(dict.fromkeys(key.partition("/")[0] for key in arrays))
+            return {name: _fit(name, *(arrays[f"{name}/{part}"] for part in _PARTS)) for name in names}
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"expected sets of series in {self.file}; they cannot be read: {error!r}") from error
+
+    def run(self, progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+        """The record of each side and set in turn: side, name, `tested`, and figures.
+
+        Raises InputError for a folder of another run.
+        """
+        notes = RunFile(None if self.folder is None else self.folder / "robustness.json", {"run": "robustness, series"})
+        for name, fit in self.fits().items():
+            for side, answering in self.sides.items():
+                found = _measure(notes, side, answering, fit, name, _below(progress, f"{name}, {side}"))
+                yield {"side": side, "name": name} | found["clean"]
+
+
+_PARTS = ("readings", "lengths", "label", "test", "range")
+
+
+def _fit(name: str, readings: Any, lengths: Any, label: Any, test: Any, limits: Any) -> Fit:
+    test = test.astype(bool)
+    sensor = Sensor(
+        name=name,
+        channels=readings.shape[1],
+        rate=RATE,
+        low=float(limits[0]),
+        high=float(limits[1]),
+        unit="",
+        duration=float(np.median(lengths[~test])) / RATE,
+    )
+    streams = [validate(part, sensor) for part in np.split(readings, np.cumsum(lengths)[:-1])]
+    touches = list(zip(map(str, label.tolist()), streams, test.tolist(), strict=True))
+    train = [(material, stream) for material, stream, out in touches if not out]
+    return Fit(sensor, train, {"clean": [(material, stream) for material, stream, out in touches if out]})
+
+
+def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Side → row → figure → mean, standard deviation over folds and their number, in the records' order."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for side, row in dict.fromkeys((record["side"], record["row"]) for record in records):
+        own = [record for record in records if (record["side"], record["row"]) == (side, row)]
+        for figure in FIGURES:
+            if figure in own[0]:
+                mean, spread = mean_and_spread([record[figure] for record in own])
+                means = found.setdefault(side, {}).setdefault(row, {})
+                means[figure] = {"mean": mean, "sd": spread, "folds": len(own)}
+    return found

@@ -32,6 +32,13 @@ class Apart:
     logits: Mapping[str, float]
     strange: float
 
+    @property
+    def margin(self) -> float:
+        """How far its own material is ahead of the next, below 0 where it is behind."""
+        return self.logits[self.material] - max(
+            (value for name, value in self.logits.items() if name != self.material), default=-np.inf
+        )
+
 
 @dataclass(frozen=True)
 class Pooled:
@@ -56,11 +63,14 @@ class Pooled:
 def pool(recall: Recall, apart: Mapping[bytes, Apart]) -> Pooled:
     """Fit g and r to kept touches that were left out of both. apart: by key, what the model says of those."""
     rows = [row for key, row in sorted(recall.rows().items()) if key in apart]
-    rows = [rows[i] for i in spaced(rows, LEFT_OUT)]
+    keys = {row: key for key, row in recall.rows().items()}
+    # Of the least sure half of them, where it matters which of the two is believed; the others at random.
+    unsure = sorted(rows, key=lambda row: apart[keys[row]].margin)[: LEFT_OUT // 2]
+    others = [row for row in rows if row not in unsure]
+    rows = sorted(unsure + [others[i] for i in spaced(others, LEFT_OUT // 2)])
     names = recall.materials
     if len(rows) < FEWEST or len(names) < 2:
         return Pooled(recall, float(PRIOR[0]), float(PRIOR[1]), np.inf, 0.0, 1.0 / UNMEASURED)
-    keys = {row: key for key, row in recall.rows().items()}
     told = [apart[keys[row]] for row in rows]
     found = [recall.recollect(recall.levels(row), left_out=row) for row in rows]
     common = [i for i, name in enumerate(names) if all(name in touch.logits for touch in told)]
@@ -73,6 +83,6 @@ def pool(recall: Recall, apart: Mapping[bytes, Apart]) -> Pooled:
     )
     trusted, recalled = fit_weights(scores, targets, PRIOR, PRIOR_TOUCHES).tolist()
     surprise = np.array([recollection.surprise for recollection in found])
-    familiar = float(np.quantile([touch.strange for touch in told], USUAL))
+    familiar = float(np.quantile([touch.strange for touch in apart.values()], USUAL))
     spread = max(float(surprise.std()), MOST_SPREAD)
     return Pooled(recall, trusted, max(recalled, 1e-6), familiar, float(surprise.mean()), spread)

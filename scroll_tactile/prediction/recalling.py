@@ -33,6 +33,7 @@ FloatArray = npt.NDArray[np.float64]
 SURE = 0.99  # of the probability: less than that is looked up
 COUNTED = 30.0  # values, as which the evidence for a way to compare a touch counts: neighbours say the same
 TINY = 1e-300
+MOST_USUAL = 4.0  # times as much is the model believed of a touch that is as familiar as can be
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,9 @@ def _answer(asked: _Asked, encoded: Encoded, recollection: Recollection, whole: 
     places = {name: i for i, name in enumerate(pooled.recall.materials)}
     least = float(recollection.scores.min())
     scores = np.array([recollection.scores[places[name]] if name in places else least for name in asked.candidates])
-    heard = pooled.trusted * (1 - recollection.trust) * np.log(np.maximum(judgement.probability, TINY))
-    logits = heard + scores / (1 + (1 / pooled.recalled - 1) * recollection.certainty)
+    usual = min(max(pooled.familiar / max(judgement.strange, TINY), 1.0), MOST_USUAL)
+    heard = usual * pooled.trusted * (1 - recollection.trust) * np.log(np.maximum(judgement.probability, TINY))
+    logits = heard + scores * pooled.steepness(recollection)
     chances = np.exp(logits - logits.max())
     novelty = (1 - recollection.trust) * judgement.novelty + recollection.trust * pooled.novelty(recollection)
     return Judgement(chances / chances.sum(), float(novelty), judgement.calibration, judgement.strange)

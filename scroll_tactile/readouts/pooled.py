@@ -55,6 +55,10 @@ class Pooled:
     usual: float
     spread: float
 
+    def steepness(self, recollection: Recollection) -> float:
+        """β, see `prediction.recalling`."""
+        return 1 / (1 + (1 / self.recalled - 1) * recollection.certainty)
+
     def novelty(self, recollection: Recollection) -> float:
         """The surprise of a touch, in units of its spread in known ones, as novelty is."""
         return (recollection.surprise - self.usual) / self.spread

@@ -1,0 +1,203 @@
+"""Kept touches are a function of the set observed, whatever happened on the way, and of how many are kept."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from touches import OBSERVED, PAD, SETTINGS, Windowed, contents, fed, filled, kept_of, require_same, stream, without
+
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.kept import Keeping, KeptTouches, usual_kept
+from scroll_tactile.readouts.likelihood import LEVELS, MISSING, levels_of
+from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
+from store import Store
+
+FEW = 5
+SPARE = [("d", (40 + i, 60)) for i in range(3)]
+
+
+def test_levels_are_those_of_the_readings_and_at_most_twice_as_long_as_is_usual():
+    for readings in (2, 50, 100, 101, 5000):
+        levels = Keeping(PAD, 3).levels(stream((0, readings)))
+        assert levels.dtype == np.uint8
+        assert np.array_equal(levels, levels_of(stream((0, readings))[:100], PAD))
+    short = PAD.model_copy(update={"duration": 0.02})
+    assert Keeping(short, 3).levels(stream((0, 60))).shape == (2, 2)
+
+
+def test_each_channel_has_levels_of_its_own_range():
+    sensor = Sensor(name="two", channels=2, rate=50, low=(0, -10), high=(1, 10), unit="", duration=1)
+    levels = levels_of(np.array([[0, -10], [1, 10], [0.5, 0], [2, -20], [np.nan, 5]]), sensor)
+    assert levels.tolist() == [[0, 254, 127, 254, MISSING], [0, 254, 127, 0, round(0.75 * (LEVELS - 1))]]
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 12), st.sampled_from([2, 30, 150])), max_size=30),
+    st.integers(1, 12),
+    st.randoms(use_true_random=False),
+)
+@settings(max_examples=60, deadline=None)
+def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches, capacity, rng):
+    def kept(order):
+        chosen = KeptTouches(Keeping(PAD, capacity))
+        for material, seed, readings in order:
+            chosen.take(material, bytes([seed, readings]) * 16, stream((seed, readings)))
+        return chosen
+
+    first = kept(touches)
+    shuffled = [*touches, *touches[:3]]
+    rng.shuffle(shuffled)
+    arrays, materials = first.to_arrays()
+    for other in (kept(shuffled), KeptTouches(Keeping(PAD, capacity))):
+        if not len(other):
+            other.fill(arrays, materials)
+        again, names = other.to_arrays()
+        assert names == materials
+        assert {name: array.tobytes() for name, array in again.items()} == {
+            name: array.tobytes() for name, array in arrays.items()
+        }
+    assert len(first) == min(capacity, len(set(touches)))
+    # Of as many materials as fit there is one at least.
+    assert len(set(materials)) == min(capacity, len({material for material, *_ in touches}))
+
+
+def test_a_touch_without_readings_is_not_kept():
+    kept = KeptTouches(Keeping(PAD, 3))
+    kept.take("a", b"a" * 32, None)
+    assert not kept.touches()
+
+
+@pytest.mark.parametrize("recall", [FEW, None])
+def test_they_are_the_same_after_every_change(tmp_path, recall):
+    chosen = {"recall": recall}
+    learner, receipts = filled(tmp_path / "m", **chosen)
+    other, _ = filled(tmp_path / "other", SPARE, **chosen)
+    other.close()
+    with learner, TactileLearner.open(tmp_path / "m", mode="read", **SETTINGS) as reader:
+        require_same(learner, OBSERVED, **chosen)
+        assert len(kept_of(learner)) == (FEW if recall else len(OBSERVED))
+        for i in (1, 5):
+            learner.retract(receipts[i])
+        require_same(learner, without(1, 5), **chosen)
+        assert reader.refresh()
+        require_same(reader, without(1, 5), **chosen)
+        learner.merge(tmp_path / "other", shared="once")
+        require_same(learner, [*without(1, 5), *SPARE], **chosen)
+        learner.forget("d")
+        learner.compact(keep=4)
+        require_same(learner, without(1, 5), **chosen)
+        assert reader.refresh()
+        require_same(reader, without(1, 5), **chosen)
+        learner.retract(receipts[11])
+        require_same(learner, without(1, 5, 11), **chosen)
+        assert reader.refresh()
+        assert kept_of(reader) == kept_of(learner)
+    with TactileLearner.open(tmp_path / "m") as again:
+        assert again.settings.recall == (FEW if recall else usual_kept(PAD))
+        require_same(again, without(1, 5, 11), **chosen)
+
+
+def test_a_compacted_memory_brings_its_own(tmp_path):
+    ours, _ = filled(tmp_path / "m", recall=FEW)
+    other, _ = filled(tmp_path / "other", SPARE, recall=FEW)
+    other.compact()
+    other.close()
+    with ours:
+        ours.merge(tmp_path / "other", shared="once")
+        require_same(ours, [*OBSERVED, *SPARE], exemplars=False, recall=FEW)
+
+
+@pytest.mark.parametrize("theirs", [0, 3, None])
+def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_path, theirs):
+    ours, _ = filled(tmp_path / "m", recall=FEW)
+    other, _ = filled(tmp_path / "other", SPARE, recall=theirs)
+    with ours:
+        ours.merge(other, shared="once")
+        require_same(ours, [*OBSERVED, *SPARE], recall=FEW)
+        ours.forget("d")
+        other.compact()
+        other.close()
+        before = contents(ours)
+        with pytest.raises(MismatchError, match=rf"compacted and keeps {other.settings.recall} touches.*keeps {FEW}"):
+            ours.merge(tmp_path / "other", shared="once")
+        assert contents(ours) == before
+
+
+def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
+    ours, _ = filled(tmp_path / "m", recall=0)
+    other, _ = filled(tmp_path / "other", SPARE)
+    other.compact()
+    other.close()
+    with ours:
+        ours.merge(tmp_path / "other", shared="once")
+        assert kept_of(ours) is None
+        assert ours.materials["d"] == len(SPARE)
+
+
+def test_a_process_that_dies_leaves_them_in_the_journal(tmp_path):
+    learner, _ = filled(tmp_path / "m", recall=FEW)
+    learner.observe("d", stream((50, 60)))
+    learner._ledger.store.close()  # as a kill leaves it: no generation
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as again:
+        require_same(again, [*OBSERVED, ("d", (50, 60))], recall=FEW)
+
+
+@pytest.mark.parametrize("made", [None, FEW, 0])
+@pytest.mark.parametrize("snapshot", [copy.deepcopy, lambda learner: pickle.loads(pickle.dumps(learner))])
+def test_a_snapshot_has_them(tmp_path, made, snapshot):
+    learner, _ = filled(tmp_path / "m", recall=made)
+    with learner:
+        taken = snapshot(learner)
+        assert contents(taken) == contents(learner)
+        learner.forget("a")
+        taken.observe("d", stream((50, 60)))
+        require_same(taken, [*OBSERVED, ("d", (50, 60))], recall=made)
+
+
+@pytest.mark.parametrize("made", [None, 0, FEW])
+def test_how_many_is_chosen_once(tmp_path, made):
+    learner, _ = filled(tmp_path / "m", recall=made)
+    count = usual_kept(PAD) if made is None else made
+    assert learner.settings.recall == count
+    learner.close()
+    for mode in ("write", "read"):
+        for asked in ({}, {"recall": count}):
+            with TactileLearner.open(tmp_path / "m", mode=mode, **asked) as again:
+                assert again.settings.recall == count
+        with pytest.raises(MismatchError, match=rf"recall={count}; it was opened with 7.*leave recall out"):
+            TactileLearner.open(tmp_path / "m", mode=mode, recall=7)
+    with Store.open(tmp_path / "m", mode="read") as store:
+        identity = Identity.read(store)
+    assert Identity.model_validate(identity.to_json()) == identity
+
+
+def test_none_are_kept_where_they_are_of_no_use():
+    assert usual_kept(BIOTAC) == 1000
+    assert usual_kept(GELSIGHT) == 0
+    large = BIOTAC.model_copy(update={"channels": 2000, "duration": 60.0})
+    assert 1 <= usual_kept(large) < 20
+    windowed = TactileLearner(sensor=PAD, embedding=Windowed(dimension=64))
+    windowed.observe("a", stream((0, 60)))
+    assert windowed.settings.recall == 0
+    assert kept_of(windowed) is None
+    assert kept_of(fed(OBSERVED, recall=0)) is None
+
+
+@pytest.mark.parametrize("recall", [-1, 2.5, "all", True])
+def test_it_is_a_whole_number(recall):
+    with pytest.raises(InputError, match="recall"):
+        TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), recall=recall)
+
+
+def test_it_stands_in_what_is_reembedded(tmp_path):
+    learner, receipts = filled(tmp_path / "m", recall=FEW)
+    with learner:
+        learner.retract(receipts[2])
+        learner.reembed(Kernels(seed=3, dimension=64))
+        assert learner.settings.recall == FEW
+        assert kept_of(learner) == kept_of(fed(without(2), recall=FEW))

@@ -135,7 +135,7 @@ class Draft:
                 weight * left.scores[row][own]
                 for weight, left, row, own in zip(weights, said, rows, places, strict=True)
             )
-            relative = float((strange / whole.usual).min())
+            relative = float(whole.relative(strange).min())
             found[key] = Apart(material, dict(zip(names, np.asarray(logits).tolist(), strict=True)), relative)
         return found
 
@@ -323,7 +323,7 @@ class Model:
                 best = int(places[scale][int(scores[scale].argmax())])
                 strange[i] = self.readouts[scale].strangeness(means[scale], best)
         believed = self.whole.believed(strange, 1.0 if whole else DOUBT)
-        least = float((strange / self.whole.usual)[[scale in scores for scale in joint]].min())
+        least = float(self.whole.relative(strange)[[scale in scores for scale in joint]].min())
         return weights | {scale: believed[i] for i, scale in enumerate(joint) if scale in judging}, least
 
     def _is_whole(self, stage: int, whole: bool) -> bool:

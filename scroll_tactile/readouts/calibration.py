@@ -67,6 +67,11 @@ class Calibration:
         """The weights of the scales for touches of a strangeness, both of shape (…, S)."""
         return np.asarray(self.weights * np.minimum(1.0, self.usual / np.maximum(strangeness, TINY)) ** power)
 
+    def relative(self, strangeness: FloatArray) -> FloatArray:
+        """Strangeness beside that of a usual known touch, both of shape (…, S)."""
+        with np.errstate(over="ignore"):  # where known touches are all the same
+            return np.asarray(strangeness / np.maximum(self.usual, TINY))
+
     def novelty(self, distances: FloatArray) -> FloatArray:
         """Standardised novelty, shape (…,), of distances by scale, shape (…, S)."""
         mean, spread = self.scale_novelty.T

@@ -20,6 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 LEFT_OUT = 48  # kept touches that are left out, each compared with all others
 PRIOR = np.array([1.0, 1 / 600])  # of the model's logits, and of values that say the same as their neighbours
 PRIOR_TOUCHES = 5.0
+UNSEEN = 1 / 20_000  # r where nothing can be left out: after one touch of each, beginnings are lost to a larger one
 USUAL = 0.95  # of touches left out are familiar
 MOST_SPREAD = 1e-9
 
@@ -74,7 +75,7 @@ def pool(recall: Recall, apart: Mapping[bytes, Apart]) -> Pooled:
     rows = sorted(unsure + [others[i] for i in spaced(others, LEFT_OUT // 2)])
     names = recall.materials
     if len(rows) < FEWEST or len(names) < 2:
-        return Pooled(recall, float(PRIOR[0]), float(PRIOR[1]), np.inf, 0.0, 1.0 / UNMEASURED)
+        return Pooled(recall, float(PRIOR[0]), UNSEEN, np.inf, 0.0, 1.0 / UNMEASURED)
     told = [apart[keys[row]] for row in rows]
     found = [recall.recollect(recall.levels(row), left_out=row) for row in rows]
     common = [i for i, name in enumerate(names) if all(name in touch.logits for touch in told)]

@@ -1,0 +1,237 @@
+"""What kept touches are for: noise, dead and stuck channels, gaps, other speeds, with nothing told."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.readouts.calibration import FEWEST
+
+SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6, non_finite="missing")
+SCENE = Scene(sensor=SKIN, seed=1)
+NAMES = SCENE.materials[:5]
+ASKED = [(name, SCENE.touch(name, i).readings) for i in range(50, 58) for name in NAMES]
+CHANNELS, REACH = SKIN.channels, 100.0
+
+
+def learned(recall=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
+    scene = Scene(sensor=sensor, seed=1)
+    learner = TactileLearner(sensor=sensor, embedding=Kernels(dimension=256), recall=recall, **settings)
+    for i in range(of_each):
+        for name in names:
+            learner.observe(name, scene.touch(name, i))
+    return learner
+
+
+@pytest.fixture(scope="module")
+def recalling():
+    return learned()
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return learned(recall=0)
+
+
+def uniform(values, rng, reach=0.5):
+    return values + rng.uniform(-reach * REACH, reach * REACH, values.shape)
+
+
+def normal(values, rng, reach=0.5):
+    return values + rng.normal(0, reach * REACH / 3**0.5, values.shape)
+
+
+def some(values, rng, channels, level):
+    return np.where(np.isin(np.arange(CHANNELS), rng.permutation(CHANNELS)[:channels]), level, values)
+
+
+def lasting(values, times):
+    places = np.linspace(0, len(values) - 1, round(len(values) * times))
+    return np.stack([np.interp(places, range(len(values)), channel) for channel in values.T], axis=1)
+
+
+def gapped(values, rng):
+    return np.where(rng.random(values.shape) < 0.4, np.nan, values)
+
+
+LOST = {
+    "uniform noise of half the range": (uniform, 0.85, 0.5),
+    "normal noise of the same energy": (normal, 0.75, 0.5),
+    "half of the channels dead": (lambda values, rng: some(values, rng, 4, 0.0), 0.95, 0.8),
+    "half of the channels stuck at the top": (lambda values, rng: some(values, rng, 4, REACH), 0.95, 0.8),
+    "half of the channels missing": (lambda values, rng: some(values, rng, 4, np.nan), 0.95, 0.9),
+    "twice the speed": (lambda values, rng: lasting(values, 0.5), 0.95, 0.9),
+}
+HELD = {
+    "clean": lambda values, rng: values,
+    "half the speed": lambda values, rng: lasting(values, 2),
+    "a third of the touch": lambda values, rng: values[:27],
+    "two readings of five missing": gapped,
+    "a channel dead": lambda values, rng: some(values, rng, 1, 0.0),
+}
+
+
+def right(learner, change):
+    rng = np.random.default_rng(0)
+    return np.mean([learner.predict(change(values, rng)).material == name for name, values in ASKED])
+
+
+@pytest.mark.parametrize("kind", LOST)
+def test_what_is_lost_without_recall_is_recalled(recalling, alone, kind):
+    change, least, most = LOST[kind]
+    assert right(recalling, change) >= least
+    assert right(alone, change) <= most
+
+
+@pytest.mark.parametrize("kind", HELD)
+def test_what_is_known_without_recall_stays_known(recalling, alone, kind):
+    assert right(recalling, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
+
+
+def test_noise_alone_and_what_was_never_touched_is_unknown(recalling):
+    rng = np.random.default_rng(0)
+    alone = [recalling.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(20)]
+    strange = [recalling.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
+    usual = [recalling.predict(values).known for _, values in ASKED]
+    assert sum(alone) == sum(strange) == 0
+    assert np.mean(usual) >= 0.9
+
+
+def test_a_touch_that_the_model_is_sure_of_is_its_alone(recalling, alone):
+    sure = [values for _, values in ASKED if alone.predict(values).probability > 0.999]
+    assert len(sure) > len(ASKED) / 2
+    same = [recalling.predict(values).ranking == alone.predict(values).ranking for values in sure]
+    assert np.mean(same) > 0.8
+
+
+def test_a_scene_restricts_recall(recalling):
+    rng = np.random.default_rng(0)
+    for name, values in ASKED[:10]:
+        scene = sorted({name, NAMES[0], NAMES[1]})
+        prediction = recalling.predict(uniform(values, rng), scene=scene)
+        assert sorted(material for material, _ in prediction.ranking) == scene
+        assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
+        assert recalling.predict(uniform(values, rng), scene=[name]).probability == 1
+
+
+def test_a_material_without_kept_touches_is_weighed():
+    """Where there is room for fewer touches than materials."""
+    learner = learned(recall=3)
+    kept = {material for material, *_ in learner.memory.kept}
+    assert len(kept) == 3 < len(NAMES)
+    assert right(learner, HELD["clean"]) >= 0.9
+    prediction = learner.predict(uniform(ASKED[0][1], np.random.default_rng(0)))
+    assert sorted(material for material, _ in prediction.ranking) == sorted(NAMES)
+    assert np.isfinite([prediction.novelty, *(share for _, share in prediction.ranking)]).all()
+
+
+@pytest.mark.parametrize(("names", "of_each"), [(NAMES[:1], 8), (NAMES[:1], 1), (NAMES[:2], 1), (NAMES[:3], 2)])
+def test_one_material_and_few_touches(names, of_each):
+    assert len(names) == 1 or len(names) * of_each < FEWEST
+    learner, without = learned(None, of_each, names), learned(0, of_each, names)
+    rng = np.random.default_rng(0)
+    for name, values in ASKED[:10]:
+        for changed in (values, uniform(values, rng), values[:2], lasting(values, 3)):
+            prediction = learner.predict(changed)
+            assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
+            assert np.isfinite(prediction.novelty)
+        if name in names:
+            assert learner.predict(values).material == without.predict(values).material == name
+
+
+def test_touches_far_longer_than_usual_are_kept_in_part_and_recalled(recalling):
+    learner = learned(of_each=4)
+    for i in range(4):
+        learner.observe("long", lasting(SCENE.touch(SCENE.materials[7], i).readings, 5))
+    assert max(levels.shape[1] for *_, levels in learner.memory.kept) == 160
+    rng = np.random.default_rng(0)
+    asked = [lasting(SCENE.touch(SCENE.materials[7], i).readings, 5) for i in range(20, 26)]
+    assert np.mean([learner.predict(values).material == "long" for values in asked]) >= 0.8
+    for values in asked:
+        assert np.isfinite(learner.predict(uniform(values, rng)).novelty)
+    assert right(learner, HELD["clean"]) >= 0.9
+
+
+def test_each_channel_has_noise_of_its_own_range():
+    sensor = SKIN.model_copy(update={"low": (0.0, -10.0) * 4, "high": (1.0, 400.0) * 4})
+    learner, scene, low, high = learned(sensor=sensor), Scene(sensor=sensor, seed=1), *map(np.array, sensor.limits)
+    rng = np.random.default_rng(0)
+    found = []
+    for name, i in [(name, i) for name in NAMES for i in range(50, 54)]:
+        values = scene.touch(name, i).readings
+        found.append(learner.predict(values + rng.uniform(-0.5, 0.5, values.shape) * (high - low)).material == name)
+    assert np.mean(found) >= 0.85
+
+
+def test_one_channel():
+    sensor = SKIN.model_copy(update={"channels": 1})
+    learner, without, scene = learned(sensor=sensor), learned(recall=0, sensor=sensor), Scene(sensor=sensor, seed=1)
+    rng, noisy, clean, lost = np.random.default_rng(0), [], [], []
+    for name, i in [(name, i) for name in NAMES for i in range(50, 54)]:
+        values = scene.touch(name, i).readings
+        clean.append(learner.predict(values).material == name)
+        noisy.append(learner.predict(uniform(values, rng, 0.25)).material == name)
+        lost.append(without.predict(uniform(values, rng, 0.25)).material == name)
+    assert np.mean(clean) >= 0.9
+    assert np.mean(noisy) >= np.mean(lost)
+    for flat in (0.0, 50.0, REACH):
+        assert np.isfinite(learner.predict(np.full((80, 1), flat)).novelty)
+
+
+def test_ragged_touches(recalling):
+    learner = learned(of_each=2)
+    for i in range(2, 10):
+        for name in NAMES:
+            learner.observe(name, SCENE.touch(name, i).readings[: 20 + 8 * i])
+    assert right(learner, HELD["clean"]) >= 0.9
+    assert right(learner, LOST["uniform noise of half the range"][0]) >= 0.6
+
+
+def present(learner):
+    """The recall that answers now."""
+    return learner._current.present(learner._ledger).pooled.recall
+
+
+def test_a_model_that_followed_recalls_what_one_fitted_anew_does(tmp_path):
+    """What was measured and fitted stays until the next fit; what is kept is that of now."""
+    with TactileLearner.open(tmp_path / "m", sensor=SKIN, embedding=Kernels(dimension=256)) as learner:
+        receipts = [learner.observe(name, SCENE.touch(name, i)) for i in range(14) for name in NAMES]
+        learner.settle()
+        measured = present(learner).measured
+        receipt = learner.observe("new", SCENE.touch(SCENE.materials[8], 0))
+        learner.observe(NAMES[0], SCENE.touch(NAMES[0], 30))
+        learner.retract(receipts[3])
+        followed = present(learner)
+        assert followed.measured is measured
+        kept = {(material, key) for material, key, _ in learner.memory.kept}
+        assert followed.held == kept
+        rng = np.random.default_rng(0)
+        asked = [learner.memory.keeping.levels(uniform(values, rng)) for _, values in ASKED[:8]]
+        before = [followed.recollect(levels) for levels in asked]
+        learner.settle()
+        anew = present(learner)
+        assert (anew.held, anew.materials) == (kept, sorted({*NAMES, "new"}))
+        anew.measured = measured
+        for levels, found in zip(asked, before, strict=True):
+            again = anew.recollect(levels)
+            assert again.noise == found.noise
+            assert np.allclose(again.scores, found.scores, rtol=1e-9)
+            numbers = [[each.trust, each.evidence, each.surprise] for each in (again, found)]
+            assert np.allclose(*numbers, rtol=1e-9)
+        learner.retract(receipt)
+        assert "new" not in present(learner).materials
+        assert "new" not in {material for material, _ in learner.predict(ASKED[0][1]).ranking}
+
+
+def test_answers_are_the_same_bytes_for_any_order_of_the_touches():
+    rng = np.random.default_rng(0)
+    touches = [(name, i) for i in range(6) for name in NAMES]
+    asked = [change(values, rng) for _, values in ASKED[:6] for change, *_ in LOST.values()]
+    answers = []
+    for seed in range(2):
+        learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=256), recall=20)
+        for place in np.random.default_rng(seed).permutation(len(touches)):
+            learner.observe(touches[place][0], SCENE.touch(*touches[place]))
+        learner.settle()
+        answers.append([learner.predict(values) for values in asked])
+    assert answers[0] == answers[1]

@@ -81,11 +81,13 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
     """Show what a memory holds: materials with their counts, sensor, embedding, digest and size on disk."""
     with opened_for_upkeep(memory, mode="read") as learner:
         materials, digest, sensor, embedding = learner.materials, learner.digest(), learner.sensor, learner.embedding
+        kept = len(learner.memory.kept or ())
     size = sum(file.stat().st_size for file in memory.rglob("*") if file.is_file())
     if as_json:
         found = {
             "materials": materials,
             "observations": sum(materials.values()),
+            "kept": kept,
             "sensor": sensor.model_dump(mode="json"),
             "embedding": {
                 "name": embedding.name,
@@ -102,6 +104,7 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
         table.add_row(escape(name), str(count))
     console().print(table)
     say(f"[bold]observations:[/] {sum(materials.values())} of {len(materials)} materials")
+    say(f"[bold]kept for recall:[/] {kept} touches")
     say(f"[bold]sensor:[/] {escape(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
     say(
         f"[bold]embedding:[/] {escape(embedding.name)}, {embedding.dimension} features, "

@@ -1,4 +1,8 @@
-"""Kept touches: a bounded sample of what was observed, as small integers, for recall (see `readouts.recall`)."""
+"""Kept touches: a bounded sample of what was observed, for recall (see `readouts.recall`).
+
+In a generation these are `kept-keys` (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their
+materials are the attribute `kept`. Of a generation without them the rows are replayed.
+"""
 
 from __future__ import annotations
 

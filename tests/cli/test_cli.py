@@ -63,9 +63,11 @@ class TestMemory:
         assert found["materials"] == {"silk": 2, "wool": 2}
         assert found["sensor"]["name"] == "roboskin"
         assert found["bytes"] > 0
+        assert found["kept"] == 4
         text = run("inspect", memory).stdout
         assert digest_of(text) == found["digest"]
         assert "4 of 2 materials" in text
+        assert "kept for recall: 4 touches" in text
 
     def test_what_it_is_made_of_is_described_and_composed(self, memory: Path, files: Path) -> None:
         assert "nothing was described yet" in run("compose", memory, files / "silk.csv").output

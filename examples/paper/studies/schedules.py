@@ -187,8 +187,9 @@ def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
     memory = joint.memory
     for learner in learners:
         memory.statistics = memory.statistics + learner.memory.statistics
-        for material, key, touch in learner.memory.sample:
-            memory.sample.add(material, key, touch)
+        memory.sample.update(learner.memory.sample)
+        if memory.kept is not None:
+            memory.kept.update(learner.memory.kept or ())
     return joint
 
 

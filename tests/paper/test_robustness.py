@@ -108,7 +108,7 @@ def test_the_command(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     assert "folds 0" in result.output and "AUROC" in result.output and "Waves" in result.output
     kept = json.loads((tmp_path / "r.json").read_text())
-    assert kept["folds"] == {"roboskin-20": [0]} and "--before CHECKOUT" in kept["command"]
+    assert kept["folds"] == {"roboskin-20": "0"} and "--before CHECKOUT" in kept["command"]
     assert kept["now"] == kept["before"]  # it is this checkout
     assert list(kept["now"]["roboskin-20"]) == ROWS
     assert kept["now"]["series"]["mean"]["accuracy"] == kept["now"]["series"]["Waves"]["accuracy"]

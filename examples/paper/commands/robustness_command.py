@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -61,7 +61,7 @@ def robustness(
     if series is not None and not series.is_file():
         raise InputError(f"expected sets of series in {series}; there is no such file")
     found: dict[str, dict[str, Any]] = {side: {} for side in sides}
-    tested: dict[str, list[int]] = {}
+    tested: dict[str, str] = {}
     records: list[dict[str, Any]] = []
     with progress_bar() as progress:
         for name in named("--set", sets, list(Dataset)):
@@ -74,7 +74,7 @@ def robustness(
             own = [record for fold in task.run(chosen, progress) for record in fold]
             for side, rows in summary(own).items():
                 found[side][name] = rows
-            tested[name] = chosen
+            tested[name] = ", ".join(map(str, chosen))
             records += [{"dataset": name} | record for record in own]
         if series is not None:
             study = Series(series, sides, None if run is None else run / "series")
@@ -86,8 +86,8 @@ def robustness(
         if "series" in found[side]:
             shares = [row["accuracy"] for row in found[side]["series"].values()]
             found[side]["series"]["mean"] = {"accuracy": float(np.mean(shares))}
-    for name, chosen in tested.items():
-        _show(name, chosen, {side: rows[name] for side, rows in found.items()})
+    for name, numbers in tested.items():
+        _show(name, numbers, {side: rows[name] for side, rows in found.items()})
     if series is not None:
         _show_series({side: rows["series"] for side, rows in found.items()})
     if json is not None:
@@ -101,9 +101,9 @@ def robustness(
         write_result(json, made | found | {"records": records})
 
 
-def _show(name: str, folds: Sequence[int], sides: Mapping[str, Mapping[str, Any]]) -> None:
+def _show(name: str, folds: str, sides: Mapping[str, Mapping[str, Any]]) -> None:
     heads = [f"{figure}{f', {side}' * (side != NOW)}" for side in sides for figure in ("right", "ECE", "known")]
-    table = Table("test touches", *heads, title=f"{name}, trained on clean touches, folds {', '.join(map(str, folds))}")
+    table = Table("test touches", *heads, title=f"{name}, trained on clean touches, folds {folds}")
     for row in sides[NOW]:
         cells: list[str] = []
         for rows in sides.values():

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.memory.identity import Identity, usual_embedding, usual_recall
-from scroll_tactile.memory.kept import Keeping
+from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
@@ -50,7 +50,9 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
     """What carries the memory in a store over to another embedding."""
     made = Identity.read(store)
     exemplars = made.exemplar_count(store, None)
-    recall = made.recall if made.recall is not None else usual_recall(made.sensor, embedding)
+    usual = usual_kept(made.sensor) if made.views else None
+    # As many as were asked for, or as many as are usual with the embedding that it gets.
+    recall = usual_recall(made.sensor, embedding) if made.recall in (None, usual) else made.recall
     identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation, recall)
     keeping = Keeping(made.sensor, recall)
     plan = window_plan(made.sensor, embedding)

@@ -38,12 +38,11 @@ MOST_USUAL = 4.0  # times as much is the model believed of a touch that is as fa
 
 @dataclass(frozen=True)
 class _Asked:
-    """What a question is about: the touch, as it was encoded, and the materials that it may be of."""
+    """Who is asked, and the materials that the touch may be of."""
 
     model: Model
     extractor: FeatureExtractor
     candidates: Sequence[str]
-    stream: Stream
 
 
 def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
@@ -56,20 +55,18 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         and model.least <= len(encoded.stream) <= model.longest
     ):
         return judgement
-    asked = _Asked(model, extractor, candidates, encoded.stream)
+    asked = _Asked(model, extractor, candidates)
     levels = levels_of(_seen(encoded.stream), encoded.stream.sensor)
     own_time = pooled.recall.recollect(levels)
     ways = [(own_time, encoded.columns >= model.least)]
     if levels.shape[1] != pooled.recall.longest and levels.shape[1] > 1:
         ways.append((pooled.recall.recollect(levels, whole=True), True))
     filled = _filled(asked, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))
-    answers = [(_answer(asked, filled, way, whole), way.evidence) for way, whole in ways]
-    weights = np.exp(COUNTED * np.array([evidence - max(e for _, e in answers) for _, evidence in answers]))
-    weights /= weights.sum()
-    probability = np.sum(
-        [w * judgement.probability for w, (judgement, _) in zip(weights, answers, strict=True)], axis=0
-    )
-    best = answers[int(weights.argmax())][0]
+    answers = [_answer(asked, filled, way, whole) for way, whole in ways]
+    evidence = np.array([way.evidence for way, _ in ways])
+    weights = np.exp(COUNTED * (evidence - evidence.max()))
+    probability = weights @ np.array([answer.probability for answer in answers])
+    best = answers[int(weights.argmax())]
     return Judgement(probability / probability.sum(), best.novelty, best.calibration, best.strange)
 
 

@@ -33,7 +33,6 @@ FloatArray = npt.NDArray[np.float64]
 SURE = 0.99  # of the probability: less than that is looked up
 COUNTED = 30.0  # values, as which the evidence for a way to compare a touch counts: neighbours say the same
 TINY = 1e-300
-MOST_USUAL = 4.0  # times as much is the model believed of a touch that is as familiar as can be
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,12 @@ def _answer(asked: _Asked, encoded: Encoded, recollection: Recollection, whole: 
     places = {name: i for i, name in enumerate(pooled.recall.materials)}
     least = float(recollection.scores.min())
     scores = np.array([recollection.scores[places[name]] if name in places else least for name in asked.candidates])
-    usual = min(max(pooled.familiar / max(judgement.strange, TINY), 1.0), MOST_USUAL)
-    heard = usual * pooled.trusted * (1 - recollection.trust) * np.log(np.maximum(judgement.probability, TINY))
+    heard = (
+        pooled.familiarity(judgement.strange)
+        * pooled.trusted
+        * (1 - recollection.trust)
+        * np.log(np.maximum(judgement.probability, TINY))
+    )
     logits = heard + scores * pooled.steepness(recollection)
     chances = np.exp(logits - logits.max())
     novelty = (1 - recollection.trust) * judgement.novelty + recollection.trust * pooled.novelty(recollection)

@@ -23,6 +23,7 @@ PRIOR_TOUCHES = 5.0
 UNSEEN = 1 / 20_000  # r where nothing can be left out: after one touch of each, beginnings are lost to a larger one
 USUAL = 0.95  # of touches left out are familiar
 MOST_SPREAD = 1e-9
+MOST_FAMILIAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,12 @@ class Pooled:
     def steepness(self, recollection: Recollection) -> float:
         """β, see `prediction.recalling`."""
         return 1 / (1 + (1 / self.recalled - 1) * recollection.certainty)
+
+    def familiarity(self, strange: float) -> float:
+        """How many times as much the model is believed of a touch, the more familiar it is: 1 where it is strange."""
+        if not (np.isfinite(self.familiar) and np.isfinite(strange)):
+            return 1.0
+        return float(np.clip(self.familiar / max(strange, MOST_SPREAD), 1.0, MOST_FAMILIAR))
 
     def novelty(self, recollection: Recollection) -> float:
         """The surprise of a touch, in units of its spread in known ones, as novelty is."""

@@ -311,7 +311,8 @@ class Readout:
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.
         """
-        away = codes - self.origin - self._means[self.held([place])[0]]
+        row = self.held([place])[0]  # first: it may make room for the means anew
+        away = codes - self.origin - self._means[row]
         return float(np.square(away) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:

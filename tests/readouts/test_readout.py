@@ -209,3 +209,17 @@ def test_a_coarse_comparison_keeps_its_bounds(monkeypatch, followed, materials):
     plain = readout.novelty(probe, np.arange(len(readout.names)))
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     assert readout.novelty(probe, np.arange(len(readout.names))) == pytest.approx(plain, rel=1e-12)
+
+
+def test_the_strangeness_from_a_material_that_was_not_held_is_that_of_one_that_was(monkeypatch):
+    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
+    rng = np.random.default_rng(0)
+    statistics = Statistics(WIDTH, [SCALE])
+    for name in [f"{i:03d}" for i in range(40)] * 2:
+        statistics.add(name, {SCALE: rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)})
+    probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
+    few, again = (readout_of(statistics, ["000", "001"]) for _ in range(2))
+    again.held(range(40))
+    assert [few.strangeness(probe, place) for place in range(40)] == [
+        again.strangeness(probe, place) for place in range(40)
+    ]

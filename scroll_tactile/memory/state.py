@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
-from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -28,8 +27,9 @@ from scroll_tactile.memory.rows import (
     unspanned,
 )
 from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.readouts.likelihood import LevelArray
 from scroll_tactile.signals.windows import WindowPlan
-from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
+from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import CompactedError, DamageError, Generation, Head, Record, Store
 
@@ -224,22 +224,17 @@ class Memory:
         fresh.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
         if fresh.kept is not None:
-            self._keep_again(fresh.kept, store, read)
+            mine, made = {(material, key): own for material, key, own in self.kept or ()}, fresh.kept.made
+
+            def levels(material: str, key: bytes, sequence: int) -> LevelArray:
+                if (own := mine.get((material, key))) is not None:
+                    return own
+                return made.levels(cast(Readings, unpack_readings(store.record(sequence).arrays)))
+
+            fresh.kept.refill(((head.label, head.key, head.sequence) for head in read), levels)
         if fresh.exemplars is not None:
             fresh.exemplars.update((head.label, head.key, head.sequence) for head in read)
         return fresh
-
-    def _keep_again(self, kept: KeptTouches, store: Store, heads: Sequence[Head]) -> None:
-        """Take in those of some observations, whose rows hold readings, that belong to the kept touches."""
-        mine = {(material, key): levels for material, key, levels in self.kept or ()}
-        rows: Sample[int | None] = Sample(kept.capacity)
-        rows.update((material, key, None) for material, key, _ in kept)
-        rows.update((head.label, head.key, head.sequence) for head in heads)
-        for material, key, sequence in rows:
-            if (levels := mine.get((material, key))) is not None:
-                kept.add(material, key, levels)
-            elif sequence is not None:
-                kept.take(material, key, unpack_readings(store.record(sequence).arrays))
 
     def _to_keep(self, record: Record) -> Readings | None:
         """The readings of an observation, where it belongs to the kept touches and its row holds them."""

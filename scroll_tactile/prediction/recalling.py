@@ -15,7 +15,6 @@ are fitted to touches left out. The two ways weigh exp(COUNTED e), e the evidenc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.readouts.likelihood import levels_of
+from scroll_tactile.readouts.pooled import Pooled
 from scroll_tactile.readouts.recollection import Recollection
 from scroll_tactile.signals.stream import Stream
 
@@ -35,15 +35,6 @@ COUNTED = 30.0  # values, as which the evidence for a way to compare a touch cou
 TINY = 1e-300
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """Who is asked, and the materials that the touch may be of."""
-
-    model: Model
-    extractor: FeatureExtractor
-    candidates: Sequence[str]
-
-
 def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
     """What a model says of an encoded touch, and what kept touches add to it where it is not sure."""
     judgement = model.judge(candidates, encoded.means, encoded.columns)
@@ -54,14 +45,13 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         and model.least <= len(encoded.stream) <= model.longest
     ):
         return judgement
-    asked = _Asked(model, extractor, candidates)
     levels = levels_of(_seen(encoded.stream), encoded.stream.sensor)
     own_time = pooled.recall.recollect(levels)
     ways = [(own_time, encoded.columns >= model.least)]
     if levels.shape[1] != pooled.recall.longest and levels.shape[1] > 1:
         ways.append((pooled.recall.recollect(levels, whole=True), True))
-    filled = _filled(asked, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))
-    answers = [_answer(asked, filled, way, whole) for way, whole in ways]
+    filled = _filled(model, extractor, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))
+    answers = [_answer(model, pooled, candidates, filled, way, whole) for way, whole in ways]
     evidence = np.array([way.evidence for way, _ in ways])
     weights = np.exp(COUNTED * (evidence - evidence.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
@@ -74,7 +64,7 @@ def _seen(stream: Stream) -> npt.NDArray[np.floating]:
     return stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
 
 
-def _filled(asked: _Asked, encoded: Encoded, recollection: Recollection) -> Encoded:
+def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recollection: Recollection) -> Encoded:
     """The touch with its stuck channels as kept touches have them, where that changes any of its levels."""
     stream = encoded.stream
     readings = recollection.filled(stream.readings, stream.sensor)
@@ -82,17 +72,17 @@ def _filled(asked: _Asked, encoded: Encoded, recollection: Recollection) -> Enco
         return encoded
     readings.setflags(write=False)
     needed = [*encoded.means]
-    return asked.extractor.encode(Stream(stream.sensor, readings), asked.model.longest, lambda columns: needed)
+    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: needed)
 
 
-def _answer(asked: _Asked, encoded: Encoded, recollection: Recollection, whole: bool) -> Judgement:
+def _answer(
+    model: Model, pooled: Pooled, candidates: Sequence[str], encoded: Encoded, recollection: Recollection, whole: bool
+) -> Judgement:
     """What the model and the kept touches say together, compared in one way."""
-    model, pooled = asked.model, asked.model.pooled
-    assert pooled is not None
-    judgement = model.judge(asked.candidates, encoded.means, encoded.columns, whole=whole)
+    judgement = model.judge(candidates, encoded.means, encoded.columns, whole=whole)
     places = {name: i for i, name in enumerate(pooled.recall.materials)}
     least = float(recollection.scores.min())
-    scores = np.array([recollection.scores[places[name]] if name in places else least for name in asked.candidates])
+    scores = np.array([recollection.scores[places[name]] if name in places else least for name in candidates])
     heard = (
         pooled.familiarity(judgement.strange)
         * pooled.trusted

@@ -74,8 +74,8 @@ class Pooled:
 
 def pool(recall: Recall, apart: Mapping[bytes, Apart]) -> Pooled:
     """Fit g and r to kept touches that were left out of both. apart: by key, what the model says of those."""
-    rows = [row for key, row in sorted(recall.rows().items()) if key in apart]
-    keys = {row: key for key, row in recall.rows().items()}
+    keys = {row: key for key, row in sorted(recall.rows().items()) if key in apart}
+    rows = list(keys)
     # Of the least sure half of them, where it matters which of the two is believed; the others at random.
     unsure = sorted(rows, key=lambda row: apart[keys[row]].margin)[: LEFT_OUT // 2]
     others = [row for row in rows if row not in unsure]

@@ -47,11 +47,15 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         return judgement
     levels = levels_of(_seen(encoded.stream), encoded.stream.sensor)
     own_time = pooled.recall.recollect(levels)
-    ways = [(own_time, encoded.columns >= model.least)]
+    ways = [(own_time, True)]
     if levels.shape[1] != pooled.recall.longest and levels.shape[1] > 1:
-        ways.append((pooled.recall.recollect(levels, whole=True), True))
+        ways.append((pooled.recall.recollect(levels, whole=True), False))
     filled = _filled(model, extractor, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))
-    answers = [_answer(model, pooled, candidates, filled, way, whole) for way, whole in ways]
+    usual = encoded.columns >= model.least
+    said = {usual: judgement} if filled is encoded else {}  # by the model, by whether the touch counts as a whole one
+    for whole in {usual or not own_time for _, own_time in ways} - set(said):
+        said[whole] = model.judge(candidates, filled.means, filled.columns, whole=whole)
+    answers = [_answer(pooled, candidates, said[usual or not own_time], way, own_time) for way, own_time in ways]
     evidence = np.array([way.evidence for way, _ in ways])
     weights = np.exp(COUNTED * (evidence - evidence.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
@@ -76,15 +80,14 @@ def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recolle
 
 
 def _answer(
-    model: Model, pooled: Pooled, candidates: Sequence[str], encoded: Encoded, recollection: Recollection, whole: bool
+    pooled: Pooled, candidates: Sequence[str], judgement: Judgement, recollection: Recollection, own_time: bool
 ) -> Judgement:
     """What the model and the kept touches say together, compared in one way."""
-    judgement = model.judge(candidates, encoded.means, encoded.columns, whole=whole)
     places = {name: i for i, name in enumerate(pooled.recall.materials)}
     least = float(recollection.scores.min())
     scores = np.array([recollection.scores[places[name]] if name in places else least for name in candidates])
     heard = (
-        pooled.familiarity(judgement.strange)
+        pooled.familiarity(judgement.strange, own_time)
         * pooled.trusted
         * (1 - recollection.trust)
         * np.log(np.maximum(judgement.probability, TINY))

@@ -23,7 +23,7 @@ PRIOR_TOUCHES = 5.0
 UNSEEN = 1 / 20_000  # r where nothing can be left out: after one touch of each, beginnings are lost to a larger one
 USUAL = 0.95  # of touches left out are familiar
 MOST_SPREAD = 1e-9
-MOST_FAMILIAR = 4.0
+LEAST_FAMILIAR, MOST_FAMILIAR = 0.5, 4.0  # and 1 at least in the time of those that were learned
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,15 @@ class Pooled:
         """β, see `prediction.recalling`."""
         return 1 / (1 + (1 / self.recalled - 1) * recollection.certainty)
 
-    def familiarity(self, strange: float) -> float:
-        """How many times as much the model is believed of a touch, the more familiar it is: 1 where it is strange."""
+    def familiarity(self, strange: float, own_time: bool) -> float:
+        """How many times as much the model is believed of a touch, the more familiar it is.
+
+        own_time: whether it is compared with beginnings: a strange one of those is believed as a usual one.
+        """
+        least = 1.0 if own_time else LEAST_FAMILIAR
         if not (np.isfinite(self.familiar) and np.isfinite(strange)):
             return 1.0
-        return float(np.clip(self.familiar / max(strange, MOST_SPREAD), 1.0, MOST_FAMILIAR))
+        return float(np.clip(self.familiar / max(strange, MOST_SPREAD), least, MOST_FAMILIAR))
 
     def novelty(self, recollection: Recollection) -> float:
         """The surprise of a touch, in units of its spread in known ones, as novelty is."""

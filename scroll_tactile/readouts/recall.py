@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise
+from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
 from scroll_tactile.readouts.recollection import Kept, Measured, Recollection, by_chance, shape_of, trust_in
 
 __all__ = ["Recall"]
@@ -30,12 +30,16 @@ FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 SHORTLIST = 64  # kept touches that are compared value by value; with all 800 no more is right
-BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by: four bytes each
-COARSER = 4  # blocks in one where touches of another speed are compared
+BLOCK_VALUES = (
+    2400  # means of a kept touch that the shortlist is made by, a byte each; 1200 lose 3 in 100 through noise
+)
+AT_ONCE = 128  # kept touches whose means are multiplied at once, as floats
+COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
 FIRST = 3  # candidates for each rough amplitude, and for the finer ones
 FIRST_VALUES = 1000  # of a touch, by which the rough amplitude is found
 ROUGH = (CLEAN, *(Noise(step) for step in (420, 632, 784, 880)))
-COARSE = (CLEAN, *(Noise(step) for step in range(120, 924, 32)), *(Noise(step, True) for step in range(5, 41, 2)))
+COARSE = tuple(Noise(step) for step in range(120, 924, 32)), tuple(Noise(step, True) for step in range(5, 41, 2))
+STRIDE = 4  # coarse amplitudes in one at first: the likelihood has one peak over them
 WARMTHS = (0.03, 0.1, 0.3)  # of blends: how steeply a kept touch's part falls with its likelihood
 BLENDED = 6  # materials, the likeliest, that have blends
 
@@ -73,15 +77,30 @@ class _Asked:
         return self.values / self.levels.size
 
 
+@dataclass(frozen=True)
+class _Pairs:
+    """Values of a touch beside those of some others: 256 · level + other level, (others, values).
+
+    weights: of each other's sum: by the same number of values, where some lack, (others,).
+    """
+
+    places: Rows
+    weights: FloatArray
+
+    def logs(self, table: Table) -> FloatArray:
+        """Log-likelihood of the touch by each of the others, (others,)."""
+        return np.asarray(table.logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
+
+
 @dataclass
 class _Room:
     """What is made of kept touches, row by row.
 
-    blocks: means, (touches, C · B). squares: sums of their squares by channel, (touches, C).
+    blocks: means, rounded to levels, (touches, C · B). squares: sums of their squares by channel, (touches, C).
     columns: the length of each. gapless: whether it has a value everywhere.
     """
 
-    blocks: npt.NDArray[np.float32]
+    blocks: LevelArray
     squares: npt.NDArray[np.float32]
     columns: npt.NDArray[np.intp]
     gapless: npt.NDArray[np.bool_]
@@ -89,7 +108,7 @@ class _Room:
     @classmethod
     def of(cls, count: int, channels: int, blocks: int) -> _Room:
         return cls(
-            np.empty((count, channels * blocks), np.float32),
+            np.empty((count, channels * blocks), np.uint8),
             np.empty((count, channels), np.float32),
             np.empty(count, np.intp),
             np.empty(count, np.bool_),
@@ -185,7 +204,7 @@ class Recall:
             held = self._held
         whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
         whole[:, : touch.levels.shape[1]] = touch.levels
-        means = _means(whole, self._edges)[0].astype(np.float32)
+        means = np.rint(_means(whole, self._edges)[0])
         held.blocks[row], held.squares[row] = means.ravel(), (means**2).sum(axis=1)
         held.columns[row], held.gapless[row] = touch.levels.shape[1], not bool((whole == MISSING).any())
         self._touches.append((touch.material, touch.key))
@@ -198,7 +217,7 @@ class Recall:
         self._labels = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
         self._blocks, self._squares = held.blocks[:count], held.squares[:count]
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
-        self._brought: npt.NDArray[np.float32] | None = None
+        self._brought: LevelArray | None = None
 
     def recollect(self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None) -> Recollection:
         """Compare a touch, levels of shape (C, T), with all that are kept, but for the row `left_out`.
@@ -212,18 +231,19 @@ class Recall:
         noise = self._roughly(asked, left_out)
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
-        logs = self._logs(beside, asked, noise)
+        pairs = self._pairs(beside, asked)
+        logs = pairs.logs(self._table(noise))
         for stride in () if noise == CLEAN else (1,) if noise.normal else (8, 2, 1):
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
-                noise, logs = finer, self._logs(beside, asked, finer)
+                noise, logs = finer, pairs.logs(self._table(finer))
         return self._told(asked, rows, beside, logs, noise, levels.shape[1])
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
         asked = _Asked.of(self._levels[row], self.longest, whole=False)
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
-        best = beside[np.argmax(self._logs(beside, asked, CLEAN))]
+        best = beside[np.argmax(self._pairs(beside, asked).logs(self._table(CLEAN)))]
         return shape_of(*self._deviation(asked, best, CLEAN))
 
     def nearest(self, row: int) -> tuple[LevelArray, LevelArray] | None:
@@ -231,7 +251,9 @@ class Recall:
         others = np.flatnonzero((self._labels == self._labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
-        far = self._squares[others].sum(axis=1) - 2 * (self._blocks[others] @ self._blocks[row])
+        far = self._squares[others].sum(axis=1) - 2 * _product(
+            self._blocks[others], self._blocks[row].astype(np.float32)
+        )
         own, other = self._rows([row, int(others[np.argmin(far)])])
         return own, other
 
@@ -263,7 +285,7 @@ class Recall:
         columns = asked.levels.shape[1]
         edges = self._edges[::COARSER] * columns // self.longest if asked.whole else self._edges
         means, known = _means(asked.levels, edges)
-        tables = [self.measured.likelihood.table(noise) for noise in noises]
+        tables = [self._table(noise) for noise in noises]
         guess = np.stack([(means - table.offset) / table.slope * known for table in tables]).reshape(len(noises), -1)
         far = self._distances(guess.astype(np.float32), known, asked.whole)
         if left_out is not None:
@@ -280,23 +302,23 @@ class Recall:
         """
         blocks = self._in_their_time() if whole else self._blocks
         if self._gapless and not whole and bool((known.all(axis=1) == known.any(axis=1)).all()):
-            return np.asarray((self._squares @ known[:, 0].astype(np.float32))[:, None] - 2 * (blocks @ guess.T))
+            return np.asarray((self._squares @ known[:, 0].astype(np.float32))[:, None] - 2 * _product(blocks, guess.T))
         columns = np.flatnonzero(known)
         blocks, guess = blocks[:, columns], guess[:, columns]
-        square = np.einsum("nd,nd->n", blocks, blocks)[:, None]
+        square = np.einsum("nd,nd->n", blocks, blocks, dtype=np.float32)[:, None]
         if self._gapless or whole:
-            return np.asarray(square - 2 * (blocks @ guess.T))
+            return np.asarray(square - 2 * _product(blocks, guess.T))
         both = self._read()[:, columns].astype(np.float32)
-        far = square - 2 * (blocks @ guess.T) + both @ np.square(guess).T
+        far = square - 2 * _product(blocks, guess.T) + both @ np.square(guess).T
         return np.asarray(far / np.maximum(both.sum(axis=1, keepdims=True), 1))
 
-    def _in_their_time(self) -> npt.NDArray[np.float32]:
+    def _in_their_time(self) -> LevelArray:
         """Means of the kept touches over wider blocks of each one's own length, (touches, blocks)."""
         if (brought := self._brought) is None:
             means = []
             for row, columns in enumerate(self._columns.tolist()):
                 means.append(_means(self._levels[row], self._edges[::COARSER] * columns // self.longest)[0].ravel())
-            brought = self._brought = np.array(means, dtype=np.float32)
+            brought = self._brought = np.rint(means).astype(np.uint8)
         return brought
 
     def _read(self) -> npt.NDArray[np.bool_]:
@@ -304,16 +326,17 @@ class Recall:
         values = (self._rows(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
         return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
 
-    def _logs(self, beside: LevelArray, asked: _Asked, noise: Noise, values: slice | Rows = slice(None)) -> FloatArray:
-        """Log-likelihood of the touch by each of some others; by the same number of values, where some lack."""
-        logs = self.measured.likelihood.table(noise).logs
+    def _table(self, noise: Noise) -> Table:
+        return self.measured.likelihood.table(noise)
+
+    def _pairs(self, beside: LevelArray, asked: _Asked, values: slice | Rows = slice(None)) -> _Pairs:
         beside = beside[:, values]
-        sums = logs.take(asked.shifted[values] | beside).sum(axis=1, dtype=np.int64) / UNIT
+        places = asked.shifted[values] | beside
         if self._gapless:
-            return np.asarray(sums)
+            return _Pairs(places, np.ones(len(beside)))
         seen = asked.seen.ravel()[values]
-        pairs = np.count_nonzero((beside != MISSING) & seen, axis=1)
-        return np.asarray(sums * (np.count_nonzero(seen) / np.maximum(pairs, 1)))
+        both = np.count_nonzero((beside != MISSING) & seen, axis=1)
+        return _Pairs(places, np.count_nonzero(seen) / np.maximum(both, 1))
 
     def _roughly(self, asked: _Asked, left_out: int | None) -> Noise:
         beside = self._beside(np.unique(self._shortlist(ROUGH, asked, FIRST, left_out)), asked)
@@ -321,7 +344,16 @@ class Recall:
         values = values[:: max(1, len(values) // FIRST_VALUES)]
         if not len(values) or not len(beside):
             return CLEAN
-        return max(COARSE, key=lambda noise: float(self._logs(beside, asked, noise, values).max()))
+        pairs = self._pairs(beside, asked, values)
+
+        def likelihood(noise: Noise) -> float:
+            return float(pairs.logs(self._table(noise)).max())
+
+        found = [CLEAN]
+        for noises in COARSE:
+            best = max(range(0, len(noises), STRIDE), key=lambda i: likelihood(noises[i]))
+            found.append(max(noises[max(0, best - STRIDE + 1) : best + STRIDE], key=likelihood))
+        return max(found, key=likelihood)
 
     def _finer(
         self, rows: Rows, beside: LevelArray, logs: FloatArray, asked: _Asked, noise: Noise, stride: int
@@ -332,12 +364,13 @@ class Recall:
         else:
             same = self._labels[rows] == self._labels[rows[np.argmax(logs)]]
             nearest = _blends(beside[same], logs[same], WARMTHS[:2])
-        return max(noise.near(stride), key=lambda near: float(self._logs(nearest, asked, near).max()))
+        pairs = self._pairs(nearest, asked)
+        return max(noise.near(stride), key=lambda near: float(pairs.logs(self._table(near)).max()))
 
     def _told(
         self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise, columns: int
     ) -> Recollection:
-        table, measured = self.measured.likelihood.table(noise), self.measured
+        table, measured = self._table(noise), self.measured
         expected = np.full((self.channels, columns), np.nan)
         mean = _mean(beside, np.exp(WARMTHS[1] * (logs - logs.max()))[None])[0].reshape(self.channels, -1)
         expected[:, : mean.shape[1]] = mean[:, :columns]
@@ -360,7 +393,7 @@ class Recall:
         """How a touch deviates from what a kept one reads through noise, (C, T), 0 where one lacks; and where not."""
         near = best.reshape(asked.seen.shape)
         both = asked.seen & (near != MISSING)
-        mean = self.measured.likelihood.table(noise).mean[np.where(both, near, 0)]
+        mean = self._table(noise).mean[np.where(both, near, 0)]
         return np.where(both, asked.levels - mean, 0.0), both
 
     def _scores(self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise) -> FloatArray:
@@ -372,8 +405,15 @@ class Recall:
             mine = labels == material
             if np.count_nonzero(mine) > 1:
                 blends = _blends(beside[mine], logs[mine], WARMTHS)
-                best[material] = max(best[material], float(self._logs(blends, asked, noise).max()))
+                pairs = self._pairs(blends, asked)
+                best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
         return best
+
+
+def _product(blocks: LevelArray, guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """blocks @ guess."""
+    parts = [blocks[row : row + AT_ONCE].astype(np.float32) @ guess for row in range(0, len(blocks), AT_ONCE)]
+    return np.concatenate(parts)
 
 
 def _means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

@@ -28,6 +28,7 @@ EARLIER = {
     "0.1.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
     "0.2.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
     "0.3.0": "fd4382a21ead3d6d3a1a7e110ebc593960402bd1d8fe83188c99697183a73705",
+    "0.4.0": "35de6b7b9ac3fa8c4465003160167bc31e80c5ce4497769e2dc5b0b3330dd7e8",
 }
 NAMES = ("felt", "Samt ü/√", "cork")
 COMPACTED = (0, 1, 2, 3, 6, 7, 8, 9, 11)  # seeds of the touches whose readings are gone, of 60 readings each

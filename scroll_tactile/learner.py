@@ -242,7 +242,7 @@ class TactileLearner:
         Raises StreamError (NoContactError where the gel was not pressed), MaterialError (nothing was kept),
         CapacityError, or StoreError.
         """
-        require_name(material)
+        material = require_name(material)
         touch = self._verified().stream(stream)
         image = self._extractor.image(touch)
         receipt = self._ledger.observe(material, touch, image.shape[1], self._extractor.codes(image, touch.key))
@@ -263,7 +263,7 @@ class TactileLearner:
         Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
         that cannot be used (nothing was changed); StoreError.
         """
-        require_name(material)
+        material = require_name(material)
         self._ledger.describe(material, None if constituents is None else checked(material, constituents))
 
     @property

@@ -58,14 +58,15 @@ def _described(error: ValidationError, model: type[BaseModel]) -> str:
     return f"expected {name} to be {what}; came {first['input']!r:.80}"
 
 
-def require_name(material: str) -> None:
-    """Raise MaterialError for what cannot name a material."""
+def require_name(material: str) -> str:
+    """The name of a material, of no subclass of str such as numpy's; raises MaterialError for what cannot be one."""
     if not isinstance(material, str):
         raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
     if not material or len(material) > LONGEST_NAME:
         raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
     if not material.isprintable():
         raise MaterialError(f"expected a name of printable characters; came {material!r}")
+    return str(material)
 
 
 def candidates_of(scene: Sequence[str] | None, names: list[str], known: AbstractSet[str]) -> list[str]:

@@ -11,6 +11,7 @@ import torch
 
 import scroll_tactile
 from scroll_tactile import Kernels, Prediction, Sensor, TactileLearner, sensors
+from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import (
     CapacityError,
     ChannelCountError,
@@ -587,3 +588,13 @@ def test_it_says_what_it_is(tmp_path):
         assert "pad" in repr(kept)
         assert "m" in repr(kept)
     assert scroll_tactile.TactileLearner is TactileLearner
+
+
+def test_a_name_of_numpys_is_the_name():
+    touch = Scene(sensor=sensors.BIOTAC).touch("felt", 0)
+    digests = []
+    for name in ("felt", np.str_("felt")):
+        learner = TactileLearner(sensor=sensors.BIOTAC)
+        learner.observe(name, touch)
+        digests.append(learner.digest())
+    assert digests[0] == digests[1]

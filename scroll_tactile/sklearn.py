@@ -1,0 +1,137 @@
+"""A learner as an estimator of scikit-learn: for pipelines, cross-validation and grid searches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.exceptions import NotFittedError
+
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.errors import InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import validate
+
+__all__ = ["TactileClassifier"]
+
+RATE = 100.0  # Hz, where nothing is known of the sensor
+MARGIN = 0.1  # of the range that was seen, beyond it at both ends
+
+Touches = npt.NDArray[Any] | Sequence[npt.ArrayLike]
+Labels = npt.NDArray[Any] | Sequence[Any]
+
+
+class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
+    """`TactileLearner`, in memory only, behind fit, partial_fit, predict, predict_proba and score.
+
+    Touches X: an array (N, T, n) of N touches of T readings of n channels, (N, T) where there is one channel, or a list
+    of arrays (T, n), whose lengths may differ. Labels y, (N,): of any kind that numpy can sort; each is the name of a
+    material as its text.
+
+    sensor: of the readings; None: 100 Hz, and the range of the first touches that are fitted, a tenth wider at both
+    ends. embedding, readout, recall: as of the learner.
+
+    After fitting: classes_, the labels in ascending order; n_features_in_, the channels; learner_, the learner. An
+    estimator that was fitted in parts, in any order, is the same as one that was fitted at once.
+
+    Raises InputError for labels that do not fit the touches, StreamError for touches that do not fit the sensor,
+    NotFittedError for predictions before anything was fitted.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor | None = None,
+        embedding: Embedding | None = None,
+        readout: str = "lda",
+        recall: int | None = None,
+    ) -> None:
+        self.sensor = sensor
+        self.embedding = embedding
+        self.readout = readout
+        self.recall = recall
+
+    def fit(self, X: Touches, y: Labels) -> Self:
+        """Observe these touches and nothing else."""
+        for name in ("learner_", "classes_", "n_features_in_"):
+            self.__dict__.pop(name, None)
+        return self.partial_fit(X, y)
+
+    def partial_fit(self, X: Touches, y: Labels, classes: Labels | None = None) -> Self:
+        """Observe these touches beside all before. classes: taken as scikit-learn passes it, and not needed."""
+        touches, labels = list(_arrays(X)), np.asarray(y)
+        if labels.shape != (len(touches),) or not touches:
+            raise InputError(
+                f"expected touches, and one label for each; came {len(touches)} touches and labels of shape "
+                f"{labels.shape}"
+            )
+        learner: TactileLearner | None = getattr(self, "learner_", None)
+        if learner is None:
+            sensor = _sensor_of(touches) if self.sensor is None else self.sensor
+            learner = TactileLearner(
+                sensor=sensor, embedding=self.embedding, readout=self.readout, recall=self.recall, exemplars=0
+            )
+        streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
+        for label, stream in zip(labels, streams, strict=True):
+            learner.observe(str(label), stream)
+        before = getattr(self, "classes_", labels[:0])
+        self.learner_, self.n_features_in_ = learner, learner.sensor.channels
+        self.classes_ = np.unique(np.concatenate([before, labels]))
+        return self
+
+    def predict(self, X: Touches) -> npt.NDArray[Any]:
+        """The likeliest label of each touch, (N,)."""
+        likeliest = self.predict_proba(X).argmax(axis=1)
+        return np.asarray(self.classes_[likeliest])
+
+    def predict_proba(self, X: Touches) -> npt.NDArray[np.float64]:
+        """The probability of each label in the order of classes_, (N, classes), calibrated on touches left out."""
+        learner: TactileLearner | None = getattr(self, "learner_", None)
+        if learner is None:
+            raise NotFittedError("this TactileClassifier knows no touches yet: call fit or partial_fit first")
+        names = [str(label) for label in self.classes_]
+        rankings = [dict(learner.predict(touch).ranking) for touch in _arrays(X)]
+        return np.array([[shares[name] for name in names] for shares in rankings]).reshape(-1, len(names))
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.three_d_array = True
+        tags.target_tags.required = True
+        return tags
+
+
+def _arrays(touches: Touches) -> Iterator[npt.NDArray[Any]]:
+    """Each touch as (T, n)."""
+    if isinstance(touches, np.ndarray) and touches.dtype != object and touches.ndim not in (2, 3):
+        raise InputError(f"expected touches of shape (N, T, n), or (N, T) of one channel; came {touches.shape}")
+    for touch in touches:
+        array = np.asarray(touch)
+        yield array[:, None] if array.ndim == 1 else array
+
+
+def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:
+    """A sensor that some touches could be of."""
+    first = touches[0]
+    if any(touch.ndim != 2 or touch.shape[1:] != first.shape[1:] or not touch.size for touch in touches):
+        shapes = sorted({touch.shape[1:] for touch in touches})
+        raise InputError(f"expected touches of shape (T, n), all of the same n; came readings of shapes {shapes[:5]}")
+    low = min(float(np.min(touch)) for touch in touches)
+    high = max(float(np.max(touch)) for touch in touches)
+    if not np.isfinite([low, high]).all():
+        raise InputError(
+            'expected finite readings, or a sensor that says what others are: sensor=Sensor(..., non_finite="missing")'
+        )
+    margin = MARGIN * (high - low) or 1.0
+    longest = max(len(touch) for touch in touches)
+    return Sensor(
+        name="array",
+        channels=first.shape[1],
+        rate=RATE,
+        low=low - margin,
+        high=high + margin,
+        unit="",
+        duration=longest / RATE,
+    )

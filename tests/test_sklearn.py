@@ -1,0 +1,112 @@
+"""The learner as an estimator of scikit-learn."""
+
+import pickle
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
+
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.errors import InputError, MaterialError, StreamError
+from scroll_tactile.sklearn import TactileClassifier
+
+PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+SMALL = Kernels(seed=0, dimension=64)
+
+
+def touches(count=8, readings=50):
+    """Touches (N, T, 2) of three materials, and their labels."""
+    labels = np.repeat(["cork", "felt", "silk"], count)
+    rng = np.random.default_rng(0)
+    steps = {"cork": 0.1, "felt": 0.4, "silk": 0.9}
+    walks = [np.cumsum(rng.normal(0, steps[label], (readings, 2)), axis=0) for label in labels]
+    return 0.5 + 0.4 * np.sin(np.array(walks)), labels
+
+
+def make(**changes):
+    return TactileClassifier(**{"sensor": PAD, "embedding": SMALL, "recall": 0, **changes})
+
+
+def test_it_answers_as_its_learner_does():
+    X, y = touches()
+    fitted = make().fit(X, y)
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, recall=0, exemplars=0)
+    for touch, label in zip(X, y, strict=True):
+        learner.observe(label, touch)
+    assert fitted.learner_.digest() == learner.digest()
+    shares = fitted.predict_proba(X[:3])
+    assert [dict(learner.predict(touch).ranking) for touch in X[:3]] == [
+        dict(zip(fitted.classes_, row, strict=True)) for row in shares
+    ]
+    assert fitted.score(X, y) > 0.9
+    assert fitted.n_features_in_ == 2
+
+
+def test_parts_in_any_order_are_the_whole():
+    X, y = touches()
+    whole, order = make().fit(X, y), np.random.default_rng(1).permutation(len(y))
+    parts = make()
+    for some in np.array_split(order, 5):
+        parts.partial_fit(X[some], y[some], classes=["cork", "felt", "silk"])
+    assert parts.learner_.digest() == whole.learner_.digest()
+    assert parts.classes_.tolist() == whole.classes_.tolist()
+    assert parts.fit(X[:8], y[:8]).classes_.tolist() == ["cork"]
+
+
+def test_lists_of_touches_of_any_length_and_labels_that_are_numbers():
+    X, y = touches()
+    ragged = [touch[: 30 + i % 20] for i, touch in enumerate(X)]
+    numbers = np.unique(y, return_inverse=True)[1] * 10
+    predicted = make().fit(ragged, numbers).predict(ragged)
+    assert predicted.dtype == numbers.dtype
+    assert np.mean(predicted == numbers) > 0.8
+
+
+def test_it_clones_and_pickles():
+    X, y = touches()
+    fitted = make(readout="ridge").fit(X, y)
+    copy = clone(fitted)
+    assert str(copy.get_params()) == str(fitted.get_params())
+    assert not hasattr(copy, "learner_")
+    again = pickle.loads(pickle.dumps(fitted))
+    assert np.array_equal(again.predict_proba(X), fitted.predict_proba(X))
+
+
+def test_it_works_in_pipelines_and_searches():
+    X, y = touches()
+    piped = make_pipeline(FunctionTransformer(lambda touches: touches * 0.5), make())
+    assert cross_val_score(piped, X, y, cv=2).mean() > 0.6
+    found = GridSearchCV(make(), {"readout": ["lda", "ridge"]}, cv=2).fit(X, y)
+    assert found.best_params_["readout"] in ("lda", "ridge")
+
+
+def test_a_sensor_that_is_not_given_is_as_wide_as_the_touches():
+    X, y = touches()
+    one_channel = TactileClassifier(embedding=SMALL, recall=0).fit(X[:, :, 0], y)
+    sensor = one_channel.learner_.sensor
+    assert (sensor.channels, sensor.readings) == (1, 50)
+    assert sensor.low < X[:, :, 0].min() < X[:, :, 0].max() < sensor.high
+
+
+def test_what_does_not_fit_is_said():
+    X, y = touches(2)
+    with pytest.raises(NotFittedError, match="call fit"):
+        make().predict(X)
+    with pytest.raises(InputError, match="6 touches and labels of shape \\(5,\\)"):
+        make().fit(X, y[:5])
+    with pytest.raises(InputError, match=r"shape \(N, T, n\)"):
+        make().fit(X[0, 0], y)
+    with pytest.raises(InputError, match="all of the same n"):
+        TactileClassifier().fit([X[0], X[1][:, :1]], y[:2])
+    with pytest.raises(InputError, match="finite readings"):
+        TactileClassifier().fit(np.full((2, 5, 1), np.nan), ["a", "b"])
+    with pytest.raises(MaterialError):
+        make().fit(X, ["", *y[1:]])
+    fitted = make().fit(X, y)
+    with pytest.raises(StreamError):
+        fitted.partial_fit([*X, X[0][:, :1]], [*y, "felt"])
+    assert fitted.learner_.digest() == make().fit(X, y).learner_.digest()

@@ -6,29 +6,44 @@ import hashlib
 import re
 import struct
 from collections.abc import Mapping
-from io import BytesIO
+from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 
 from store.exceptions import RecordError, VersionError
+from store.frames import compress, decompress, decompress_blosc
 
-__all__ = ["array_digest", "check_arrays", "decode_payload", "encode_payload", "flat_bytes"]
+__all__ = [
+    "array_digest",
+    "check_arrays",
+    "decode_payload",
+    "encode_payload",
+    "flat_bytes",
+    "item_size",
+    "kept_dtype",
+    "require_name",
+    "require_shape",
+    "require_values",
+]
 
 MAGIC = b"ARPL"
-PAYLOAD_VERSION = 1
+PAYLOAD_VERSION = 2
 HEADER = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
-RAW, BLOSC = 0, 1
+RAW, BLOSC, ZSTD = 0, 1, 2
+COMPRESSED = {1: BLOSC, 2: ZSTD}  # by the payload's version
 
-# Every append waits for it: the differences of a BioTac touch's readings, 15 KB as int16, become 3.2 KB in 0.023 ms
-# (LZ4: 5.3 KB in 0.007 ms; zstd level 3: 3.1 KB in 0.037 ms), where the disk itself takes 0.2 to 0.3 ms.
-COMPRESSOR, LEVEL = b"zstd", 1
 SMALL = 128  # bytes, of which compressing saves next to nothing
 
 # SQLite refuses blobs above 1e9 bytes, and a row this large stalls every append behind it.
 LARGEST_PAYLOAD = 256 * 2**20
 
 KEPT_TYPES = frozenset(["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"])
+TEXT_TYPE = re.compile(r"<U[1-9][0-9]{0,8}")
+LAST_CODE_POINT = 0x10FFFF
+MOST_AXES = 64  # NumPy's own limit
+LARGEST_SIZE = 2**63 - 1
 
 # The names are folders in a generation: portable to every file system, never zarr's reserved "__…".
 NAME = re.compile(r"(?!__)[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,98}[A-Za-z0-9_-])?")
@@ -44,22 +59,60 @@ def check_arrays(arrays: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarra
     checked: dict[str, np.ndarray] = {}
     folded: dict[str, str] = {}
     for name, array in (arrays or {}).items():
-        _check_name(name)
+        try:
+            require_name(name)
+        except ValueError as error:
+            raise RecordError(str(error)) from error
         if other := folded.get(name.casefold()):
             raise RecordError(f"the names {other!r} and {name!r} would be one folder on a Mac or on Windows")
         folded[name.casefold()] = name
         _check_array(name, array)
         # Not ascontiguousarray, which turns a 0-d array into a 1-d one.
         checked[name] = np.asarray(array, order="C")
+        try:
+            require_values(checked[name])
+        except ValueError as error:
+            raise RecordError(f"array {name!r} cannot be kept: {error}") from error
     return checked
 
 
-def _check_name(name: str) -> None:
+def require_name(name: object) -> str:
+    """Return what can name an array; raise ValueError for anything else."""
     if not isinstance(name, str) or not NAME.fullmatch(name) or name.casefold() == "zarr.json":
-        raise RecordError(
+        raise ValueError(
             f"{name!r} cannot name an array: use 1 to 100 ASCII letters, digits, '_', '-' and '.', not "
             "starting with '__', '-' or '.' nor ending with '.'"
         )
+    return name
+
+
+def kept_dtype(text: object) -> np.dtype:
+    """Return the dtype that NumPy's string `text` stands for; raise ValueError where it is none that is kept."""
+    if not isinstance(text, str) or not (text in KEPT_TYPES or TEXT_TYPE.fullmatch(text)):
+        raise ValueError(f"{text!r} is no dtype that is kept")
+    try:
+        return np.dtype(text)
+    except TypeError as error:
+        raise ValueError(f"{text!r} is no dtype: {error}") from error
+
+
+def require_shape(lengths: object, dtype: np.dtype) -> tuple[int, ...]:
+    """Return the shape of an array that could be in memory; raise ValueError where `lengths` is none."""
+    if not isinstance(lengths, list | tuple) or len(lengths) > MOST_AXES:
+        raise ValueError(f"{str(lengths)[:80]} is not the shape of an array with at most {MOST_AXES} axes")
+    if not all(type(length) is int and length >= 0 for length in lengths):
+        raise ValueError(f"{lengths} is not a shape: a length is an int of 0 or more")
+    if prod(max(length, 1) for length in lengths) * max(dtype.itemsize, 1) > LARGEST_SIZE:
+        raise ValueError(f"an array of shape {lengths} and dtype {dtype} is too large for any memory")
+    return tuple(lengths)
+
+
+def require_values(array: np.ndarray) -> None:
+    """Raise ValueError for a bool that is neither 0 nor 1 or a character that is no code point of Unicode."""
+    if array.size and array.dtype.kind == "b" and flat_bytes(array).max() > 1:
+        raise ValueError("a bool is neither 0 nor 1")
+    if array.nbytes and array.dtype.kind == "U" and flat_bytes(array).view("<u4").max() > LAST_CODE_POINT:
+        raise ValueError("a character is no code point of Unicode")
 
 
 def _check_array(name: str, array: np.ndarray) -> None:
@@ -81,6 +134,11 @@ def flat_bytes(array: np.ndarray) -> np.ndarray:
     if array.nbytes == 0:
         return np.empty(0, np.uint8)
     return array.reshape(-1).view(np.uint8)
+
+
+def item_size(dtype: np.dtype) -> int:
+    """Return by how many bytes the elements of an array alternate: four for text, a character."""
+    return 4 if dtype.kind == "U" else dtype.itemsize
 
 
 def array_digest(array: np.ndarray) -> str:
@@ -118,68 +176,87 @@ def _short(text: str) -> bytes:
 
 def _compressed(array: np.ndarray) -> tuple[int, bytes]:
     raw = flat_bytes(array)
-    if raw.size < SMALL:
-        return RAW, raw.tobytes()
-    # Imported late: reading and opening a store without arrays does not need it, and it costs 60 ms.
-    from numcodecs import blosc
+    if raw.size >= SMALL and len(frame := compress(raw, item_size(array.dtype))) < raw.size:
+        return ZSTD, frame
+    return RAW, raw.tobytes()
 
-    # Blosc shuffles by the item's size, which it takes from the buffer; a character is four bytes.
-    item = 4 if array.dtype.kind == "U" else array.dtype.itemsize
-    packed: bytes = blosc.compress(raw.view(f"<u{item}"), COMPRESSOR, LEVEL, blosc.BITSHUFFLE)
-    return (BLOSC, packed) if len(packed) < raw.size else (RAW, raw.tobytes())
+
+@dataclass(frozen=True)
+class _Described:
+    """What a payload says of one of its arrays; `stored` are the bytes of its buffer."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    codec: int
+    size: int
+    stored: int
 
 
 def decode_payload(payload: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of a payload whose checksum was verified, as fresh writable arrays.
+    """Return the arrays of a payload, as fresh writable arrays; its checksum need not be right, nor from a friend.
 
-    Raises VersionError for a payload of a newer version and ValueError for bytes that are no payload.
+    Nothing is allocated before all that it says of its arrays is found to be so. Raises VersionError for a
+    payload of a newer version and ValueError for bytes that are no payload, or hold more than `encode_payload`
+    takes.
     """
     try:
-        return _decode(BytesIO(payload))
-    except (struct.error, UnicodeDecodeError, RuntimeError, TypeError, OverflowError) as error:
-        raise ValueError(f"not a payload of arrays: {error}") from error
+        described, start = _descriptions(payload)
+    except (struct.error, IndexError, UnicodeDecodeError) as error:
+        raise ValueError(f"the payload ends in a description: {error}") from error
+    size, stored = (sum(getattr(part, name) for part in described) for name in ("size", "stored"))
+    if size > LARGEST_PAYLOAD:
+        raise ValueError(f"the arrays of a payload have {size} bytes, more than {LARGEST_PAYLOAD}")
+    if stored != len(payload) - start:
+        raise ValueError(f"the buffers of a payload have {len(payload) - start} bytes, not {stored}")
+    if len({part.name.casefold() for part in described}) < len(described):
+        raise ValueError("two arrays of a payload have one name")
+    arrays = {}
+    for part in described:
+        arrays[part.name] = _filled(part, payload[start : start + part.stored])
+        start += part.stored
+    return arrays
 
 
-def _decode(stream: BytesIO) -> dict[str, np.ndarray]:
-    def unpack(layout: str) -> tuple[int, ...]:
-        return struct.unpack(layout, stream.read(struct.calcsize(layout)))
-
-    def text() -> str:
-        return stream.read(*unpack("<B")).decode("ascii")
-
-    if stream.read(4) != MAGIC:
+def _descriptions(payload: bytes) -> tuple[list[_Described], int]:
+    """Return what the payload says of each array, and where the first buffer begins."""
+    magic, version, count = HEADER.unpack_from(payload)
+    if magic != MAGIC:
         raise ValueError("the payload does not start with its magic number")
-    version, count = unpack("<BH")
     if version > PAYLOAD_VERSION:
         raise VersionError(
             f"a record's arrays are written in payload format {version}; this release reads up to "
             f"{PAYLOAD_VERSION}: upgrade it"
         )
-    described = []
+    if version not in COMPRESSED:
+        raise ValueError(f"there is no payload format {version}")
+    start, described = HEADER.size, []
     for _ in range(count):
-        name, dtype = text(), text()
-        (dimensions,) = unpack("<B")
-        array = np.empty(unpack(f"<{dimensions}Q"), np.dtype(dtype))
-        codec, size, stored = unpack("<BQQ")
-        if array.nbytes != size:
-            raise ValueError(f"array {name!r} of {array.nbytes} bytes is said to have {size}")
-        described.append((name, array, codec, stored))
-    for _, array, codec, stored in described:
-        _fill(array, codec, stream.read(stored), stored)
-    return {name: array for name, array, _, _ in described}
+        texts = []
+        for _ in ("name", "dtype"):
+            end = start + 1 + payload[start]
+            texts.append(payload[start + 1 : end].decode("ascii"))
+            start = end
+        name, dtype, axes = require_name(texts[0]), kept_dtype(texts[1]), payload[start]
+        shape = require_shape(struct.unpack_from(f"<{axes}Q", payload, start + 1), dtype)
+        codec, size, stored = LENGTHS.unpack_from(payload, start + 1 + 8 * axes)
+        start += 1 + 8 * axes + LENGTHS.size
+        if size != prod(shape) * dtype.itemsize:
+            raise ValueError(f"array {name!r} of shape {shape} and dtype {dtype} is said to have {size} bytes")
+        if codec not in (RAW, COMPRESSED[version]) or (codec == RAW and stored != size):
+            raise ValueError(f"array {name!r} has codec {codec} and {stored} bytes for {size}")
+        described.append(_Described(name, dtype, shape, codec, size, stored))
+    return described, start
 
 
-def _fill(array: np.ndarray, codec: int, buffer: bytes, size: int) -> None:
+def _filled(part: _Described, buffer: bytes) -> np.ndarray:
+    array = np.empty(part.shape, part.dtype)
     target = flat_bytes(array)
-    if len(buffer) != size:
-        raise ValueError("the payload ends early")
-    if codec == RAW:
+    if part.codec == RAW:
         target[:] = np.frombuffer(buffer, np.uint8)
-    elif codec == BLOSC:
-        from numcodecs import blosc
-
-        if struct.unpack_from("<I", buffer, 4)[0] != array.nbytes:
-            raise ValueError("a compressed array has another length than its description")
-        blosc.decompress(buffer, target)
+    elif part.codec == BLOSC:
+        decompress_blosc(buffer, target)
     else:
-        raise ValueError(f"unknown codec {codec}")
+        decompress(buffer, target, item_size(part.dtype))
+    require_values(array)
+    return array

@@ -1,0 +1,68 @@
+"""Rows, payloads and generations as somebody else could make them: their checksums are right, as these have no key."""
+
+import hashlib
+import json
+import sqlite3
+import struct
+import subprocess
+import sys
+import textwrap
+from contextlib import closing
+
+from store.records import checksum, payload_digest
+
+
+def payload(arrays, version=1, after=b""):
+    """The bytes of a payload; arrays: (name, dtype, shape, codec, bytes of the array, buffer)."""
+    head, buffers = struct.pack("<4sBH", b"ARPL", version, len(arrays)), b""
+    for name, dtype, shape, codec, size, buffer in arrays:
+        for text in (name, dtype):
+            head += struct.pack("<B", len(text)) + text.encode()
+        head += struct.pack(f"<B{len(shape)}Q", len(shape), *shape) + struct.pack("<BQQ", codec, size, len(buffer))
+        buffers += buffer
+    return head + buffers + after
+
+
+def put_row(path, content, *, kind="a", label="forged", key=b"key", time=1.0, attributes="{}"):
+    """Put a row with this payload behind the last of the store in `path`; return its sequence."""
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+        ((sequence,),) = connection.execute("SELECT coalesce(max(sequence), 0) + 1 FROM record").fetchall()
+        digest = payload_digest(content)
+        fields = (sequence, kind, label, key, time, attributes, len(content), digest)
+        stored = checksum("record", *(part.encode() if isinstance(part, str) else part for part in fields))
+        connection.execute("INSERT INTO record VALUES (?,?,?,?,?,?,?,?,?)", (*fields, stored))
+        connection.execute("INSERT INTO payload VALUES (?,?)", (sequence, content))
+    return sequence
+
+
+def put_generation(path, number, content, *, upto=1, base=0, time=1.0, attributes="{}"):
+    """Name a generation in the journal of the store in `path`; content: JSON's values, or its text."""
+    text = content if isinstance(content, str) else json.dumps(content)
+    fields = (number, upto, base, time, attributes, text)
+    stored = checksum("generation", *(part.encode() if isinstance(part, str) else part for part in fields))
+    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
+        connection.execute("INSERT OR REPLACE INTO generation VALUES (?,?,?,?,?,?,?)", (*fields, stored))
+
+
+def describe_again(folder, **changes):
+    """Change what a generation says of itself, and make its sha256 anew."""
+    header = folder / "zarr.json"
+    group = json.loads(header.read_text())
+    known = group["attributes"] | changes
+    known.pop("sha256", None)
+    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
+    group["attributes"] = known | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    header.write_text(json.dumps(group))
+    return {"format": known["format"], "arrays": known["arrays"]}
+
+
+def in_a_process(code, *arguments, memory=2**30, seconds=60):
+    """Run code in a process that may die, with this much memory more than it has after its imports."""
+    limited = f"""
+        import resource, sys
+        import numpy, store, numcodecs.blosc, numcodecs.zstd, zarr
+        held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + {memory}, held + {memory}))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(limited) + textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)

@@ -1,0 +1,144 @@
+"""A payload from elsewhere, however forged, is damage at its place: no crash, no byte of ours, no memory taken."""
+
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+from forged import in_a_process, payload, put_row
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numcodecs import blosc, zstd
+
+from store import DamageError, RecordError, Store, VersionError
+from store.encoding import decode_payload, encode_payload
+
+HEADER = struct.Struct("<BBBBIII")
+BEHIND = HEADER.pack(2, 1, 0x20, 1, 65536, 65536, 2**31 - 1) + struct.pack("<i", 2**30)
+COPIED = HEADER.pack(2, 1, 2, 1, 65536, 65536, 65552)
+READ = """
+    with store.Store.open(sys.argv[1], mode="read") as opened:
+        try:
+            list(opened.records())
+        except store.DamageError as damage:
+            print("damage at", damage.sequence)
+"""
+
+
+@pytest.mark.parametrize("frame", [BEHIND, COPIED], ids=["a block far behind the end", "bytes that are not there"])
+def test_a_crafted_frame_is_damage_and_nothing_else(plain, frame):
+    number = put_row(plain, payload([("codes", "|u1", (65536,), 1, 65536, frame)]))
+    read = in_a_process(READ, plain)
+    assert (read.returncode, read.stdout) == (0, f"damage at {number}\n"), read.stderr
+
+
+def test_arrays_that_together_are_larger_than_any_that_are_written_are_damage(plain):
+    large = 256 * 2**20
+    frame = blosc.compress(np.zeros(large, np.uint8), b"zstd", 1, blosc.BITSHUFFLE)
+    put_row(plain, payload([(f"x{i}", "|u1", (large,), 1, large, frame) for i in range(60)]))
+    number = put_row(plain, payload([("x", "<f8", (2**37,), 0, 2**40, b"")]))
+    read = in_a_process(READ, plain, memory=200 * 2**20)
+    assert (read.returncode, read.stdout) == (0, f"damage at {number - 1}\n"), read.stderr
+
+
+FOUR = b"abcd"
+FORGED = {
+    "nothing": b"",
+    "no arrays but bytes": payload([], after=b"x"),
+    "bytes behind the last buffer": payload([("x", "|u1", (4,), 0, 4, FOUR)], after=b"x"),
+    "fewer arrays than said": struct.pack("<4sBH", b"ARPL", 1, 3),
+    "format 0": payload([], version=0),
+    "a terabyte": payload([("x", "<f8", (2**37,), 0, 2**40, b"")]),
+    "sizes whose product overflows": payload([("x", "<f8", (2**32, 2**32), 0, 0, b"")]),
+    "a length above any": payload([("x", "|u1", (2**64 - 1, 0), 0, 0, b"")]),
+    "more axes than arrays have": payload([("x", "|u1", (1,) * 65, 0, 1, b"a")]),
+    "one name twice": payload([("x", "|u1", (4,), 0, 4, FOUR)] * 2),
+    "one name in two cases": payload([("x", "|u1", (4,), 0, 4, FOUR), ("X", "|u1", (4,), 0, 4, FOUR)]),
+    "a name that leads out": payload([("../x", "|u1", (4,), 0, 4, FOUR)]),
+    "no name": payload([("", "|u1", (4,), 0, 4, FOUR)]),
+    "objects": payload([("x", "|O8", (1,), 0, 8, bytes(8))]),
+    "a big-endian dtype": payload([("x", ">i4", (1,), 0, 4, FOUR)]),
+    "times": payload([("x", "<M8[s]", (1,), 0, 8, bytes(8))]),
+    "a structure": payload([("x", "i4,i4", (1,), 0, 8, bytes(8))]),
+    "text too long": payload([("x", "<U999999999", (2**40,), 0, 0, b"")]),
+    "text of no length": payload([("x", "<U0", (4,), 0, 0, b"")]),
+    "a character that is none": payload([("x", "<U1", (1,), 0, 4, struct.pack("<I", 0x110000))]),
+    "a bool of 2": payload([("x", "|b1", (1,), 0, 1, b"\2")]),
+    "another size": payload([("x", "|u1", (5,), 0, 4, FOUR)]),
+    "an unknown codec": payload([("x", "|u1", (4,), 9, 4, FOUR)]),
+    "the codec of a later format": payload([("x", "|u1", (4,), 2, 4, zstd.compress(FOUR))]),
+    "a codec that is no more written": payload([("x", "|u1", (4,), 1, 4, FOUR)], version=2),
+    "zstd of another size": payload([("x", "|u1", (4,), 2, 4, zstd.compress(b"abc"))], version=2),
+    "two frames of zstd": payload([("x", "|u1", (6,), 2, 6, 2 * zstd.compress(b"abc"))], version=2),
+}
+
+
+@pytest.mark.parametrize("content", FORGED.values(), ids=FORGED)
+def test_a_payload_that_was_never_written_is_damage_at_its_row(plain, content):
+    number = put_row(plain, content)
+    with Store.open(plain, mode="read") as opened:
+        found = opened.records()
+        tracemalloc.start()
+        try:
+            with pytest.raises(DamageError) as refused:
+                for _ in found:
+                    pass
+            assert tracemalloc.get_traced_memory()[1] < 2**20
+        finally:
+            tracemalloc.stop()
+    assert refused.value.sequence == number
+
+
+ARRAYS = {
+    "levels": np.arange(4000, dtype=np.uint8).reshape(10, 400),
+    "text": np.array(["wool", "silk ü"]),
+    "flags": np.arange(300) % 2 == 0,
+    "none": np.zeros((0, 3)),
+    "one": np.array(1.5),
+}
+
+
+def of_the_first_format(arrays):
+    """A payload as releases up to 0.4 wrote it."""
+    parts = []
+    for name, array in arrays.items():
+        raw, item = array.tobytes(), 4 if array.dtype.kind == "U" else array.dtype.itemsize
+        frame = blosc.compress(np.frombuffer(raw, f"<u{item}"), b"zstd", 1, blosc.BITSHUFFLE) if raw else raw
+        smaller = len(frame) < len(raw)
+        parts.append((name, array.dtype.str, array.shape, int(smaller), len(raw), frame if smaller else raw))
+    return payload(parts)
+
+
+@pytest.mark.parametrize("written", [encode_payload, of_the_first_format])
+def test_both_formats_are_read(written):
+    read = decode_payload(written(ARRAYS))
+    assert {name: (array.dtype, array.shape, array.tobytes()) for name, array in read.items()} == {
+        name: (array.dtype, array.shape, array.tobytes()) for name, array in ARRAYS.items()
+    }
+
+
+@pytest.mark.parametrize("written", [encode_payload, of_the_first_format])
+@settings(deadline=None, max_examples=500)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_harmed_payload_is_refused_or_read_and_nothing_else(written, seed):
+    rng, content = np.random.default_rng(seed), bytearray(written(ARRAYS))
+    for _ in range(rng.integers(1, 4)):
+        content[int(rng.integers(len(content) if rng.random() < 0.5 else 120))] = int(rng.integers(256))
+    if rng.random() < 0.2:
+        del content[int(rng.integers(len(content))) :]
+    try:
+        decode_payload(bytes(content))
+    except ValueError:
+        pass
+    except VersionError as error:
+        assert "upgrade" in str(error)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.array([2], np.uint8).view(bool), np.array([0x110000], "<u4").view("<U1")],
+    ids=["a bool of 2", "a character that is none"],
+)
+def test_what_would_be_damage_is_not_written(opened, array):
+    with pytest.raises(RecordError, match="'x'"):
+        opened.append("a", "b", b"", arrays={"x": array})

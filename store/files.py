@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 from contextlib import suppress
 from pathlib import Path
+
+from store.exceptions import DamageError
 
 try:
     import fcntl
@@ -14,7 +17,7 @@ except ImportError:  # Windows has none
 else:
     FULL_SYNC = getattr(fcntl, "F_FULLFSYNC", None)
 
-__all__ = ["file_size", "remove_tree", "sync_file", "sync_folder", "sync_tree", "tree_size"]
+__all__ = ["file_size", "read_regular", "remove_tree", "sync_file", "sync_folder", "sync_tree", "tree_size"]
 
 
 def sync_file(path: Path) -> None:
@@ -69,3 +72,25 @@ def remove_tree(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+
+
+def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes:
+    """Return the bytes of a regular file of at most `limit` bytes.
+
+    within: a folder above it; those between the two are no links either. Raises DamageError for a link, for anything
+    that is no file, and for a larger one, without reading from it; and OSError.
+    """
+    for folder in path.parents if within is not None else ():
+        if folder == within:
+            break
+        if folder.is_symlink():
+            raise DamageError(f"{folder} is a symbolic link, where a store has a folder of its own", path=folder)
+    # Before it is opened: to open a device can already do something.
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise DamageError(f"{path} is no regular file", path=path)
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    with os.fdopen(descriptor, "rb") as file:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
+            raise DamageError(f"{path} has {found.st_size} bytes; at most {limit} are read there", path=path)
+        return file.read(found.st_size)

@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from store.chunks import ArrayFiles, file_digests, most_bytes
+from store.content import GROUP_VERSION, ArrayContent, read_content
 from store.encoding import array_digest, flat_bytes
-from store.exceptions import DamageError, StoreError, VersionError, reported
-from store.files import remove_tree, sync_folder, sync_tree
-from store.records import JSON, from_json
+from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
+from store.files import read_regular, remove_tree, sync_folder, sync_tree
+from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json
 
 if TYPE_CHECKING:
     import zarr
 
 __all__ = ["PARTIAL", "Draft", "GroupReader", "folder_name", "read_own_description", "require_known", "write_group"]
 
-GROUP_VERSION = 1
 PARTIAL = ".partial"
 
-# Pieces of a large array: small enough to be compressed in cache-sized steps and on several
-# threads, large enough that a hundred megabytes are some tens of files to make durable.
-CHUNK_BYTES = 4 * 2**20
+# The memory of 800 BioTac touches, 29.3 MB, becomes 19.1 MB (level 1: 20.0; level 6: 18.7; with shuffled bytes, as in
+# Blosc, 17.3; but zarr's format has no codec for these alone).
+LEVEL = 3
 
 # What a reader meets where a file is missing or is not a file; other failures of the system
 # (no permission, too many open files) say nothing against the generation.
@@ -56,19 +57,28 @@ def write_group(parent: Path, number: int, draft: Draft, identity: Mapping[str, 
     left behind. Raises StoreFullError, ReadOnlyError or StoreError.
     """
     described = {
-        name: {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
-        for name, array in draft.arrays.items()
+        name: ArrayContent(array.dtype, array.shape, array_digest(array)) for name, array in draft.arrays.items()
     }
-    content = {"format": GROUP_VERSION, "arrays": described}
     known = {"number": number, "upto": draft.upto, "attributes": from_json(draft.attributes), "identity": identity}
-    known |= content
     final = parent / folder_name(number)
     partial = parent / (folder_name(number) + PARTIAL)
     try:
         with reported(partial, f"writing generation {number}"):
             parent.mkdir(exist_ok=True)
             remove_tree(partial)
-            _write_zarr(partial, known | {"sha256": _own_digest(known)}, draft)
+            group = _write_zarr(partial, draft, described, LEVEL)
+            if sum(content.size for content in described.values()) > most_bytes(partial):
+                # Readers make no room for so much that so little stands for: anybody could claim it.
+                remove_tree(partial)
+                group = _write_zarr(partial, draft, described, None)
+            content = {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
+            group.update_attributes(known | content | {"sha256": _own_digest(known | content)})
+            try:
+                _read_attributes(partial / "zarr.json")
+            except (ValueError, DamageError) as error:
+                raise RecordError(
+                    f"generation {number} has more attributes than could be read again: {error}"
+                ) from error
             sync_tree(partial)
             partial.rename(final)
             sync_folder(parent)
@@ -79,45 +89,44 @@ def write_group(parent: Path, number: int, draft: Draft, identity: Mapping[str, 
     return content
 
 
+def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSON]:
+    return {
+        name: {
+            "dtype": content.dtype.str,
+            "shape": list(content.shape),
+            "sha256": content.sha256,
+            "files": file_digests(path / name, content),
+        }
+        for name, content in described.items()
+    }
+
+
 def _own_digest(known: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
-def _write_zarr(path: Path, attributes: dict[str, Any], draft: Draft) -> None:
-    # Imported late: 300 ms that a process which only appends or reads the journal need not spend.
+def _write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], level: int | None) -> zarr.Group:
+    # Imported late: 300 ms that a process which reads, or only appends, need not spend.
     import zarr
-    from zarr.codecs import BloscCodec
+    from zarr.codecs import ZstdCodec
     from zarr.storage import LocalStore
 
-    group = zarr.create_group(store=LocalStore(path), zarr_format=3, attributes=attributes)
+    group = zarr.create_group(store=LocalStore(path), zarr_format=3)
     for name, array in draft.arrays.items():
-        plain = array
-        if array.dtype.kind == "U":
-            # zarr v3 has no settled type for fixed-width text and warns of it: code points have one.
-            plain = flat_bytes(array).view("<u4").reshape(*array.shape, array.dtype.itemsize // 4)
+        content = described[name]
         target = group.create_array(
             name,
-            shape=plain.shape,
-            dtype=plain.dtype,
-            chunks=_chunks(plain),
-            # Second moments and a sample of 800 BioTac touches, 12.3 MB, become 7.9 MB in 75 ms, synced, and are read
-            # in 20 ms (level 1: 8.1 MB in 56 ms; level 5: 7.6 MB in 105 ms; differences of rows save nothing).
-            compressors=BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"),
+            shape=content.plain_shape,
+            dtype=content.plain,
+            chunks=content.chunk,
+            compressors=None if level is None else ZstdCodec(level=level),
             fill_value=0,
             attributes={"dtype": array.dtype.str},
             # A chunk that equals the fill value would have no file, nor would a lost one.
             config={"write_empty_chunks": True},
         )
-        target[...] = plain
-
-
-def _chunks(array: np.ndarray) -> tuple[int, ...]:
-    lengths, piece = [], array.nbytes
-    for length in array.shape:
-        slab = piece // max(length, 1)
-        lengths.append(max(1, length if piece <= CHUNK_BYTES else CHUNK_BYTES // max(slab, 1)))
-        piece = slab * lengths[-1]
-    return tuple(lengths)
+        target[...] = flat_bytes(array).view(content.plain).reshape(content.plain_shape)
+    return group
 
 
 class GroupReader:
@@ -129,19 +138,20 @@ class GroupReader:
 
     def __init__(self, path: Path, number: int, content: Mapping[str, Any]) -> None:
         require_known(path, content["format"])
-        import zarr
-        from zarr.storage import LocalStore
-
-        self._path, self._number, self._described = path, number, content["arrays"]
+        self._path, self._number, self._described = path, number, read_content(content)
         header = path / "zarr.json"
         try:
-            self._group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r", zarr_format=3)
-            found = self._group.attrs.get("format")
+            found, room = _read_attributes(header).get("format"), most_bytes(path)
         except Exception as error:
             raise _unreadable(error, f"generation {number} in {header}", header) from error
         if found != content["format"]:
             raise DamageError(
                 f"generation {number} in {header} claims format {found!r}, not {content['format']}", path=header
+            )
+        if (size := sum(array.size for array in self._described.values())) > room:
+            raise DamageError(
+                f"generation {number} in {path} claims arrays of {size} bytes; its files can stand for {room} at most",
+                path=path,
             )
 
     def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -157,36 +167,29 @@ class GroupReader:
                 yield damage
 
     def _array(self, name: str) -> np.ndarray:
-        import zarr
-
-        folder = self._path / name
+        folder, content = self._path / name, self._described[name]
         what = f"array {name!r} of generation {self._number} in {folder}"
         try:
-            node = self._group[name]
-            array = _read_array(node, self._described[name]) if isinstance(node, zarr.Array) else None
+            array = ArrayFiles(self._path, name, content).read()
         except Exception as error:
             raise _unreadable(error, what, folder) from error
-        if array is None or array_digest(array) != self._described[name]["sha256"]:
+        if array_digest(array) != content.sha256:
             raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
         return array
 
 
-def _read_array(node: zarr.Array[Any], described: Mapping[str, Any]) -> np.ndarray | None:
-    shape, dtype = tuple(described["shape"]), np.dtype(described["dtype"])
-    text = dtype.kind == "U"
-    stored = ((*shape, dtype.itemsize // 4), np.dtype("<u4")) if text else (shape, dtype)
-    # Before it is read: a flipped bit in a shape could ask for more memory than there is.
-    if (node.shape, node.dtype) != stored:
-        return None
-    plain = np.asarray(node[...])
-    if not text:
-        return np.require(plain, requirements=["C", "W"])
-    array = np.empty(shape, dtype)
-    flat_bytes(array)[:] = flat_bytes(np.asarray(plain, order="C"))
-    return array
+def _read_attributes(header: Path) -> dict[str, Any]:
+    """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
+    group: dict[str, Any] = from_json(read_regular(header, LARGEST_JSON, within=header.parent.parent).decode())
+    attributes = group.get("attributes")
+    if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
+        raise ValueError("it describes no group of zarr's format 3")
+    return attributes
 
 
 def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
+    if isinstance(error, DamageError):
+        return DamageError(f"{what} cannot be read: {error}", path=error.path)
     other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
     if other or isinstance(error, MemoryError):
         return StoreError(f"{what} could not be read: {error}")
@@ -200,17 +203,32 @@ def read_own_description(path: Path) -> dict[str, Any]:
     """
     header = path / "zarr.json"
     try:
-        known = json.loads(header.read_text(encoding="utf-8"))["attributes"]
+        known = _read_attributes(header)
         stored = known.pop("sha256", None)
+        sound = _own_digest(known) == stored
     except Exception as error:
         raise _unreadable(error, f"a generation in {header}", header) from error
     # Before the version, which a flipped bit can make a newer one.
-    if _own_digest(known) != stored:
+    if not sound:
         raise DamageError(
             f"what {header} says of its generation is not what was written: its sha256 differs", path=header
         )
-    require_known(path, known["format"])
-    return dict(known)
+    try:
+        read_content(known)
+        require_known(path, known["format"])
+        _require_described(known)
+    except ValueError as error:
+        raise _unreadable(error, f"a generation in {header}", header) from error
+    return known
+
+
+def _require_described(known: Mapping[str, Any]) -> None:
+    """Raise ValueError where a group of a known format does not say whose it is."""
+    for name, kind in {"number": int, "upto": int, "attributes": dict, "identity": dict}.items():
+        if type(known.get(name)) is not kind:
+            raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
+    if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["upto"] <= LARGEST_NUMBER):
+        raise ValueError(f"its number is {known['number']}, its upto {known['upto']}")
 
 
 def require_known(path: Path, version: int) -> None:

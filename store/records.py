@@ -10,18 +10,22 @@ import json
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 
+from store.content import read_content
 from store.exceptions import DamageError, RecordError
 
 __all__ = [
     "GENERATION_COLUMNS",
     "HEAD_COLUMNS",
     "JSON",
+    "LARGEST_JSON",
+    "LARGEST_NUMBER",
     "Generation",
     "GenerationRow",
     "Head",
@@ -42,6 +46,10 @@ __all__ = [
 ]
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
+
+# Texts that are read as JSON. A value of three characters takes up to 90 bytes of memory: these at most 200 MB.
+LARGEST_JSON, MOST_VALUES = 64 * 2**20, 2**21
+LARGEST_NUMBER = 2**63 - 1  # of SQLite's integers
 
 LONGEST_KEY = 64  # bytes: the longest digest in common use (sha512, blake2b)
 
@@ -132,19 +140,42 @@ def to_json(what: str, value: Mapping[str, JSON] | None) -> str:
     if not isinstance(value, Mapping):
         raise RecordError(f"{what} must be a mapping, not {type(value).__name__}")
     try:
-        return json.dumps(_plain(what, value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        text = json.dumps(_plain(what, value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        _require_bounded(text)
     except (RecursionError, ValueError) as error:
         if isinstance(error, RecordError):
             raise
         raise RecordError(f"{what} cannot be written as JSON: {error}") from error
+    return text
 
 
 def from_json(text: str) -> dict[str, JSON]:
-    """Return what `to_json` wrote; raise ValueError when `text` is not a JSON object."""
-    value = json.loads(text)
+    """Return what `to_json` wrote; raise ValueError for anything else, or JSON that is too deep or long."""
+    _require_bounded(text)
+    try:
+        value = JSON_READER.decode(text)
+    except RecursionError as error:
+        raise ValueError("JSON that is nested too deep") from error
     if not isinstance(value, dict):
         raise ValueError("not a JSON object")
     return cast("dict[str, JSON]", value)
+
+
+def _require_bounded(text: str) -> None:
+    if len(text) > LARGEST_JSON:
+        raise ValueError(f"JSON of {len(text)} characters; at most {LARGEST_JSON} are read")
+    if len(text) > MOST_VALUES and sum(map(text.count, "[{,:")) > MOST_VALUES:
+        raise ValueError(f"JSON of more than {MOST_VALUES} values")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"JSON with the number {text}")
+    return number
+
+
+JSON_READER = json.JSONDecoder(parse_float=_finite, parse_constant=_finite)
 
 
 def _plain(where: str, value: JSON) -> JSON:
@@ -192,31 +223,64 @@ def payload_digest(payload: bytes) -> bytes:
 def _verifies(table: str, fields: Sequence[Any], stored: object) -> bool:
     try:
         return checksum(table, *fields) == stored
-    except (TypeError, ValueError, AttributeError):
+    except (TypeError, ValueError, AttributeError, struct.error):
         return False  # a flipped bit can also change a value's type
 
 
 def read_head(row: tuple[Any, ...]) -> tuple[Head, bytes] | None:
-    """Return what a row of table record holds, and the digest of its payload; None where its checksum fails."""
+    """Return what a row of table record holds, and the digest of its payload.
+
+    None where its checksum fails, or where its values are none that `Store.append` takes: anybody can make a
+    checksum.
+    """
     *fields, stored = row
     if not _verifies("record", fields, stored):
         return None
     sequence, kind, label, key, time, attributes, size, digest = fields
-    head = Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
+    if not (_is_number(sequence) and _is_number(size) and _is_time(time)):
+        return None
+    try:
+        head = Head(sequence, _text(kind), _text(label), check_key(key), time, from_json(attributes.decode()), size)
+    except (AttributeError, ValueError):
+        return None
     return head, digest
 
 
+def _is_number(value: object) -> bool:
+    return type(value) is int and 0 <= value <= LARGEST_NUMBER
+
+
+def _is_time(value: object) -> bool:
+    return type(value) is float and math.isfinite(value)
+
+
+def _text(value: bytes) -> str:
+    return check_text("text", value.decode())
+
+
 def read_meta(rows: Iterable[tuple[Any, ...]]) -> dict[str, str]:
-    """Return what table meta holds, by key, without the rows that fail their checksums."""
-    return {key.decode(): value.decode() for key, value, stored in rows if _verifies("meta", (key, value), stored)}
+    """Return what table meta holds, by key, without the rows that fail their checksums or are no text."""
+    meta = {}
+    for key, value, stored in rows:
+        if isinstance(key, bytes) and isinstance(value, bytes) and _verifies("meta", (key, value), stored):
+            with suppress(UnicodeDecodeError):
+                meta[key.decode()] = value.decode()
+    return meta
 
 
 def lost_heads(meta: dict[str, str]) -> Spans:
     """Return the rows up to the base that an earlier repair had to leave out."""
     try:
-        return [(int(first), int(last)) for first, last in json.loads(meta["repaired"])["heads"]]
-    except (KeyError, TypeError, ValueError):
+        spans = from_json(meta["repaired"])["heads"]
+    except (KeyError, ValueError):
         return []
+    if not isinstance(spans, list) or not all(isinstance(span, list) and len(span) == 2 for span in spans):
+        return []
+    bounds = [bound for span in spans for bound in span]
+    # Ascending, and never the same one: spans that are apart.
+    if not all(map(_is_number, bounds)) or any(end < first for first, end in spans) or bounds != sorted(bounds):
+        return []
+    return [(first, last) for first, last in spans]
 
 
 def uncovered(first: int, last: int, spans: Spans) -> Iterator[tuple[int, int]]:
@@ -267,15 +331,24 @@ class GenerationRow:
 
     @property
     def sound(self) -> bool:
-        """Whether it is as it was written."""
+        """Whether it is as it was written, and has numbers where `of` has them."""
         fields = (self.number, self.upto, self.base, self.time, self.attributes, self.content)
-        return _verifies("generation", fields, self.checksum)
+        numbers = all(map(_is_number, (self.number, self.upto, self.base))) and _is_time(self.time)
+        texts = isinstance(self.attributes, bytes) and isinstance(self.content, bytes)
+        return numbers and texts and _verifies("generation", fields, self.checksum)
 
     def verified(self, journal: Path) -> tuple[dict[str, JSON], dict[str, Any]]:
-        """Return the attributes and the content; raise DamageError if they are not as written."""
+        """Return the attributes and the content; raise DamageError if they are not as written, or never were."""
         if not self.sound:
             raise DamageError(f"the row of generation {self.number} in {journal} fails its checksum", path=journal)
-        return from_json(self.attributes.decode()), dict(from_json(self.content.decode()))
+        try:
+            content: dict[str, Any] = dict(from_json(self.content.decode()))
+            read_content(content)
+            return from_json(self.attributes.decode()), content
+        except ValueError as error:
+            raise DamageError(
+                f"the row of generation {self.number} in {journal} was never written so: {error}", path=journal
+            ) from error
 
     def values(self) -> tuple[int, int, int, float, str, str, bytes]:
         """Return the values of GENERATION_COLUMNS, to be written."""

@@ -9,6 +9,8 @@ import sys
 import textwrap
 from contextlib import closing
 
+from store.content import ArrayContent
+from store.encoding import array_digest
 from store.records import checksum, payload_digest
 
 
@@ -66,3 +68,38 @@ def in_a_process(code, *arguments, memory=2**30, seconds=60):
     """
     command = [sys.executable, "-c", textwrap.dedent(limited) + textwrap.dedent(code), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+
+
+def write_first_format(folder, arrays, *, rows=None, level=3, **known):
+    """Write a group as releases up to 0.4 did, with Blosc; rows: in shards as up to 0.2. Return its content."""
+    import zarr
+    from zarr.codecs import BloscCodec
+    from zarr.storage import LocalStore
+
+    described = {
+        name: {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
+        for name, array in arrays.items()
+    }
+    content = {"format": 1, "arrays": described}
+    known = {"number": 1, "upto": 1, "attributes": {}, "identity": {}} | known | content
+    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
+    attributes = known | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    group = zarr.create_group(store=LocalStore(folder), zarr_format=3, attributes=attributes)
+    for name, array in arrays.items():
+        plain = array.view("<u4").reshape(*array.shape, -1) if array.dtype.kind == "U" else array
+        chunks = {"chunks": ArrayContent(array.dtype, array.shape, "").chunk}
+        if rows is not None and plain.ndim:
+            rest = tuple(max(1, length) for length in plain.shape[1:])
+            chunks = {"chunks": (rows, *rest), "shards": (rows * max(1, -(-len(plain) // rows)), *rest)}
+        target = group.create_array(
+            name,
+            shape=plain.shape,
+            dtype=plain.dtype,
+            **chunks,
+            compressors=BloscCodec(cname="zstd", clevel=level, shuffle="shuffle"),
+            fill_value=0,
+            attributes={"dtype": array.dtype.str},
+            config={"write_empty_chunks": True},
+        )
+        target[...] = plain
+    return content

@@ -14,6 +14,7 @@ from store_builds import folders
 import store.generations
 import store.groups
 from store import DamageError, Store, StoreError, check_store
+from store.chunks import ArrayFiles
 
 ONE = {"x": np.arange(10)}
 
@@ -192,16 +193,16 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
     def starve(*_):
         raise MemoryError
 
-    monkeypatch.setattr(store.groups, "_read_array", starve)
+    monkeypatch.setattr(ArrayFiles, "read", starve)
     with pytest.raises(StoreError) as caught:
         opened.latest()
     assert not isinstance(caught.value, DamageError)
 
 
-@pytest.mark.parametrize("instant", ["GroupReader", "_read_array"])
+@pytest.mark.parametrize("instant", ["GroupReader", "read"])
 def test_a_reader_whose_generation_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
     opened.commit(ONE, upto=0)
-    owner = store.generations if instant == "GroupReader" else store.groups
+    owner = store.generations if instant == "GroupReader" else ArrayFiles
     real = getattr(owner, instant)
     waiting = [2, 3, 4]
 

@@ -142,7 +142,7 @@ SPOIL = {
     ),
     "no group": lambda folder: (folder / "zarr.json").unlink(),
     "the group's format": lambda folder: rewrite(
-        folder / "zarr.json", lambda data: data.replace(b'"format": 1', b'"format": 9')
+        folder / "zarr.json", lambda data: data.replace(b'"format": 2', b'"format": 9')
     ),
     "nothing left": shutil.rmtree,
 }

@@ -227,7 +227,7 @@ def test_a_generation_of_a_newer_format_is_refused_also_for_its_attributes(tmp_p
         opened.commit({"x": np.arange(3)}, upto=0)
         (row,) = opened._journal.generations()
         _, content = row.verified(tmp_path)
-        newer = GenerationRow.of(2, 0, 0, row.time, "{}", content | {"format": 2})
+        newer = GenerationRow.of(2, 0, 0, row.time, "{}", content | {"format": 3})
         opened._journal.make_current(newer, forget=())
-        with pytest.raises(VersionError, match=r"format 2; .* upgrade"):
+        with pytest.raises(VersionError, match=r"format 3; .* upgrade"):
             opened.latest(only=only)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from tempfile import mkdtemp
 
 from store.exceptions import DamageError, NotAStoreError, reported
-from store.files import remove_tree, sync_folder, sync_tree
+from store.files import is_real_folder, read_regular, remove_tree, same_folder, sync_folder, sync_tree
 from store.groups import PARTIAL, folder_name
-from store.schema import GENERATIONS, JOURNAL_FILE, SIDES, connect
+from store.reader import JournalReader
+from store.schema import GENERATIONS, JOURNAL_FILE
 from store.survey import Progress, check_store
 
 __all__ = ["back_up"]
@@ -26,17 +28,21 @@ def back_up(source: Path, destination: Path, named: Callable[[], set[int]], prog
     """
     if os.path.lexists(destination):
         raise NotAStoreError(f"{destination} is there already; nothing was written: give the name of a new folder")
-    if destination.resolve().is_relative_to(source.resolve()):
+    if any(same_folder(source, above) for above in destination.resolve().parents if above.is_dir()):
         raise NotAStoreError(f"{destination} lies inside {source}; nothing was written: give a folder outside of it")
     with reported(destination, "backing up a store"):
         destination.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(mkdtemp(prefix=f"{destination.name}.", suffix=PARTIAL, dir=destination.parent))
         try:
             shutil.copymode(source, draft)
-            with closing(connect(source / JOURNAL_FILE, write=False)) as connection:
-                _copy_generations(source, draft, connection, named)
-                with closing(sqlite3.connect(draft / JOURNAL_FILE)) as copy:
-                    connection.backup(copy)
+            with closing(JournalReader(source / JOURNAL_FILE)) as reader:
+                while True:
+                    _copy_generations(source, draft, reader.connection, named)
+                    with closing(sqlite3.connect(draft / JOURNAL_FILE)) as copy:
+                        reader.connection.backup(copy)
+                    if not reader.renew():
+                        break
+                    remove_tree(draft / GENERATIONS)
             _verify(source, draft, progress)
             sync_tree(draft)
             draft.rename(destination)
@@ -68,18 +74,17 @@ def _copy_generations(source: Path, draft: Path, connection: sqlite3.Connection,
 
 def _copy_tree(source: Path, target: Path) -> None:
     target.mkdir(parents=True)
+    if source.is_symlink():
+        raise DamageError(f"{source} is a symbolic link, where a store has a folder of its own", path=source)
     for entry in source.iterdir():
-        if entry.is_dir():
+        if is_real_folder(entry):
             _copy_tree(entry, target / entry.name)
         else:
-            (target / entry.name).write_bytes(entry.read_bytes())
+            (target / entry.name).write_bytes(read_regular(entry, sys.maxsize))
 
 
 def _verify(source: Path, draft: Path, progress: Progress | None) -> None:
     damaged = [problem for problem in check_store(draft, progress=progress) if problem.kind != "leftover"]
-    # What SQLite made beside the copy in order to read it.
-    for suffix in SIDES:
-        remove_tree(draft / (JOURNAL_FILE + suffix))
     if damaged:
         what = damaged[0].what.replace(str(draft), str(source))
         raise DamageError(

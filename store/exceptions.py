@@ -44,6 +44,7 @@ FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 # SQLite says IOERR, not FULL, when it cannot grow the shared memory beside the journal.
 IOERR_SHMSIZE = 10 | (19 << 8)
 IOERR_SHORT_READ = 10 | (2 << 8)
+DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_INTERRUPT})
 
 # The second where a message quotes damaged text that Python cannot decode.
 SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
@@ -132,7 +133,8 @@ def is_damage(error: sqlite3.Error | UnicodeDecodeError) -> bool:
     if code == sqlite3.SQLITE_ERROR:
         # Our statements are right: so tables or columns are missing, or their description is unreadable.
         return str(error).startswith(("no such", "malformed", "unsupported file format"))
-    return code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or extended == IOERR_SHORT_READ
+    # Interrupted, because it took more steps than the file has room for.
+    return code in DAMAGED or extended == IOERR_SHORT_READ
 
 
 def from_sqlite(error: sqlite3.Error | UnicodeDecodeError, path: Path, doing: str) -> StoreError:

@@ -1,4 +1,4 @@
-"""Files and folders made durable, measured and removed."""
+"""Files and folders made durable, read, measured, compared and removed; links are never followed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from store.exceptions import DamageError
+from store.exceptions import DamageError, NotAStoreError
 
 try:
     import fcntl
@@ -17,7 +17,22 @@ except ImportError:  # Windows has none
 else:
     FULL_SYNC = getattr(fcntl, "F_FULLFSYNC", None)
 
-__all__ = ["file_size", "read_regular", "remove_tree", "sync_file", "sync_folder", "sync_tree", "tree_size"]
+__all__ = [
+    "CAREFULLY",
+    "file_size",
+    "is_real_folder",
+    "read_regular",
+    "remove_tree",
+    "same_folder",
+    "store_folder",
+    "sync_file",
+    "sync_folder",
+    "sync_tree",
+    "tree_size",
+]
+
+# Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
+CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def sync_file(path: Path) -> None:
@@ -55,7 +70,7 @@ def sync_tree(path: Path) -> None:
 def file_size(path: Path) -> int:
     """Return the size in bytes, 0 for a file that is not, or no longer, there."""
     try:
-        return path.stat().st_size
+        return path.lstat().st_size
     except FileNotFoundError:
         return 0
 
@@ -74,6 +89,14 @@ def remove_tree(path: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def is_real_folder(path: Path) -> bool:
+    """Return whether a folder is there, and not a link to one."""
+    try:
+        return stat.S_ISDIR(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
 def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes:
     """Return the bytes of a regular file of at most `limit` bytes.
 
@@ -88,9 +111,30 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
     # Before it is opened: to open a device can already do something.
     if not stat.S_ISREG(path.lstat().st_mode):
         raise DamageError(f"{path} is no regular file", path=path)
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    descriptor = os.open(path, os.O_RDONLY | CAREFULLY)
     with os.fdopen(descriptor, "rb") as file:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
             raise DamageError(f"{path} has {found.st_size} bytes; at most {limit} are read there", path=path)
         return file.read(found.st_size)
+
+
+def store_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a folder; raise NotAStoreError for what no file system could call so."""
+    try:
+        name = os.fspath(path)
+        if isinstance(name, str) and "\0" not in name and os.fsencode(name) is not None:
+            return Path(name).absolute()
+    except TypeError:
+        pass
+    except UnicodeEncodeError as error:
+        raise NotAStoreError(f"{path!r} is no path: it holds half of a surrogate pair") from error
+    raise NotAStoreError(f"expected the path of a folder, without NUL characters; came {path!r}")
+
+
+def same_folder(first: Path, second: Path) -> bool:
+    """Return whether two paths lead to one folder, also by links, by other mounts of it or in other letters."""
+    try:
+        return first.samefile(second)
+    except OSError:
+        return first.resolve() == second.resolve()

@@ -11,7 +11,7 @@ from concurrent.futures import wait as wait_for
 from pathlib import Path
 
 from store.exceptions import DamageError, RecordError, StoreError, reported
-from store.files import remove_tree
+from store.files import is_real_folder, remove_tree
 from store.groups import PARTIAL, Draft, GroupReader, folder_name, require_known, write_group
 from store.journal import Journal
 from store.records import Generation, GenerationRow
@@ -186,7 +186,7 @@ class Generations:
 
 def numbers(parent: Path, *, unfinished: bool = False) -> list[int]:
     """Return the numbers of the generations' folders in `parent`, ascending; finished ones unless told otherwise."""
-    if not parent.is_dir():
+    if not is_real_folder(parent):
         return []
     names = (entry.name for entry in parent.iterdir())
     stems = {name.removesuffix(PARTIAL) if unfinished else name for name in names}
@@ -203,7 +203,7 @@ def remove_others(parent: Path, kept: Collection[int]) -> None:
 
     What does not carry a generation's name is left alone; what cannot be removed stays for the next open.
     """
-    if not parent.is_dir():
+    if not is_real_folder(parent):
         return
     names = {folder_name(number) for number in kept}
     for entry in sorted(parent.iterdir()):

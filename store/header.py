@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import struct
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import file_size, sync_folder
+from store.files import file_size, is_real_folder, sync_folder
+from store.groups import PARTIAL
 from store.lock import HOLDER_FILE, LOCK_FILE, WriterLock
 from store.schema import (
     APPLICATION_ID,
@@ -19,17 +22,18 @@ from store.schema import (
     LOG,
     PAGE_BYTES,
     REPAIRED_FILE,
+    ROLLBACK,
     SIDES,
     create_journal,
     remove_drafts,
 )
 
-__all__ = ["header_fault", "holds_store", "lock_to_write", "new_first_page"]
+__all__ = ["header_fault", "holds_store", "lock_to_write", "new_first_page", "strangers"]
 
 # What a folder may hold in which no store was made yet, and what betrays that one was.
 OURS = frozenset(
     {LOCK_FILE, HOLDER_FILE, HOLDER_FILE + ".new", GENERATIONS}
-    | {DRAFT_FILE + suffix for suffix in ("", "-journal", *SIDES)}
+    | {DRAFT_FILE + suffix for suffix in ("", ROLLBACK, *SIDES)}
 )
 TRACES = (JOURNAL_FILE + LOG, REPAIRED_FILE, DAMAGED_FILE)
 
@@ -61,6 +65,10 @@ def holds_store(folder: Path) -> bool:
         if not folder.is_dir():
             raise NotAStoreError(f"{folder} is a file; a store is a folder")
         journal = folder / JOURNAL_FILE
+        if os.path.lexists(journal):
+            for error in strangers(folder):
+                raise error
+            _refuse_rollback(journal.with_name(JOURNAL_FILE + ROLLBACK))
         # A repair may be moving it away just now.
         with suppress(FileNotFoundError):
             if journal.is_file():
@@ -75,7 +83,49 @@ def holds_store(folder: Path) -> bool:
             if journal.is_file():  # another process has just made the store
                 return holds_store(folder)
             raise
+        for error in strangers(folder):
+            raise error
         return False
+
+
+def strangers(folder: Path) -> Iterator[DamageError]:
+    """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
+
+    A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never
+    end. Raises OSError.
+    """
+    for path, is_ours in _named_as_ours(folder):
+        if not is_ours and os.path.lexists(path):
+            what = "a symbolic link" if path.is_symlink() else "no regular file or folder"
+            yield DamageError(
+                f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. Put "
+                "what belongs there in its place; in a folder that comes from elsewhere trust nothing",
+                path=path,
+            )
+
+
+def _refuse_rollback(rollback: Path) -> None:
+    if file_size(rollback):
+        raise DamageError(
+            f"{rollback} is of another program, which was writing to the journal and did not end: repair the store "
+            "(repair_store)",
+            path=rollback,
+        )
+
+
+def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name == GENERATIONS:
+                yield Path(entry.path), entry.is_dir(follow_symlinks=False)
+            elif entry.name.startswith((JOURNAL_FILE, HOLDER_FILE)) or entry.name == LOCK_FILE:
+                yield Path(entry.path), entry.is_file(follow_symlinks=False)
+    if is_real_folder(folder / GENERATIONS):
+        with os.scandir(folder / GENERATIONS) as entries:
+            for entry in entries:
+                if entry.name.removesuffix(PARTIAL).isdecimal():
+                    is_ours = entry.is_dir(follow_symlinks=False) or entry.is_file(follow_symlinks=False)
+                    yield Path(entry.path), is_ours
 
 
 def _header(journal: Path) -> bytes:

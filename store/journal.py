@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
+from store.reader import JournalReader, Limits
 from store.records import (
     GENERATION_COLUMNS,
     HEAD_COLUMNS,
@@ -26,7 +28,7 @@ from store.records import (
     read_meta,
     uncovered,
 )
-from store.schema import connect, has_our_schema
+from store.schema import connect_to_write
 
 __all__ = ["Journal"]
 
@@ -45,8 +47,13 @@ class Journal:
         self._guard = threading.RLock()
         self._connection: sqlite3.Connection | None = None
         self._batch = False
+        self._reader: JournalReader | None = None
         with reported(path, "opening the journal"):
-            self._connection = connect(path, write=write)
+            if write:
+                self._connection = connect_to_write(path)
+                self._limits = Limits(path, self._connection)
+            else:
+                self._reader = JournalReader(path)
         try:
             self.identity = self._read_identity()
             self._last = self.last() if write else 0
@@ -59,17 +66,20 @@ class Journal:
         with self._guard, reported(self.path, doing):
             if self._connection is None:
                 raise StoreClosedError(f"the store of {self.path} is closed")
+            self._limits.begin()
             yield self._connection
 
+    def _fetch(self, doing: str, query: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """Return the rows of a query, those of a writer's own transaction, too."""
+        with self._guard, reported(self.path, doing):
+            if self._reader is not None:
+                return self._reader.fetch(query, values)
+            if self._connection is None:
+                raise StoreClosedError(f"the store of {self.path} is closed")
+            return self._limits.fetch(query, values)
+
     def _read_identity(self) -> dict[str, JSON]:
-        with self._using("reading what the store is for") as connection:
-            if not has_our_schema(connection):
-                raise DamageError(
-                    f"the tables of {self.path} are not where and what they were made as: repair the store "
-                    "(repair_store)",
-                    path=self.path,
-                )
-            meta = read_meta(connection.execute("SELECT key, value, checksum FROM meta").fetchall())
+        meta = read_meta(self._fetch("reading what the store is for", "SELECT key, value, checksum FROM meta"))
         self._lost = lost_heads(meta)
         try:
             return from_json(meta["identity"])
@@ -88,8 +98,7 @@ class Journal:
             "SELECT max(coalesce((SELECT max(sequence) FROM record), 0),"
             " coalesce((SELECT max(sequence) FROM payload), 0)), (SELECT max(upto) FROM generation)"
         )
-        with self._using("looking for the last row") as connection:
-            last, upto = connection.execute(query).fetchone()
+        ((last, upto),) = self._fetch("looking for the last row", query)
         if upto is None or (isinstance(upto, int) and upto <= last):
             return int(last)
         return max([int(last), *(row.upto for row in self.generations() if row.sound)])
@@ -175,9 +184,10 @@ class Journal:
         together = 1 if arrays else TOGETHER
         query = f"SELECT {HEAD_COLUMNS}{payload} FROM record WHERE {where} ORDER BY sequence LIMIT {together}"
         while after < last:
-            with self._using(f"reading rows behind {after}") as connection:
-                rows = connection.execute(query, (after, last, *chosen.values())).fetchall()
+            rows = self._fetch(f"reading rows behind {after}", query, (after, last, *chosen.values()))
             for *fields, payload in rows if arrays else ((*row, b"") for row in rows):
+                if fields[0] <= after:
+                    raise self._damage(f"row {fields[0]} follows row {after} in", fields[0])
                 if not chosen:
                     self._require_no_gap(after + 1, fields[0] - 1)
                 found = read_head(tuple(fields))
@@ -215,19 +225,17 @@ class Journal:
     def compacted(self) -> int:
         """Return the last row that has given up its arrays for a base, 0 where none has."""
         query = f"SELECT {GENERATION_COLUMNS} FROM generation WHERE base"
-        with self._using("looking for a base") as connection:
-            rows = [GenerationRow(*row) for row in connection.execute(query).fetchall()]
+        rows = [GenerationRow(*row) for row in self._fetch("looking for a base", query)]
         # One that fails its checksum does not count: then the rows themselves say that their arrays are missing.
         return max((row.upto for row in rows if row.sound), default=0)
 
     def _damage(self, what: str, sequence: int) -> DamageError:
         query = "SELECT number, upto FROM generation WHERE upto >= ? ORDER BY number DESC LIMIT 1"
         try:
-            with self._using("looking for a generation") as connection:
-                covering = connection.execute(query, (sequence,)).fetchone()
+            covering = self._fetch("looking for a generation", query, (sequence,))
             still = "no generation contains it"
-            if covering is not None:
-                still = f"generation {covering[0]} (up to row {covering[1]}) still contains it"
+            if covering:
+                still = f"generation {covering[0][0]} (up to row {covering[0][1]}) still contains it"
         except StoreError:
             still = "the table of generations cannot be read either"
         return DamageError(
@@ -239,15 +247,13 @@ class Journal:
     def generations(self) -> list[GenerationRow]:
         """Return the rows of the committed generations, the newest first, not yet verified."""
         query = f"SELECT {GENERATION_COLUMNS} FROM generation ORDER BY upto DESC, number DESC"
-        with self._using("looking for generations") as connection:
-            return [GenerationRow(*row) for row in connection.execute(query).fetchall()]
+        return [GenerationRow(*row) for row in self._fetch("looking for generations", query)]
 
     def newest(self) -> int | None:
         """Return the number of the newest generation, None when there is none."""
         query = "SELECT number FROM generation ORDER BY upto DESC, number DESC LIMIT 1"
-        with self._using("looking for the newest generation") as connection:
-            row = connection.execute(query).fetchone()
-        return None if row is None else int(row[0])
+        rows = self._fetch("looking for the newest generation", query)
+        return int(rows[0][0]) if rows else None
 
     def make_current(self, row: GenerationRow, *, forget: Iterable[int]) -> None:
         """In one transaction make `row` a generation and drop the rows numbered in `forget`.
@@ -283,6 +289,8 @@ class Journal:
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         with self._guard, reported(self.path, "closing the journal"):
-            if self._connection is not None:
-                connection, self._connection = self._connection, None
-                connection.close()
+            reader, self._reader = self._reader, None
+            connection, self._connection = self._connection, None
+            for each in (reader, connection):
+                if each is not None:
+                    each.close()

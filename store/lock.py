@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
@@ -10,15 +11,47 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from store.exceptions import LockedError, StoreError, reported
+from store.exceptions import DamageError, LockedError, StoreError, reported
+from store.files import CAREFULLY, read_regular, remove_tree
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-__all__ = ["HOLDER_FILE", "LOCK_FILE", "WriterLock"]
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    flock = None
+else:
+    flock = fcntl.flock
+
+__all__ = ["HOLDER_FILE", "LOCK_FILE", "WriterLock", "is_held"]
 
 LOCK_FILE = "lock"
 HOLDER_FILE = "holder.json"
+LARGEST_NOTE = 4096  # bytes
+
+WITHOUT_LOCKS = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
+
+# Seconds, because a reader that asks whether a writer is there holds the lock for an instant.
+PATIENCE, PAUSE = 0.1, 0.01
+
+
+def is_held(folder: Path) -> bool:
+    """Return whether a writer holds the lock on the store in `folder`, or may, where that cannot be asked."""
+    if flock is None:
+        return True
+    try:
+        descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | CAREFULLY)
+    except OSError as error:
+        return not isinstance(error, FileNotFoundError)
+    try:
+        flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        # Where there are no locks there is no writer.
+        return isinstance(error, BlockingIOError | PermissionError)
+    finally:
+        os.close(descriptor)
+    return False
 
 
 class WriterLock:
@@ -34,14 +67,20 @@ class WriterLock:
 
         self._folder = folder
         # Not per thread: the thread that closes the store need not be the one that opened it.
-        self._lock: BaseFileLock = FileLock(folder / LOCK_FILE, timeout=0, thread_local=False)
+        # Nor the lock of a file's mere presence, which filelock takes where there is no other: it outlives its holder.
+        self._lock: BaseFileLock = FileLock(folder / LOCK_FILE, thread_local=False, fallback_to_soft=False)
         with reported(folder, "taking the writer's lock"):
             try:
-                self._lock.acquire()
+                self._lock.acquire(timeout=PATIENCE, poll_interval=PAUSE)
             except Timeout:
                 raise LockedError(self._refusal()) from None
-            except NotImplementedError as error:
-                raise StoreError(f"{folder}: its file system has no locks ({error})") from error
+            except (NotImplementedError, OSError) as error:
+                if isinstance(error, OSError) and error.errno not in WITHOUT_LOCKS:
+                    raise
+                raise StoreError(
+                    f"the file system of {folder} has no locks ({error}), without which two writers could spoil a "
+                    'store: keep it on another one and copy it here, or open it with mode="read"'
+                ) from error
         try:
             with reported(folder, "noting who holds the lock"):
                 self._note_holder()
@@ -53,14 +92,18 @@ class WriterLock:
         since = datetime.now(UTC).isoformat(timespec="seconds")
         text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since})
         draft = self._folder / f"{HOLDER_FILE}.new"
-        draft.write_text(text + "\n", encoding="utf-8")
+        remove_tree(draft)  # a writer that died may have left one
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY, 0o666)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text + "\n")
         draft.replace(self._folder / HOLDER_FILE)
 
     def _refusal(self) -> str:
         try:
-            holder = json.loads((self._folder / HOLDER_FILE).read_text(encoding="utf-8"))
-            who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
-        except (OSError, ValueError, TypeError, KeyError):
+            holder = json.loads(read_regular(self._folder / HOLDER_FILE, LARGEST_NOTE))
+            pid, host, since = int(holder["pid"]), str(holder["host"]), str(holder["since"])
+            who = f"process {pid} on {host if host.isprintable() else ascii(host)} since {ascii(since)[1:-1]}"
+        except (OSError, ValueError, TypeError, KeyError, RecursionError, DamageError):
             # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"
         return (

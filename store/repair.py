@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,9 +13,10 @@ from pathlib import Path
 from typing import cast
 
 from store.exceptions import DamageError, reported
-from store.files import sync_folder
+from store.files import store_folder, sync_folder
 from store.generations import highest_number, remove_others
 from store.groups import Draft, GroupReader, folder_name, write_group
+from store.header import strangers
 from store.lock import WriterLock
 from store.records import (
     GENERATION_COLUMNS,
@@ -34,6 +37,7 @@ from store.schema import (
     GENERATIONS,
     JOURNAL_FILE,
     REPAIRED_FILE,
+    ROLLBACK,
     SIDES,
     build_journal,
     new_meta,
@@ -43,6 +47,8 @@ from store.survey import FoundGeneration, Progress, Survey
 
 __all__ = ["Repair", "repair_store"]
 
+# Only such names: with another a forged note could have a file anywhere replaced.
+ASIDE = re.compile(re.escape(DAMAGED_FILE) + r"(-[0-9]{1,9})?", re.ASCII)
 DISTRUST = "its disk cannot be trusted; copy the folder to another one and repair it there"
 
 
@@ -74,10 +80,14 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     `progress` is called with what is being done, how many of it are done, and how many there will be.
 
     Raises NotAStoreError, LockedError while a writer has it, VersionError for a newer format, DamageError
-    where not even its identity is left, StoreFullError, ReadOnlyError and other StoreErrors.
+    where not even its identity is left or a link is where a file should be, StoreFullError,
+    ReadOnlyError and other StoreErrors.
     """
-    folder = Path(path).absolute()
+    folder = store_folder(path)
     require_salvageable(folder)
+    with reported(folder, "looking at the store"):
+        for error in strangers(folder):
+            raise error
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):
@@ -199,7 +209,7 @@ def _write_repaired(survey: Survey) -> dict[str, JSON]:
         )
     folder, plan = survey.folder, _Plan.of(survey)
     noted: dict[str, JSON] = {
-        "aside": _free_name(folder, DAMAGED_FILE, ("", *SIDES)),
+        "aside": _free_name(folder, DAMAGED_FILE, ("", ROLLBACK, *SIDES)),
         "heads": [list(span) for span in plan.heads],
         "kept": plan.kept,
         "lost": [*_lost_rows(survey, plan), *_lost_generations(survey)],
@@ -260,7 +270,7 @@ def _verify(survey: Survey, draft: Path, plan: _Plan, generations: Sequence[Gene
 def _free_name(folder: Path, wanted: str, suffixes: Sequence[str] = ("",)) -> str:
     """Return `wanted`, or the first of wanted-2, wanted-3 … of which nothing is there yet, with any of the suffixes."""
     name, count = wanted, 1
-    while any((folder / (name + suffix)).exists() for suffix in suffixes):
+    while any(os.path.lexists(folder / (name + suffix)) for suffix in suffixes):
         count += 1
         name = f"{wanted}-{count}"
     return name
@@ -282,13 +292,24 @@ def _put_in_place(folder: Path, aside: str) -> None:
     """
     # The journal first: without its log it could be opened, and rows would be missing; the log without it
     # cannot. And each move is durable before the next, or the repaired one could meet a log that is not its own.
-    for suffix in ("", *SIDES):
+    for suffix in ("", ROLLBACK, *SIDES):
         old = folder / (JOURNAL_FILE + suffix)
         if old.exists():
             old.rename(folder / (aside + suffix))
             sync_folder(folder)
     (folder / REPAIRED_FILE).rename(folder / JOURNAL_FILE)
     sync_folder(folder)
+
+
+def _noted(meta: dict[str, str]) -> dict[str, JSON] | None:
+    """Return what a repair noted of itself; None where it did not, or names as aside what a repair would not."""
+    try:
+        noted = from_json(meta["repaired"])
+        aside, kept, lost = noted["aside"], noted["kept"], noted["lost"]
+    except (KeyError, ValueError):
+        return None
+    is_ours = isinstance(aside, str) and ASIDE.fullmatch(aside) is not None
+    return noted if is_ours and isinstance(kept, int) and isinstance(lost, list) else None
 
 
 def _finish_interrupted(folder: Path) -> dict[str, JSON] | None:
@@ -301,13 +322,13 @@ def _finish_interrupted(folder: Path) -> dict[str, JSON] | None:
         return None
     with closing(Salvage(repaired)) as salvage:
         meta, damaged = salvage.meta()
-        if salvage.damage or damaged or "repaired" not in meta:
+        noted = _noted(meta)
+        if salvage.damage or damaged or noted is None:
             raise DamageError(
                 f"{repaired}, left by a repair that did not end, is damaged: remove it, give {DAMAGED_FILE} (the one "
                 f"with the highest number) the name {JOURNAL_FILE} again, and what is beside it likewise, and repair "
                 "the store once more",
                 path=repaired,
             )
-    noted = from_json(meta["repaired"])
     _put_in_place(folder, str(noted["aside"]))
     return noted

@@ -14,8 +14,9 @@ from typing import Any
 from store.exceptions import SQLITE_ERRORS, DamageError, NotAStoreError, VersionError, from_sqlite, is_damage, reported
 from store.files import file_size
 from store.header import header_fault, holds_store, new_first_page
+from store.reader import JournalReader, Limits
 from store.records import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, Spans, read_meta, united
-from store.schema import FORMAT_VERSION, JOURNAL_FILE, LOG, PAGE_BYTES, build_journal, connect, has_our_schema
+from store.schema import FORMAT_VERSION, JOURNAL_FILE, LOG, PAGE_BYTES, ROLLBACK, build_journal, connect, has_our_schema
 from store.writeahead import damaged_frame, describe_frame, mend_log
 
 __all__ = ["Fault", "Row", "Salvage", "require_salvageable"]
@@ -67,11 +68,10 @@ def _has_our_tables(path: Path) -> bool:
         return False
     try:
         # Immutable: of another program's database not even a shared memory may be made.
-        with closing(sqlite3.connect(f"{path.as_uri()}?immutable=1", uri=True)) as connection:
-            connection.text_factory = bytes
-            rows = connection.execute("SELECT key, value, checksum FROM meta").fetchall()
-            return has_our_schema(connection) and read_meta(rows).get("format") == str(FORMAT_VERSION)
-    except SQLITE_ERRORS:
+        with closing(connect(path, "mode=ro&immutable=1")) as connection:
+            rows = Limits(path, connection).fetch("SELECT key, value, checksum FROM meta")
+            return read_meta(rows).get("format") == str(FORMAT_VERSION)
+    except (*SQLITE_ERRORS, DamageError):
         return False
 
 
@@ -88,6 +88,7 @@ class Salvage:
         self.damage: list[str] = []
         self._connection: sqlite3.Connection | None = None
         with ExitStack() as undo, reported(path, "salvaging the journal"):
+            self._reader: JournalReader | None = None
             if not path.is_file():
                 self.damage.append(f"{path} is missing")
             elif file_size(path) < PAGE_BYTES:
@@ -106,8 +107,11 @@ class Salvage:
         frame, fault = damaged_frame(log), header_fault(self.path)
         self.damage += [] if frame is None else [describe_frame(log, frame)]
         self.damage += [] if fault is None else [fault]
+        if file_size(self.path.with_name(self.path.name + ROLLBACK)):
+            self.damage.append(f"another program was writing to {self.path} and did not end")
         if not self.damage:
-            self._connection = undo.enter_context(closing(connect(self.path, write=False)))
+            self._reader = undo.enter_context(closing(JournalReader(self.path, require_schema=False)))
+            self._connection, self._limits = self._reader.connection, self._reader.limits
             try:
                 if has_our_schema(self._connection):
                     self.damage += self._found_by_sqlite()
@@ -117,7 +121,8 @@ class Salvage:
                 self._require_damage(error)
                 self.damage.append(f"SQLite refuses to read {self.path}: {error}")
         copy = _mended(self.path, Path(undo.enter_context(TemporaryDirectory())), log=frame is not None)
-        self._connection = undo.enter_context(closing(connect(copy, write=False)))
+        self._connection = undo.enter_context(closing(connect(copy, "mode=ro", require_schema=False)))
+        self._limits = Limits(self.path, self._connection)
         # So SQLite reads even a file that is shorter than it says; nothing is written.
         self._connection.execute("PRAGMA writable_schema = ON")
 
@@ -137,6 +142,7 @@ class Salvage:
         if self._connection is None:
             yield None
             return
+        self._limits.begin()
         try:
             with closing(self._connection.execute(query, values)) as cursor:
                 yield from cursor
@@ -220,6 +226,11 @@ class Salvage:
             " WHERE record.sequence IS NULL OR payload.sequence <= ? ORDER BY payload.sequence"
         )
         return united((sequence, sequence) for (sequence,) in self._until_damage(query, compacted)[0])
+
+    @property
+    def moved(self) -> bool:
+        """Whether a writer came meanwhile: then what was found may be of no moment, and has to be looked for again."""
+        return self._reader is not None and self._reader.moved()
 
     def close(self) -> None:
         """Close the file."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
-from store.exceptions import StoreError
+from store.exceptions import DamageError, StoreError
 from store.files import remove_tree, sync_file, sync_folder
 from store.records import checksum
 
@@ -23,9 +22,12 @@ __all__ = [
     "LOG",
     "PAGE_BYTES",
     "REPAIRED_FILE",
+    "ROLLBACK",
+    "SHARED",
     "SIDES",
     "build_journal",
     "connect",
+    "connect_to_write",
     "create_journal",
     "has_our_schema",
     "new_meta",
@@ -44,8 +46,10 @@ REPAIRED_FILE = JOURNAL_FILE + ".repaired"
 # What a repair calls the damaged one (and, after it, .damaged-2, .damaged-3 …).
 DAMAGED_FILE = JOURNAL_FILE + ".damaged"
 # What SQLite keeps beside a file: the write-ahead log holds rows, the shared memory nothing of worth.
-LOG = "-wal"
-SIDES = (LOG, "-shm")
+LOG, SHARED = "-wal", "-shm"
+SIDES = (LOG, SHARED)
+# What another program may have left there: played back, it changes rows, and removes a file that it names anywhere.
+ROLLBACK = "-journal"
 
 
 # Seconds for another program, such as a backup, to leave a transaction before it is reported.
@@ -94,19 +98,35 @@ TABLES = (
 # In the order of TABLES each gets the next page of a new file, and again after a VACUUM. A number that
 # changed would make one table pass for another, or for a shorter one.
 ROOTS = (
-    (b"table", b"meta", 2),
-    (b"index", b"sqlite_autoindex_meta_1", 3),
-    (b"table", b"record", 4),
-    (b"table", b"payload", 5),
-    (b"table", b"generation", 6),
+    (b"table", b"meta", b"meta", 2),
+    (b"index", b"sqlite_autoindex_meta_1", b"meta", 3),
+    (b"table", b"record", b"record", 4),
+    (b"table", b"payload", b"payload", 5),
+    (b"table", b"generation", b"generation", 6),
+)
+ANALYZED = (
+    (b"table", b"sqlite_stat1", b"sqlite_stat1", b"CREATE TABLE sqlite_stat1(tbl,idx,stat)"),
+    (b"table", b"sqlite_stat4", b"sqlite_stat4", b"CREATE TABLE sqlite_stat4(tbl,idx,neq,nlt,ndlt,sample)"),
 )
 
+# What a value, a statement (a schema's, too) and the rest may be at most; a payload holds 256 MiB and its descriptions.
+LIMITS = {
+    sqlite3.SQLITE_LIMIT_LENGTH: 2**28 + 2**25,
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 10_000,
+    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
+    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 0,
+    sqlite3.SQLITE_LIMIT_ATTACHED: 1,  # VACUUM wants one
+}
+SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON")
 
-def connect(path: Path, *, write: bool) -> sqlite3.Connection:
-    """Return a connection that begins no transaction by itself, gives text as bytes and serves any thread."""
-    options = "mode=rw" if write else "mode=ro"
-    if not write and _is_still(path):
-        options = "immutable=1"
+
+def connect(path: Path, options: str, *, require_schema: bool = True, named: Path | None = None) -> sqlite3.Connection:
+    """Return a connection that begins no transaction by itself, gives text as bytes and serves any thread.
+
+    options: of SQLite's URI, such as "mode=ro". It trusts nothing that the file says of itself: no function runs that
+    a schema names. Raises DamageError, which names `named` in place of a copy of it, for another schema than ours
+    unless told not to look, and sqlite3.Error.
+    """
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?{options}",
         uri=True,
@@ -117,29 +137,43 @@ def connect(path: Path, *, write: bool) -> sqlite3.Connection:
     try:
         # Bytes, because damaged text need not be UTF-8, and the checksum is over the bytes.
         connection.text_factory = bytes
-        if write:
-            connection.execute("PRAGMA synchronous = FULL")
-            # On a Mac a plain fsync stops at the drive's cache.
-            connection.execute("PRAGMA fullfsync = 1")
-            connection.execute("PRAGMA checkpoint_fullfsync = 1")
-            connection.execute(f"PRAGMA journal_size_limit = {LARGEST_IDLE_LOG}")
-            (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
-            if mode != b"wal":
-                raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")
-            # Where opening to write fails, SQLite opens to read and says nothing until something is written.
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute("DELETE FROM meta WHERE 0")
-            connection.execute("ROLLBACK")
+        for limit, most in LIMITS.items():
+            connection.setlimit(limit, most)
+        for setting in SETTINGS:
+            connection.execute(f"PRAGMA {setting}")
+        # Before anything else is read or written: what is written could set off a trigger.
+        if require_schema and not has_our_schema(connection):
+            raise DamageError(
+                f"the tables of {named or path} are not those that a store has, where and what they were made as: "
+                "if it comes from elsewhere, do not use it; if it is your own, repair it (repair_store)",
+                path=named or path,
+            )
     except BaseException:
         connection.close()
         raise
     return connection
 
 
-def _is_still(path: Path) -> bool:
-    # Without a log, in a folder where SQLite could not make one, it refuses to read unless told
-    # that nothing changes: an archive on a read-only disk.
-    return not os.access(path.parent, os.W_OK) and not path.with_name(path.name + LOG).exists()
+def connect_to_write(path: Path) -> sqlite3.Connection:
+    """Return such a connection whose commits are on the disk when they return; the caller holds the writer's lock."""
+    connection = connect(path, "mode=rw")
+    try:
+        connection.execute("PRAGMA synchronous = FULL")
+        # On a Mac a plain fsync stops at the drive's cache.
+        connection.execute("PRAGMA fullfsync = 1")
+        connection.execute("PRAGMA checkpoint_fullfsync = 1")
+        connection.execute(f"PRAGMA journal_size_limit = {LARGEST_IDLE_LOG}")
+        (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
+        if mode != b"wal":
+            raise StoreError(f"{path}: its file system cannot hold a write-ahead log (mode {mode!r})")
+        # Where opening to write fails, SQLite opens to read and says nothing until something is written.
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("DELETE FROM meta WHERE 0")
+        connection.execute("ROLLBACK")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
 
 def create_journal(folder: Path, identity: str) -> None:
@@ -167,7 +201,7 @@ def build_journal(
 
     fill: called with the connection, to add rows in the transaction that makes the tables.
     """
-    for suffix in ("", "-journal", *SIDES):
+    for suffix in ("", ROLLBACK, *SIDES):
         remove_tree(draft.with_name(draft.name + suffix))
     with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
         connection.execute("PRAGMA synchronous = FULL")
@@ -191,19 +225,23 @@ def build_journal(
 
 def remove_drafts(folder: Path) -> None:
     """Remove what a repair left that did not end; the caller holds the writer's lock, and a journal is in place."""
-    for name in (REPAIRED_FILE, *(DRAFT_FILE + suffix for suffix in ("", "-journal", *SIDES))):
+    for name in (REPAIRED_FILE, *(DRAFT_FILE + suffix for suffix in ("", ROLLBACK, *SIDES))):
         remove_tree(folder / name)
 
 
 def has_our_schema(connection: sqlite3.Connection) -> bool:
-    """Return whether the tables are those of TABLES, to the letter, and in their places in the file.
+    """Return whether the file has the tables of TABLES, to the letter and in their places, and nothing else.
 
-    The connection gives text as bytes. Raises sqlite3.Error where the schema cannot even be read.
+    A view, an index or a trigger would be run, or asked, when a row is written or read. Only the table that ANALYZE
+    makes, of any program, does no harm. The connection gives text as bytes. Raises sqlite3.Error where the schema
+    cannot even be read.
     """
-    found = {tuple(row) for row in connection.execute("SELECT type, name, rootpage, sql FROM sqlite_master")}
+    query = "SELECT type, name, tbl_name, rootpage, sql FROM sqlite_master LIMIT 16"
+    rows = [tuple(row) for row in connection.execute(query)]
+    found = sorted((row for row in rows if (*row[:3], row[4]) not in ANALYZED), key=repr)
     meta, *rest = (table.encode() for table in TABLES)
     for strict in (b"", STRICT.encode()):
         texts = [meta + strict, None, *(table + strict for table in rest)]
-        if {(*root, text) for root, text in zip(ROOTS, texts, strict=True)} <= found:
+        if found == sorted([(*root, text) for root, text in zip(ROOTS, texts, strict=True)], key=repr):
             return True
     return False

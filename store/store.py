@@ -24,7 +24,7 @@ from store.exceptions import (
     StoreError,
     reported,
 )
-from store.files import file_size, tree_size
+from store.files import file_size, store_folder, tree_size
 from store.generations import Generations
 from store.groups import Draft
 from store.header import holds_store, lock_to_write
@@ -60,16 +60,16 @@ class Store:
         """Open the store in folder `path`.
 
         To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it
-        for good; an existing store keeps its own, and the caller compares. To read, it makes nothing and
-        takes no lock, and each call sees what is committed at that moment.
+        for good; an existing store keeps its own, and the caller compares. To read, it makes and changes
+        nothing, and each call sees what is committed at that moment.
 
         Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a
         file, a folder of other things), LockedError for a second writer, VersionError for a newer
-        format, DamageError, ReadOnlyError, StoreFullError, and RecordError for an identity not in JSON.
+        format, DamageError, ReadOnlyError, StoreFullError, and RecordError for another mode or an identity not in JSON.
         """
         if mode not in ("write", "read"):
-            raise ValueError(f"mode must be 'write' or 'read', not {mode!r}")
-        folder = Path(path).absolute()
+            raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
+        folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
         if not holds_store(folder) and (mode == "read" or kept is None):
             hint = "" if mode == "read" else "; give an identity to make one"
@@ -316,7 +316,7 @@ class Store:
         copy does not verify, StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open()
-        back_up(self.path, Path(destination).absolute(), self._generations.named, progress)
+        back_up(self.path, store_folder(destination), self._generations.named, progress)
 
     def size(self) -> dict[str, int]:
         """Return the bytes on the disk: {"journal": …, "generations": …}."""
@@ -363,4 +363,4 @@ class Store:
 
 def _check_after(after: int) -> None:
     if after < 0:
-        raise ValueError(f"after must not be negative, not {after}")
+        raise RecordError(f"after must not be negative, not {after}")

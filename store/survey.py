@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from store.exceptions import DamageError, reported
+from store.files import store_folder
 from store.generations import numbers
 from store.groups import PARTIAL, GroupReader, folder_name, read_own_description
+from store.header import strangers
 from store.records import (
     JSON,
     GenerationRow,
@@ -31,6 +33,7 @@ __all__ = ["FoundGeneration", "Problem", "Progress", "Survey", "check_store"]
 # Called with what is being done, how many of it are done, and how many there are.
 Progress = Callable[[str, int, int], object]
 REPORT_EVERY = 256  # rows
+ATTEMPTS = 4
 
 
 @dataclass(frozen=True)
@@ -50,18 +53,25 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     """Return all that is wrong with the store in folder `path`, the journal first; nothing for a sound one.
 
     It verifies every checksum: SQLite's structure of the journal, each row and its arrays, each array
-    of each generation, and what these say of themselves. It writes nothing and takes no lock, and a
-    writer may be at work (SQLite may make its two files beside the journal, as for any reader).
+    of each generation, and what these say of themselves. It changes nothing, and a writer may be at work.
+    Where something is a link, a pipe or a device it reads nothing and names these.
     `progress` is called with what is being verified, how many of it are done, and how many there are.
 
     Raises NotAStoreError where there is no store, VersionError for a newer format, and another StoreError
     where a file cannot be read for a reason that says nothing against it.
     """
-    folder = Path(path).absolute()
+    folder = store_folder(path)
     require_salvageable(folder)
-    with reported(folder, "checking the store"), closing(Salvage(folder / JOURNAL_FILE)) as salvage:
-        survey = Survey(folder, salvage, progress or (lambda *_: None))
-        return survey.problems() + list(survey.leftovers())
+    with reported(folder, "checking the store"):
+        if found := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
+            return found
+        for _ in range(ATTEMPTS):
+            with closing(Salvage(folder / JOURNAL_FILE)) as salvage:
+                survey = Survey(folder, salvage, progress or (lambda *_: None))
+                found = survey.problems() + list(survey.leftovers())
+                if not salvage.moved:
+                    break
+        return found
 
 
 @dataclass(frozen=True)
@@ -116,6 +126,9 @@ class Survey:
         trusted = whole and not self.damaged_generation_rows and not salvage.damage
         named = {row.number: row for row in rows if row.sound}
         self.lost_heads = lost_heads(self.meta)
+        if _json_or_none(self.meta.get("identity", "{}")) is None:  # forged: its checksum was right
+            del self.meta["identity"]
+            self.damaged_meta += 1
         self.identity = _identity(parent, self.meta, there)
         self.generations: list[FoundGeneration] = []
         chosen = [*named, *(number for number in there if number not in named and not trusted)]
@@ -299,12 +312,17 @@ class Survey:
                 yield Problem(path, what, "leftover")
 
 
+def _json_or_none(text: str) -> dict[str, JSON] | None:
+    try:
+        return from_json(text)
+    except ValueError:
+        return None
+
+
 def _identity(parent: Path, meta: dict[str, str], there: list[int]) -> dict[str, JSON] | None:
     """Return the journal's identity, or that of the newest generation that describes itself."""
-    try:
-        return from_json(meta["identity"])
-    except (KeyError, ValueError):
-        pass
+    if "identity" in meta:
+        return _json_or_none(meta["identity"])
     for number in reversed(there):
         try:
             return dict(read_own_description(parent / folder_name(number))["identity"])

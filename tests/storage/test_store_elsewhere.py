@@ -425,7 +425,7 @@ def test_a_table_that_leads_through_one_page_again_and_again_is_damage_and_ends(
     data, page = pages(path)
     # The root of table record, and eight pages that each lead four hundred times to the next, the last one to a leaf.
     leaf = next(i for i, found in enumerate(page, 1) if found[0] == 0x0D and i > 6)
-    chain = [4] + [i for i in range(7, len(page)) if i != leaf][:8]
+    chain = [4, *[i for i in range(7, len(page)) if i != leaf][:8]]
     for number, below in zip(chain, [*chain[1:], leaf], strict=True):
         cells = [struct.pack(">I", below) + bytes([0x82, i & 0x7F]) for i in range(100)]
         place, places = 4096, []

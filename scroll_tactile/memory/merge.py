@@ -15,6 +15,7 @@ from scroll_tactile.memory.rows import unspanned
 from scroll_tactile.memory.state import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Generation, Head, Record, Store
+from store.files import same_folder
 
 __all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations", "observations_of"]
 
@@ -202,7 +203,7 @@ def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) ->
 
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
-    if ours.path.resolve() == theirs.path.resolve():
+    if same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)
     for part in ("sensor", "embedding", "reading", "grid", "augmentation"):

@@ -13,6 +13,7 @@ they were before SQLite first read, what the query gave counts for nothing, and 
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import time
@@ -87,6 +88,7 @@ class JournalReader:
 
     def __init__(self, path: Path, *, require_schema: bool = True) -> None:
         self.path = path
+        self._files = str(path), f"{path}{LOG}"
         self._require_schema = require_schema
         self._undo = ExitStack()
         self._seen: Stamp | None = None
@@ -135,9 +137,9 @@ class JournalReader:
     def _stamp(self) -> Stamp:
         """Return what tells whether the journal or its log were changed."""
         found: list[tuple[int, int, int] | None] = []
-        for file in (self.path, self.path.with_name(self.path.name + LOG)):
+        for file in self._files:
             try:
-                entry = file.lstat()
+                entry = os.lstat(file)
                 found.append((entry.st_ino, entry.st_size, entry.st_mtime_ns))
             except FileNotFoundError:
                 found.append(None)

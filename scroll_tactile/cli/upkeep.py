@@ -14,7 +14,7 @@ from rich.markup import escape
 from scroll_tactile.cli.everyday import MemoryFolder
 from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say
 from scroll_tactile.errors import ScrollTactileError
-from store import Store, StoreError, check_store, repair_store
+from store import Store, StoreError, repair_store
 
 __all__ = ["memory"]
 
@@ -51,9 +51,14 @@ def reembed(
 
 @memory.command()
 def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """Verify every checksum; change nothing. The exit code is 1 where something is damaged."""
+    """Verify all that is in a memory, in a process that may die of it; change nothing.
+
+    The exit code is 1 where something is damaged.
+    """
+    from scroll_tactile.pipelines.checking import check_memory_apart
+
     with progress_bar() as progress:
-        problems = check_store(folder, progress=progress)
+        problems = check_memory_apart(folder, progress=progress)
     damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
         found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]
@@ -64,7 +69,16 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
             say(f"[{colour}]{problem.kind}:[/] {escape(problem.what)}")
         say("[green]sound:[/] every checksum holds" if not damaged else f"[red]{len(damaged)} damaged[/]")
         if damaged:
-            say(f"copy the folder, then: scroll-tactile memory repair {escape(str(folder))}")
+            say(
+                "it is not to be used as it is. To trust it again, put back a copy from before; or copy the folder, "
+                f"then: scroll-tactile memory repair {escape(str(folder))} (it keeps the rows up to the first that is "
+                "lost, and names the others), and check it again"
+            )
+        else:
+            say(
+                "it can be opened and merged without harm. Nobody signed it: of a memory from elsewhere the rows count "
+                "for as much as you trust who gave it to you"
+            )
     if damaged:
         raise typer.Exit(1)
 

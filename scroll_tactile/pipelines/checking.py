@@ -42,7 +42,8 @@ def check_memory_apart(
     """All that is wrong with the memory in folder `path`, as `store.check_store`; nothing for a sound one.
 
     A check that crashes, takes more than 1 GB over what the folder's size explains, or does not end is a problem of
-    kind "lost". It changes nothing. progress: called with (what is being verified, how many are done, how many there are).
+    kind "lost". It changes nothing.
+    progress: called with (what is being verified, how many are done, how many there are).
 
     Raises NotAStoreError, VersionError and other StoreErrors as `check_store`.
     """

@@ -159,7 +159,7 @@ class TestBackup:
             writer.stdout.close()
             writer.wait()
         assert f"with rows 1 to {last}; every checksum holds" in said
-        assert words(run("memory", "check", tmp_path / "copy")) == "sound: every checksum holds"
+        assert words(run("memory", "check", tmp_path / "copy")).startswith("sound: every checksum holds")
 
     def test_what_is_there_stays(self, path, tmp_path):
         (tmp_path / "copy").mkdir()

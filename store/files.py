@@ -8,7 +8,7 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from store.exceptions import DamageError, NotAStoreError
+from store.exceptions import DamageError, NotAStoreError, StoreFullError
 
 try:
     import fcntl
@@ -23,6 +23,7 @@ __all__ = [
     "is_real_folder",
     "read_regular",
     "remove_tree",
+    "require_room",
     "same_folder",
     "store_folder",
     "sync_file",
@@ -117,6 +118,16 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
         if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
             raise DamageError(f"{path} has {found.st_size} bytes; at most {limit} are read there", path=path)
         return file.read(found.st_size)
+
+
+def require_room(folder: Path, *files: Path) -> None:
+    """Raise StoreFullError where `folder` has no room for copies of the files, which may be full of holes."""
+    size, free = sum(map(file_size, files)), shutil.disk_usage(folder).free
+    if size > free:
+        raise StoreFullError(
+            f"to read {files[0]} as it is takes a copy of {size} bytes, for which {folder} has no room ({free} are "
+            "free): free some, or, where it was only not closed, open the store to write and close it"
+        )
 
 
 def store_folder(path: str | os.PathLike[str]) -> Path:

@@ -21,6 +21,8 @@ __all__ = ["Generations", "highest_number", "numbers", "remove_others"]
 
 logger = logging.getLogger(__name__)
 
+MOST_DIGITS = 18  # of the numbers that SQLite keeps, 2^63 is the end of those with 19
+
 
 class Generations:
     """The generations of the store in `folder` that the journal names. `Store` has methods of the same names."""
@@ -91,6 +93,8 @@ class Generations:
         with self._committing:
             earlier = self._journal.generations()
             number = 1 + max([highest_number(self._parent), *(row.number for row in earlier)])
+            if number >= 10**MOST_DIGITS:
+                raise DamageError(f"{self._folder} has a generation of number {number - 1}", path=self._parent)
             content = write_group(self._parent, number, draft, self._journal.identity)
             row = GenerationRow.of(number, draft.upto, int(base), time.time(), draft.attributes, content)
             kept = {row.number for row in self._kept(earlier, draft, base=base)}
@@ -190,7 +194,12 @@ def numbers(parent: Path, *, unfinished: bool = False) -> list[int]:
         return []
     names = (entry.name for entry in parent.iterdir())
     stems = {name.removesuffix(PARTIAL) if unfinished else name for name in names}
-    return sorted(int(stem) for stem in stems if stem.isascii() and stem.isdigit())
+    return sorted(int(stem) for stem in stems if is_number(stem))
+
+
+def is_number(stem: str) -> bool:
+    """Return whether a folder's name is a generation's number, and one that leaves room for those after it."""
+    return stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS
 
 
 def highest_number(parent: Path) -> int:
@@ -208,6 +217,6 @@ def remove_others(parent: Path, kept: Collection[int]) -> None:
     names = {folder_name(number) for number in kept}
     for entry in sorted(parent.iterdir()):
         stem = entry.name.removesuffix(PARTIAL)
-        if entry.name not in names and stem.isascii() and stem.isdigit():
+        if entry.name not in names and is_number(stem):
             remove_tree(entry)
             logger.debug("removed %s", entry)

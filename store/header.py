@@ -123,7 +123,7 @@ def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
     if is_real_folder(folder / GENERATIONS):
         with os.scandir(folder / GENERATIONS) as entries:
             for entry in entries:
-                if entry.name.removesuffix(PARTIAL).isdecimal():
+                if entry.name.removesuffix(PARTIAL).isdigit():
                     is_ours = entry.is_dir(follow_symlinks=False) or entry.is_file(follow_symlinks=False)
                     yield Path(entry.path), is_ours
 

@@ -38,6 +38,9 @@ logger = logging.getLogger(__name__)
 # for that would keep the write-ahead log from ever being emptied.
 TOGETHER = 4096
 
+# Far beyond what anybody appends, and short of where SQLite's integers end.
+LAST_SEQUENCE = 2**62
+
 
 class Journal:
     """An open journal file, usable from any thread; raises the store's own errors."""
@@ -150,7 +153,8 @@ class Journal:
         with self._using("appending a row") as connection:
             if self._batch and not connection.in_transaction:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
-            sequence = self._last + 1
+            if (sequence := self._last + 1) > LAST_SEQUENCE:
+                raise DamageError(f"{self.path} has a row, or a generation, of number {self._last}", path=self.path)
             digest = payload_digest(payload)
             fields = (sequence, kind.encode(), label.encode(), key, time, attributes.encode(), len(payload), digest)
             values = (sequence, kind, label, key, time, attributes, len(payload), digest, checksum("record", *fields))

@@ -23,8 +23,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from store.exceptions import SQLITE_ERRORS, DamageError, LockedError, StoreFullError
-from store.files import file_size
+from store.exceptions import SQLITE_ERRORS, DamageError, LockedError
+from store.files import file_size, require_room
 from store.lock import is_held
 from store.schema import LOG, SHARED, connect
 
@@ -122,14 +122,8 @@ class JournalReader:
         self.limits = Limits(self.path, connection)
 
     def _copied(self, scratch: Path) -> Path:
-        free = shutil.disk_usage(scratch).free
         log = self.path.with_name(self.path.name + LOG)
-        # Files may have holes, and say that they are larger than any disk.
-        if (size := file_size(self.path) + file_size(log)) > free:
-            raise StoreFullError(
-                f"{self.path} was not closed, and to read it as it is takes a copy of {size} bytes, for which "
-                f"{scratch} has no room ({free} are free): free some, or open the store to write and close it"
-            )
+        require_room(scratch, self.path, log)
         for file in (self.path, log):
             shutil.copyfile(file, scratch / file.name)
         return scratch / self.path.name

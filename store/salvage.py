@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from store.exceptions import SQLITE_ERRORS, DamageError, NotAStoreError, VersionError, from_sqlite, is_damage, reported
-from store.files import file_size
+from store.files import file_size, require_room
 from store.header import header_fault, holds_store, new_first_page
 from store.reader import JournalReader, Limits
 from store.records import GENERATION_COLUMNS, HEAD_COLUMNS, GenerationRow, Spans, read_meta, united
@@ -241,6 +241,7 @@ class Salvage:
 def _mended(path: Path, scratch: Path, *, log: bool) -> Path:
     """Copy the journal, with a new first page, and its log; of a damaged log one that SQLite reads to its end."""
     copy, beside = scratch / JOURNAL_FILE, path.with_name(path.name + LOG)
+    require_room(scratch, path, beside)
     shutil.copyfile(path, copy)
     if log:
         mend_log(beside, scratch / beside.name)

@@ -25,6 +25,7 @@ from store import (
     RecordError,
     Store,
     StoreError,
+    StoreFullError,
     check_store,
     repair_store,
 )
@@ -523,3 +524,24 @@ def test_nobody_backs_a_store_up_into_itself(tmp_path):
         for target in (tmp_path / "s" / "copy", tmp_path / "link" / "deep" / "copy"):
             with pytest.raises(NotAStoreError, match="lies inside"):
                 reader.backup(target)
+
+
+def test_numbers_at_the_end_of_all_numbers_are_damage_and_not_counted_on(tmp_path):
+    path = build(tmp_path / "s")
+    (path / "generations" / ("9" * 40)).mkdir()
+    with Store.open(path) as writer:
+        commit(writer.commit, LAST)
+    put_row(path, sequence=2**63 - 1)
+    with Store.open(path) as writer, pytest.raises(DamageError, match="number 9223372036854775807"):
+        add(writer, LAST + 1)
+    assert (path / "generations" / ("9" * 40)).is_dir()
+
+
+@pytest.mark.skipif(not hasattr(os, "truncate"), reason="makes a file with holes")
+def test_a_file_of_holes_fills_no_disk(tmp_path):
+    with Store.open(tmp_path / "s", identity={}) as writer:
+        add(writer, 1)
+        crashed = as_after_a_crash(writer, tmp_path / "c")
+    os.truncate(crashed / JOURNAL, 2**43)
+    with pytest.raises(StoreFullError, match="copy of"):
+        read_all(crashed)

@@ -56,7 +56,7 @@ class Store:
         *,
         identity: Mapping[str, JSON] | None = None,
         mode: Literal["write", "read"] = "write",
-    ) -> Store:
+    ) -> Self:
         """Open the store in folder `path`.
 
         To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it

@@ -23,6 +23,7 @@ __all__ = [
     "FRAMES",
     "MOST_WINDOWS",
     "SHAPE",
+    "VIEWS",
     "WHOLE",
     "Extent",
     "Scale",
@@ -132,21 +133,20 @@ def fitting(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> l
 
 def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
     room = max(0, columns - width)
-    if dense:
-        begin = [0]
-        while begin[-1] < min(room, 4 * width):
-            begin.append(begin[-1] + max(1, width // 6, begin[-1] // 3))
-        begin += range(begin[-1] + width, room + 1, width)
-    else:
-        begin = list(range(0, room + 1, max(1, width // 6, min(width // 2, room // 2))))
-    return _thinned([start for start in begin if start <= room])
+    if not dense:
+        return _thinned(range(0, room + 1, max(1, width // 6, min(width // 2, room // 2))))
+    begin = [0]
+    while begin[-1] < min(room, 4 * width):
+        begin.append(begin[-1] + max(1, width // 6, begin[-1] // 3))
+    rest = range(begin[-1] + width, room + 1, width)
+    return _thinned(rest, [start for start in begin if start <= room])
 
 
-def _thinned(begin: Sequence[int]) -> list[int]:
-    """At most MOST_WINDOWS of them, evenly."""
-    if len(begin) <= MOST_WINDOWS:
-        return list(begin)
-    return [begin[place] for place in np.linspace(0, len(begin) - 1, MOST_WINDOWS).round().astype(int)]
+def _thinned(rest: range, begin: Sequence[int] = ()) -> list[int]:
+    """At most MOST_WINDOWS of them, evenly, of `begin` and then the rest: of hours it is long."""
+    count = len(begin) + len(rest)
+    places = np.linspace(0, count - 1, MOST_WINDOWS).round().astype(int) if count > MOST_WINDOWS else range(count)
+    return [begin[place] if place < len(begin) else rest[place - len(begin)] for place in map(int, places)]
 
 
 def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:

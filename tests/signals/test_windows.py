@@ -129,3 +129,10 @@ def test_the_windows_of_a_camera_are_its_frames(frames):
     assert starts[-1] == 32 * (frames - 1)
     assert all(start % 32 == 0 for start in starts)
     assert reading.scored(32 * frames, 32 * frames) == {Scale("window", 32): list(range(len(starts)))}
+
+
+def test_a_touch_of_months_has_as_many_windows_as_one_of_hours():
+    for columns in (10**6, 2**28):
+        read = extent(columns, (30, 300))
+        assert [len(starts) for starts in read.values()] == [MOST_WINDOWS, MOST_WINDOWS]
+        assert all(starts == sorted(set(starts)) for starts in read.values())

@@ -235,13 +235,14 @@ def _numpy_scalars_allowed() -> AbstractContextManager[None]:
 
 def _cleaned(tensors: Mapping[str, Any], where: str) -> Tensors:
     """The network's tensors, by torchvision's names."""
-    for container in CONTAINERS:
-        if isinstance(inside := tensors.get(container), Mapping):
-            return _cleaned(inside, where)
+    for _ in CONTAINERS:  # each within another, at most; one may hold itself
+        tensors = next((held for name in CONTAINERS if isinstance(held := tensors.get(name), Mapping)), tensors)
     named = {PREFIXES.sub("", str(name)): tensor for name, tensor in tensors.items()}
     kept = {name: tensor for name, tensor in named.items() if not HEADS.search(name)}
     if strange := sorted(name for name, tensor in kept.items() if not isinstance(tensor, torch.Tensor)):
         raise WeightsError(f"expected tensors by name in {where}; {_listed(strange)} are none")
+    if sparse := sorted(name for name, tensor in kept.items() if tensor.layout != torch.strided or tensor.is_meta):
+        raise WeightsError(f"expected dense tensors in {where}; {_listed(sparse)} are of another layout")
     return kept
 
 

@@ -264,3 +264,18 @@ def test_a_file_with_any_byte_changed_is_refused_or_read_but_never_fails_otherwi
             path.write_bytes(bytes(damaged))
             with contextlib.suppress(WeightsError):
                 weights.read_tensors(path)
+
+
+def test_a_file_that_holds_itself_is_refused(tmp_path):
+    held = {}
+    held["model"] = held
+    torch.save(held, tmp_path / "w.pth")
+    with pytest.raises(WeightsError, match="model are none"):
+        load_network(tmp_path / "w.pth")
+
+
+@pytest.mark.parametrize("make", [lambda tensor: tensor.to_sparse(), lambda tensor: tensor.to("meta")])
+def test_tensors_without_values_in_their_places_are_refused(state, tmp_path, make):
+    torch.save(state | {"conv1.weight": make(state["conv1.weight"])}, tmp_path / "w.pth")
+    with pytest.raises(WeightsError, match=r"conv1\.weight"):
+        load_network(tmp_path / "w.pth")

@@ -20,7 +20,8 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, windo
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.identity import Identity, open_store, usual_embedding, usual_exemplars, usual_recall
+from scroll_tactile.memory.gate import open_store
+from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars, usual_recall
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
@@ -150,6 +151,7 @@ class TactileLearner:
             else:
                 found = embedding
                 identity.require_embedding(store.path, found)
+            store.read_with(window_plan(identity.sensor, found))
             exemplars = identity.exemplar_count(store, chosen.exemplars)
             learner = cls.__new__(cls)
             keeping = identity.keeping(store.path, found, chosen.recall)

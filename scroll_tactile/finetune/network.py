@@ -17,6 +17,7 @@ from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
@@ -68,8 +69,15 @@ class Backbone(nn.Module):
         }
 
     def put(self, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
-        """Replace tensors by those that `tensors` returned."""
+        """Replace tensors by those that `tensors` returned. Raises MismatchError for others."""
         parameters = dict(self.named_parameters())
+        strange = [
+            name
+            for name, tensor in tensors.items()
+            if name not in parameters or tuple(parameters[name].shape) != tensor.shape
+        ]
+        if strange:
+            raise MismatchError(f"f* trained {strange[:5]}, which this network does not have so: fine-tune again")
         with torch.no_grad():
             for name, tensor in tensors.items():
                 parameters[name].copy_(torch.from_numpy(tensor))
@@ -196,12 +204,21 @@ class TouchFeatures:
 
 
 class TunedReader:
-    """Logits of f*: the network with what was trained put into it, and the head."""
+    """Logits of f*: the network with what was trained put into it, and the head.
+
+    Raises MismatchError for an f* that is none of this embedding's.
+    """
 
     def __init__(self, embedding: Embedding, plan: WindowPlan, tuned: Tuned) -> None:
         self.tuned = tuned
         self._touches = TouchFeatures(embedding, plan)
         self._net: Backbone | None = None
+        judging = {int(scale) for scale in plan.judging(plan.milestones()[-1])}
+        if set(tuned.heads) != judging or (tuned.mode != "head" and not self._touches.tunable):
+            raise MismatchError(
+                f"f*, with heads of windows {sorted(tuned.heads)} and {tuned.mode!r} trained, is of another embedding "
+                f"than {embedding.name!r}: fine-tune again"
+            )
         if tuned.mode != "head":
             self._net = self._touches.network()
             if tuned.mode == "adapters":

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.rows import only_readings
-from scroll_tactile.memory.state import OBSERVE, Memory
+from scroll_tactile.memory.rows import OBSERVE, only_readings
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
 from store import Record, Store
@@ -60,4 +60,5 @@ def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]
         columns, codes = memory.codes(row)
         readings, stages = only_readings(row.arrays), memory.plan.scored_stages(columns)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
-    return [] if row is None else exemplars_from_arrays(row.arrays, cast(Any, row.attributes["exemplars"]))
+    about = None if row is None else cast(Any, row.attributes.get("exemplars"))
+    return [] if row is None or about is None else exemplars_from_arrays(row.arrays, about)

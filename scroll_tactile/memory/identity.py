@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import os
+import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Capabilities, Embedding, embed_windows, require_rest, window_plan
-from scroll_tactile.embeddings.registry import configuration_of, from_configuration, guess
-from scroll_tactile.errors import EmbeddingMismatchError, MismatchError, SensorMismatchError
+from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, from_configuration, guess
+from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
 from scroll_tactile.memory.earlier import gone_copies, gone_embedding, is_gone, split_copies
 from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.statistics.grid import BITS
-from store import DamageError, NotAStoreError, Store
+from store import DamageError, Store
 
 __all__ = [
     "AbsentEmbedding",
     "EmbeddingIdentity",
     "Grid",
     "Identity",
-    "open_store",
     "usual_embedding",
     "usual_exemplars",
     "usual_recall",
@@ -36,6 +35,13 @@ __all__ = [
 
 USUAL_EXEMPLARS = 400  # streams
 LIKELY_EXACT = "kernels"  # in memories made before configurations were kept
+MOST_FEATURES = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
+MOST_STREAMS = 2**31
+MOST_VALUES = 2**31  # of a sensor at once, or in one channel of a touch
+
+_Text = Annotated[str, Field(min_length=1, max_length=1000)]
+_Streams = Annotated[int, Field(ge=0, le=MOST_STREAMS)]
+_Width = Annotated[int, Field(ge=1, le=MOST_VALUES)]
 
 
 class _Kept(BaseModel):
@@ -47,22 +53,29 @@ class _Kept(BaseModel):
 class EmbeddingIdentity(_Kept):
     """What a memory knows of its embedding; configuration: what makes it again, None for a user's own embedding."""
 
-    name: str
-    dimension: int
-    bound: float
-    fingerprint: str
+    name: _Text
+    dimension: Annotated[int, Field(ge=1, le=MOST_FEATURES)]
+    bound: Annotated[FiniteFloat, Field(gt=0)]
+    fingerprint: _Text
     configuration: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _of_its_configuration(self) -> Self:
+        made = self.configuration or {}
+        if _depth(made) > MOST_DEPTH:
+            raise ValueError(f"expected a configuration of at most {MOST_DEPTH} levels")
+        if made.get("kind") == "kernels" and made.get("dimension") != self.dimension:
+            raise ValueError(f"kernels of dimension {made.get('dimension')!r:.40} have not {self.dimension} features")
+        return self
 
     @classmethod
     def of(cls, embedding: Embedding) -> Self:
-        """The identity of an embedding."""
-        return cls(
-            name=embedding.name,
-            dimension=embedding.dimension,
-            bound=embedding.bound,
-            fingerprint=embedding.fingerprint,
-            configuration=configuration_of(embedding),
-        )
+        """The identity of an embedding. Raises EmbeddingError where its fields are none."""
+        fields = {name: getattr(embedding, name) for name in ("name", "dimension", "bound", "fingerprint")}
+        try:
+            return cls(**fields, configuration=configuration_of(embedding))
+        except ValidationError as error:
+            raise EmbeddingError(f"the embedding {type(embedding).__name__} is none: {_first(error)}") from None
 
     @property
     def bare(self) -> bool:
@@ -81,8 +94,8 @@ class EmbeddingIdentity(_Kept):
 class Grid(_Kept):
     """The grid of codes, and the widths of windows; frames: whether they are a camera's frames."""
 
-    bits: int
-    scales: tuple[int, ...]
+    bits: Annotated[int, Field(ge=1, le=BITS)]
+    scales: Annotated[tuple[_Width, ...], Field(min_length=1, max_length=64)]
     frames: bool = False
 
 
@@ -100,20 +113,17 @@ class Identity(_Kept):
     embedding: EmbeddingIdentity
     grid: Grid
     reading: tuple[bool, Literal["all", "widest"]] | None = None
-    exemplars: tuple[int | None, int | None] | None = None
+    exemplars: tuple[_Streams | None, _Streams | None] | None = None
     augmentation: Augmented | None = None
     views: bool = False
-    recall: int | None = None
+    recall: _Streams | None = None
     gone_copies: dict[str, Any] = Field(default_factory=dict, exclude=True)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_what_is_gone(cls, fields: Any) -> Any:
-        kept = fields.get("augmentation") if isinstance(fields, Mapping) else None
-        if not isinstance(kept, Mapping):
-            return fields
-        augmentation, gone = split_copies(kept)
-        return {**fields, "augmentation": augmentation, "gone_copies": gone}
+    @model_validator(mode="after")
+    def _of_a_sensor_that_can_be(self) -> Self:
+        if max(self.sensor.channels, self.sensor.readings) > MOST_VALUES:
+            raise ValueError(f"expected a sensor of at most {MOST_VALUES} channels, and readings in a touch")
+        return self
 
     @classmethod
     def of(
@@ -127,20 +137,23 @@ class Identity(_Kept):
         """The identity of a new memory.
 
         exemplars: streams in its buffer, recall: kept touches; None: the usual numbers, none for a camera. Raises
-        InputError for an embedding that cannot read the sensor.
+        InputError for an embedding that cannot read the sensor, or numbers beyond all bounds, EmbeddingError.
         """
         require_rest(embedding, sensor)
-        plan = window_plan(sensor, embedding)
-        return cls(
-            sensor=sensor,
-            embedding=EmbeddingIdentity.of(embedding),
-            grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
-            reading=(plan.partial, plan.judged),
-            exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
-            augmentation=augmentation,
-            views=bool(plan.whole),
-            recall=(usual_recall(sensor, embedding) if recall is None else recall) or None,
-        )
+        plan, made = window_plan(sensor, embedding), EmbeddingIdentity.of(embedding)
+        try:
+            return cls(
+                sensor=sensor,
+                embedding=made,
+                grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
+                reading=(plan.partial, plan.judged),
+                exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
+                augmentation=augmentation,
+                views=bool(plan.whole),
+                recall=(usual_recall(sensor, embedding) if recall is None else recall) or None,
+            )
+        except ValidationError as error:
+            raise InputError(f"no memory can be made with {_first(error)}") from None
 
     @classmethod
     def read(cls, store: Store) -> Self:
@@ -151,13 +164,18 @@ class Identity(_Kept):
         if "sensor" not in store.identity:
             raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
         try:
-            return cls.model_validate(store.identity)
-        except (ValidationError, ValueError) as error:
-            first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
-            where = ".".join(map(str, first["loc"]))
-            raise DamageError(
-                f"the identity of {store.path} cannot be read: {where}: {first['msg']}", path=store.path
-            ) from error
+            return cls.from_json(store.identity)
+        except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
+            what = _first(error) if isinstance(error, ValidationError) else f"{type(error).__name__}: {error!s:.200}"
+            raise DamageError(f"the identity of {store.path} cannot be read: {what}", path=store.path) from error
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> Self:
+        """The identity of fields that `to_json` gave, now or in an earlier version: of JSON's types, none converted."""
+        kept = fields.get("augmentation")
+        kept, gone = split_copies(kept) if isinstance(kept, Mapping) else (kept, {})
+        text = json.dumps({**fields, "augmentation": kept, "gone_copies": gone})
+        return cls.model_validate_json(text, strict=True)
 
     def to_json(self) -> dict[str, Any]:
         """Its fields in JSON's types, as a store keeps them; absent ones are left out, as earlier versions did."""
@@ -334,8 +352,26 @@ class AbsentEmbedding:
 
 def _is_exact(configuration: Mapping[str, Any]) -> bool:
     """Whether the embedding of a configuration declares `Capabilities.exact`; it is not made for that."""
+    if not isinstance(configuration, Mapping):
+        return False
     inside = configuration.get("parts")
     return all(map(_is_exact, inside)) if isinstance(inside, list) else configuration.get("kind") == "kernels"
+
+
+def _depth(value: Any) -> int:
+    """How many mappings and lists lie within each other, counted without recursion, and no further than is of use."""
+    depth, inside = 0, [value]
+    while inside and depth <= MOST_DEPTH:
+        parts = [part.values() if isinstance(part, Mapping) else part for part in inside]
+        inside = [each for part in parts for each in part if isinstance(each, Mapping | list)]
+        depth += 1
+    return depth
+
+
+def _first(error: ValidationError) -> str:
+    """The first thing that is wrong: the field, what was expected, and what came."""
+    first = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}; came {first['input']!r:.80}"
 
 
 def usual_embedding(sensor: Sensor) -> Embedding:
@@ -353,24 +389,3 @@ def usual_recall(sensor: Sensor, embedding: Embedding) -> int:
 def usual_exemplars(sensor: Sensor) -> int:
     """The default number of streams in the buffer: none for a camera, whose streams are large."""
     return 0 if sensor.camera else USUAL_EXEMPLARS
-
-
-def open_store(
-    path: str | os.PathLike[str],
-    sensor: Sensor | None,
-    embedding: Embedding | None,
-    augmentation: Augmented | None,
-    exemplars: int | None,
-    recall: int | None,
-    mode: Literal["write", "read"],
-) -> Store:
-    """The store in a folder; a new one where there is none and a sensor is given."""
-    try:
-        return Store.open(path, mode=mode)
-    except NotAStoreError:
-        if sensor is None or mode == "read":
-            raise
-    require_augmentable(sensor, augmentation)
-    chosen = usual_embedding(sensor) if embedding is None else embedding
-    identity = Identity.of(sensor, chosen, exemplars, augmentation, recall)
-    return Store.open(path, identity=identity.to_json(), mode=mode)

@@ -15,9 +15,20 @@ from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
-from scroll_tactile.memory.rows import Added, Codes, pack_codes, pack_readings, spans, unspanned
-from scroll_tactile.memory.state import DESCRIBE, OBSERVE, RETRACT, Memory, give_back_scratch
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    OBSERVE,
+    RETRACT,
+    Added,
+    Codes,
+    pack_codes,
+    pack_readings,
+    spans,
+    unspanned,
+)
+from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
@@ -246,7 +257,8 @@ class Ledger:
             store, memory = self.require_store("merge"), self.memory
             if self._batching:
                 raise InputError("a merge is a batch of its own: end the batch before it")
-            with Store.open(path, mode="read") as source:
+            with MemoryStore.open(path, mode="read") as source:
+                source.read_with(memory.plan, thorough=True)
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))

@@ -10,9 +10,10 @@ from pydantic import BaseModel
 
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.gate import require_counted
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
-from scroll_tactile.memory.rows import unspanned
-from scroll_tactile.memory.state import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, Memory, apply_description
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Generation, Head, Record, Store
 from store.files import same_folder
@@ -100,11 +101,12 @@ Choice = Literal["same", "ours", "theirs"]
 class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: heads of its journal. shared: streams that both observed. descriptions: by material, those that we have not.
-    Made by `Incoming.of`.
+    rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed.
+    descriptions: by material, those that we have not. Made by `Incoming.of`.
     """
 
     source: Store
+    base: Generation | None
     rows: list[Head]
     shared: int
     descriptions: dict[str, Description]
@@ -115,11 +117,14 @@ class Incoming:
 
         once: leave out streams that both observed, of one material with one content hash. Raises MismatchError where
         theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
-        shared stream cannot be left out.
+        shared stream cannot be left out, DamageError.
         """
         _require_mergeable(ours, memory, theirs)
-        base, incoming = theirs.compacted, _standing(theirs)
-        known = {(head.label, head.key) for head in _standing(ours) if head.kind != MERGE}
+        base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
+        if found is not None:
+            require_counted(theirs.path, found, heads)
+        incoming = _standing(heads)
+        known = {(head.label, head.key) for head in _standing(ours.heads()) if head.kind != MERGE}
         both = [head for head in incoming if head.kind != MERGE and (head.label, head.key) in known]
         fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
@@ -135,14 +140,15 @@ class Incoming:
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
-        return cls(theirs, rows, len(both), _descriptions(ours, memory, theirs, descriptions))
+        return cls(theirs, found, rows, len(both), _descriptions(ours, memory, theirs, found, descriptions))
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
 
-        The caller opens a batch around it. each: called with (rows done, rows in all).
+        The caller opens a batch around it, and where a row does not pass the gate none of them is kept. each: called
+        with (rows done, rows in all).
         """
-        base = self.source.base()
+        base = self.base
         # A base comes in as one row, and the merges before it are a part of it.
         part = 0 if base is None else sum(head.kind == MERGE and head.sequence <= base.upto for head in self.rows) - 1
         total = len(self.rows) - part
@@ -152,7 +158,7 @@ class Incoming:
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(base), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != MEMBER:
-                memory.replay(ours.record(head.sequence), ours)
+                memory.replay(Record(**vars(head), arrays=arrays), ours)
             memory.sequence = head.sequence
             each(done, total)
         return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
@@ -177,16 +183,17 @@ def _retracted_in(heads: Iterable[Head]) -> set[int]:
     return {row for head in heads if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
-def _standing(store: Store) -> list[Head]:
+def _standing(rows: Iterable[Head]) -> list[Head]:
     """The rows that something was learned from, compacted ones too, without the retracted ones."""
-    heads = list(store.heads())
+    heads = list(rows)
     retracted = _retracted_in(heads)
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
 
 
-def _descriptions(ours: Store, memory: Memory, theirs: Store, choice: Choice) -> dict[str, Description]:
+def _descriptions(
+    ours: Store, memory: Memory, theirs: Store, base: Generation | None, choice: Choice
+) -> dict[str, Description]:
     """Those of their descriptions that come in."""
-    base = theirs.base()
     theirs_now = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
     for head in theirs.heads(0 if base is None else base.upto):
         apply_description(theirs_now, head)

@@ -17,9 +17,19 @@ from itertools import islice
 from pathlib import Path
 
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import Codes, Readings, pack_codes, pack_readings, unpack_readings
-from scroll_tactile.memory.state import DESCRIBE, OBSERVE, RETRACT, Memory
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    OBSERVE,
+    RETRACT,
+    Codes,
+    Readings,
+    pack_codes,
+    pack_readings,
+    unpack_readings,
+)
+from scroll_tactile.memory.state import Memory
 from store import Record, Store, StoreError
 from store.exceptions import reported
 from store.files import sync_folder
@@ -55,11 +65,11 @@ class Reembedding:
         if (whole := _named(source.path, "reembedded")).exists():  # as far as it goes: rows may have come since
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
-        self._draft = Store.open(folder, identity=identity.to_json())
+        self._draft = MemoryStore.open(folder, identity=identity.to_json())
         if Identity.read(self._draft) != identity:  # begun for another embedding
             self._draft.close()
             shutil.rmtree(folder)
-            self._draft = Store.open(folder, identity=identity.to_json())
+            self._draft = MemoryStore.open(folder, identity=identity.to_json())
         self._memory = load(self._draft)
 
     def copy(self, progress: Callable[[str, int, int], object]) -> None:

@@ -13,6 +13,12 @@ from scroll_tactile.signals.windows import EARLIER, Scale, WindowPlan
 from scroll_tactile.statistics.sample import stage_rows
 
 __all__ = [
+    "DESCRIBE",
+    "KINDS",
+    "MEMBER",
+    "MERGE",
+    "OBSERVE",
+    "RETRACT",
     "Added",
     "Arrays",
     "Codes",
@@ -28,6 +34,13 @@ __all__ = [
     "unpack_windows",
     "unspanned",
 ]
+
+OBSERVE = "observe"  # a stream was observed; see below
+RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
+MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
+MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
+DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
+KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]

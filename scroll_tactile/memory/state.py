@@ -10,12 +10,18 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import MismatchError
+from scroll_tactile.errors import MismatchError, UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    KINDS,
+    MEMBER,
+    MERGE,
+    OBSERVE,
+    RETRACT,
     Added,
     Arrays,
     Codes,
@@ -33,26 +39,10 @@ from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import CompactedError, DamageError, Generation, Head, Record, Store
 
-__all__ = [
-    "DESCRIBE",
-    "MEMBER",
-    "MERGE",
-    "OBSERVE",
-    "RETRACT",
-    "Memory",
-    "apply_description",
-    "give_back_scratch",
-]
+__all__ = ["Memory", "apply_description", "give_back_scratch"]
 
 logger = logging.getLogger(__name__)
 
-# The kinds of journal rows.
-OBSERVE = "observe"  # a stream was observed; see `rows`
-RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
-MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
-MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
-DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
-KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
 ATTEMPTS = 20  # of a reader, while a writer changes the store
 
 
@@ -148,9 +138,8 @@ class Memory:
             changed = [(record.label, codes, 1)]
         elif record.kind == RETRACT:
             gone = unspanned(record.attributes["sequences"])
-            records = [store.record(sequence) for sequence in gone if sequence > self.base]
-            changed = [self.retract(observed) for observed in records]
-            for sequence in sorted({*gone} - {observed.sequence for observed in records} - self.excluded):
+            changed = [self._retracted_by(record, sequence, store) for sequence in gone if sequence > self.base]
+            for sequence in sorted({sequence for sequence in gone if sequence <= self.base} - self.excluded):
                 logger.warning(  # a repair made the base: `compact` would have left it out
                     "%s: observation %d was retracted by row %d, but still counts: its features were lost to "
                     "damage. Only a copy from before the damage can leave it out",
@@ -169,6 +158,21 @@ class Memory:
         apply_description(self.descriptions, record)
         self.sequence = record.sequence
         return changed
+
+    def _retracted_by(self, record: Record, sequence: int, store: Store) -> Added:
+        """Retract an observation as a journal row says. Raises DamageError where there is none that could be."""
+        observed = store.record(sequence)
+        try:
+            if observed.kind == OBSERVE and sequence not in self.retracted:
+                return self.retract(observed)
+        except UnknownMaterialError as error:  # the sums are without it
+            logger.debug("%s", error)
+        raise DamageError(
+            f"row {record.sequence} of {store.path} retracts row {sequence}, which is no observation, or not in the "
+            "sums any more: it is damaged, or was made by another program (scroll-tactile memory check)",
+            path=store.path,
+            sequence=record.sequence,
+        )
 
     def describe(self, material: str, constituents: Any) -> None:
         """Keep what a material is made of, in place of its description before; None removes the description."""

@@ -34,7 +34,8 @@ def export_plain(
     """Write a memory into a new or empty folder; a file that is there is whole.
 
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
-      (learned from, features given up), retracted. Only where the memory has a path.
+      (learned from, features given up), retracted. A time out of the calendar's years 1 to 9999 is written as seconds
+      since 1970. Only where the memory has a path.
     - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
       see `signals.views`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
       one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
@@ -108,7 +109,10 @@ def _one_state(learner: TactileLearner) -> tuple[TactileLearner, list[Observatio
 
 
 def _date(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+    try:
+        return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+    except (OSError, OverflowError, ValueError):
+        return repr(seconds)
 
 
 def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import CapacityError, InputError
+from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage, common_names, judged_touches
@@ -38,13 +38,21 @@ DOUBT = 1.5
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
-    """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept."""
+    """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept.
+
+    Raises ScrollTactileError where sums that came from elsewhere have no readout: see `memory.gate`.
+    """
     try:
         yield
     except MemoryError as error:
         raise CapacityError(
             f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer "
             "materials in a scene, or give the process more"
+        ) from error
+    except np.linalg.LinAlgError as error:  # never of sums of rows: the shrunk scatter is positive definite
+        raise ScrollTactileError(
+            f"the sums of this memory have no readout ({error}): they are of no touches that were observed. Look at "
+            "where it came from (scroll-tactile memory check), and go back to a copy from before"
         ) from error
 
 

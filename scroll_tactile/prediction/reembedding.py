@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity, usual_embedding, usual_recall
 from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
@@ -34,7 +35,7 @@ def reembed_memory(
     with copies that only an earlier version can make has none.
     """
     finish_interrupted(Path(path))
-    with Store.open(path) as store:
+    with MemoryStore.open(path) as store:
         made, chosen = Identity.read(store), embedding
         if chosen is None:
             chosen = usual_embedding(made.sensor) if made.embedding.gone else made.own_embedding(store.path)

@@ -29,13 +29,13 @@ class Augmented(FrozenModel):
     copies: how many, the same for every touch, so that each counts alike. speed: the most that a copy is slower, or
     faster, as a factor of 1 or more. The speeds are spread evenly over the copies, two of them faster for each that is
     slower: there is less of a fast touch to be known by. A copy is no longer than the touch: a slower one is cut off
-    there, as slow touches are when they are evaluated.
+    there, as slow touches are when they are evaluated. At most 1000 copies, and a factor of 100.
 
     Raises InputError for strengths that cannot be.
     """
 
-    copies: Annotated[int, Field(ge=1)] = 4
-    speed: Annotated[FiniteFloat, Field(ge=1, strict=False)] = 2.0
+    copies: Annotated[int, Field(ge=1, le=1000)] = 4
+    speed: Annotated[FiniteFloat, Field(ge=1, le=100, strict=False)] = 2.0
 
     def copies_of(self, image: npt.NDArray[np.float32], key: bytes) -> list[Image]:
         """The copies of a touch, each float32 of shape (C, T') in [-1, 1], T' ≤ T; the same for the same key.

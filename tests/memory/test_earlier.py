@@ -133,7 +133,7 @@ class TestIdentity:
         Store.open(tmp_path / "m", identity=identity).close()
         with TactileLearner.open(tmp_path / "m", augmentation=Augmented(copies=2)) as learner:
             learner.observe("a", stream(1))
-        assert Identity.model_validate(identity).to_json() == Identity.of(PAD, SMALL, 4, Augmented(copies=2)).to_json()
+        assert Identity.from_json(identity).to_json() == Identity.of(PAD, SMALL, 4, Augmented(copies=2)).to_json()
 
     def test_none_of_this_is_written(self):
         assert "gone_copies" not in json.dumps(Identity.of(PAD, SMALL, 4, Augmented()).to_json())

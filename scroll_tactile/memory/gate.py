@@ -1,0 +1,257 @@
+"""The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
+
+Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
+gate takes every row and generation for what it must be (see `row_checks`, `generation_checks`), and raises DamageError
+with its place for anything else. What it lets through may be false, as a touch under another name is, and it fits.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Literal, cast
+
+from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.errors import MismatchError, ScrollTactileError
+from scroll_tactile.memory.expected import Unexpected
+from scroll_tactile.memory.generation_checks import GenerationChecks
+from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
+from scroll_tactile.memory.row_checks import RowChecks
+from scroll_tactile.memory.rows import KINDS, MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.signals.windows import WindowPlan
+from store import DamageError, Generation, Head, NotAStoreError, Record, Store, StoreError
+
+__all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted"]
+
+JOURNAL = ("journal.sqlite", "journal.sqlite-wal")
+SMALLEST_ROW = 32  # bytes of the journal: two digests
+# What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
+
+
+class Gate:
+    """What rows and generations in a folder must be, by the identity there, and the plan of windows it is read with.
+
+    thorough: whether second moments are shown to be some; it takes as long as fitting a readout.
+    """
+
+    def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
+        self._path, self._thorough = path, thorough
+        copies = None if identity.gone_copies else identity.augmentation.copies if identity.augmentation else 0
+        made_with = identity.sensor, identity.embedding.dimension, plan
+        self._rows = RowChecks(*made_with, copies)
+        self._generations = GenerationChecks(*made_with)
+
+    def head(self, head: Head) -> Head:
+        """This row, which is what its kind must be but for its arrays. Raises DamageError."""
+        with self._named(f"row {head.sequence}", head.sequence):
+            self._rows.check_head(head, self._most_rows())
+        return head
+
+    def record(self, record: Record) -> Record:
+        """This row with its arrays. Raises DamageError; MismatchError for what this version does not know."""
+        self.head(record)
+        with self._named(f"row {record.sequence}", record.sequence):
+            if record.kind == OBSERVE:
+                self._rows.check_observed(record)
+            elif record.kind == MERGE:
+                self._generations.check(record.arrays, record.attributes, None, thorough=self._thorough)
+        return record
+
+    def generation(self, generation: Generation) -> Generation:
+        """This generation. Raises DamageError."""
+        with self._named(f"generation {generation.number}"):
+            self._generations.check(generation.arrays, generation.attributes, generation.upto, thorough=self._thorough)
+        return generation
+
+    @contextmanager
+    def _named(self, what: str, sequence: int | None = None) -> Iterator[None]:
+        try:
+            yield
+        except (ScrollTactileError, StoreError):
+            raise
+        except WRONG as error:  # Unexpected, and as a last net what a check did not expect
+            came = str(error) if isinstance(error, Unexpected) else f"{type(error).__name__}: {error!s:.200}"
+            raise DamageError(
+                f"{what} of {self._path} is not what is written there: {came}. It is damaged, or was made by another "
+                "program: use none of this memory before you know who made it (scroll-tactile memory check)",
+                path=self._path,
+                sequence=sequence,
+            ) from error
+
+    def _most_rows(self) -> int:
+        """How many rows the journal can hold, by its size."""
+        files = [self._path / name for name in JOURNAL]
+        return sum(file.stat().st_size for file in files if file.exists()) // SMALLEST_ROW
+
+
+class MemoryStore(Store):
+    """A store that holds a memory: what it reads passes the gate.
+
+    Raises, from each method that reads, what `Gate` does, and what `Identity.read` does.
+    """
+
+    _gate: Gate | None = None
+
+    @property
+    def gate(self) -> Gate:
+        """The gate, by the memory's identity alone where nobody called `read_with`."""
+        if self._gate is None:
+            identity = Identity.read(self)
+            self.read_with(window_plan(identity.sensor, AbsentEmbedding(identity, self.path)))
+        assert self._gate is not None
+        return self._gate
+
+    def read_with(self, plan: WindowPlan, *, thorough: bool = False) -> None:
+        """Read with this plan of windows from now on; thorough: see `Gate`."""
+        self._gate = Gate(self.path, Identity.read(self), plan, thorough=thorough)
+
+    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+        """As `Store.heads`."""
+        return map(self.gate.head, super().heads(after, kind=kind, label=label))
+
+    def record(self, sequence: int) -> Record:
+        """As `Store.record`."""
+        return self.gate.record(super().record(sequence))
+
+    def records(self, after: int = 0) -> Iterator[Record]:
+        """As `Store.records`."""
+        return map(self.gate.record, super().records(after))
+
+    def latest(self, *, only: Collection[str] | None = None) -> Generation | None:
+        """As `Store.latest`; what has not all of its arrays is not looked at."""
+        if only is not None:
+            return super().latest(only=only)
+        newest = super().latest()
+        return None if newest is None else self.gate.generation(newest)
+
+    def base(self) -> Generation | None:
+        """As `Store.base`."""
+        base = super().base()
+        return None if base is None else self.gate.generation(base)
+
+
+def open_store(
+    path: str | os.PathLike[str],
+    sensor: Sensor | None,
+    embedding: Embedding | None,
+    augmentation: Augmented | None,
+    exemplars: int | None,
+    recall: int | None,
+    mode: Literal["write", "read"],
+) -> MemoryStore:
+    """The store in a folder; a new one where there is none and a sensor is given."""
+    try:
+        return MemoryStore.open(path, mode=mode)
+    except NotAStoreError:
+        if sensor is None or mode == "read":
+            raise
+    require_augmentable(sensor, augmentation)
+    chosen = usual_embedding(sensor) if embedding is None else embedding
+    identity = Identity.of(sensor, chosen, exemplars, augmentation, recall)
+    return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
+
+
+def require_counted(path: Path, generation: Generation, heads: Sequence[Head]) -> None:
+    """Raise DamageError where a generation counts more touches of a material than the journal's rows name.
+
+    heads: all rows of the journal; where a repair lost some, nobody knows.
+    """
+    if heads and len(heads) < heads[-1].sequence:
+        return
+    named = Counter(head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= generation.upto)
+    observations = generation.arrays["observations"]
+    touches = (observations if observations.ndim == 1 else observations.sum(axis=1)).tolist()
+    for material, count in zip(cast("list[str]", generation.attributes["materials"]), touches, strict=True):
+        if count > named[material]:
+            raise DamageError(
+                f"generation {generation.number} of {path} counts {count} touches of {material!r}, of which its "
+                f"journal names {named[material]}: it was made by another program, or for another journal",
+                path=path,
+            )
+
+
+def check_memory(path: str | os.PathLike[str]) -> list[str]:
+    """All that the gate finds in a folder, one sentence each; nothing of a sound memory, and nothing is replayed.
+
+    Checksums are `store.check_store`'s: a row that fails its own is passed over here. Raises StoreError where the
+    folder cannot be read, or holds no store.
+    """
+    with MemoryStore.open(path, mode="read") as store:
+        try:
+            identity = Identity.read(store)
+            plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
+            store.read_with(plan, thorough=True)
+        except (DamageError, MismatchError) as error:
+            return [str(error)]
+        heads, wrong = _in_rows(store)
+        return [*_in_generations(store, heads), *wrong]
+
+
+def _in_generations(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
+    for read in (store.latest, store.base):
+        try:
+            if (generation := read()) is not None:
+                require_counted(store.path, generation, heads)
+        except DamageError as damage:
+            yield str(damage)
+
+
+def _in_rows(store: MemoryStore) -> tuple[list[Head], list[str]]:
+    """The heads of the rows that verify, and what is wrong with them."""
+    heads: list[Head] = []
+    wrong: list[str] = []
+    kinds: dict[int, str] = {}
+    for row in _rows(store):
+        heads.append(Head(**{field.name: getattr(row, field.name) for field in fields(Head)}))  # without arrays
+        try:
+            store.gate.record(row) if isinstance(row, Record) else store.gate.head(row)
+            require_observed(store.path, row, kinds)
+        except (DamageError, MismatchError) as error:
+            wrong.append(str(error))
+        kinds[row.sequence] = row.kind
+    return heads, wrong
+
+
+def require_observed(path: Path, row: Head, kinds: dict[int, str]) -> None:
+    """Raise DamageError where a row retracts what is no observation, or was retracted before; MismatchError for a kind
+    that this version does not know.
+
+    kinds: of the rows before it, those retracted among them.
+    """
+    if row.kind not in KINDS:
+        raise MismatchError(f"row {row.sequence} of {path} is of kind {row.kind!r}, which this version does not know")
+    if row.kind != RETRACT:
+        return
+    gone = unspanned(row.attributes["sequences"])
+    if strange := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
+        raise DamageError(
+            f"row {row.sequence} of {path} retracts {strange[:5]}, which are no observations, or retracted before",
+            path=path,
+            sequence=row.sequence,
+        )
+    kinds.update((sequence, RETRACT) for sequence in gone)
+
+
+def _rows(store: MemoryStore) -> Iterator[Head]:
+    """The rows whose checksums hold, with their arrays where they were not compacted; they do not pass the gate."""
+    compacted, last, after = store.compacted, store.last, 0
+    while after < last:
+        try:
+            for row in Store.heads(store, after) if after < compacted else Store.records(store, after):
+                after = row.sequence
+                yield row
+                if after == compacted:
+                    break
+            else:
+                return
+        except DamageError as damage:
+            if damage.sequence is None or damage.sequence <= after:
+                return
+            after = damage.sequence

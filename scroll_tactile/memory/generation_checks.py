@@ -1,0 +1,234 @@
+"""What a generation, or the base that a merge brought, must be: sums that touches can have, and samples of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.expected import (
+    MOST_COLUMNS,
+    array,
+    codes,
+    counts,
+    expect,
+    keys,
+    name,
+    whole,
+)
+from scroll_tactile.memory.row_checks import check_description, check_readings
+from scroll_tactile.memory.rows import Arrays
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import fewest_readings
+from scroll_tactile.signals.windows import VIEWS, Scale, WindowPlan
+from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.moments import MOST_ROWS, within_scatter
+
+__all__ = ["GenerationChecks"]
+
+FOLDS = 3  # of statistics on disk before version 0.3
+MOST_STAGES = 2**10  # and scales that judge at one
+MODES = ("head", "adapters", "network")
+JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
+IntArray = npt.NDArray[np.int64]
+
+
+class GenerationChecks:
+    """The checks of generations of one sensor, dimension and plan of windows; each raises Unexpected."""
+
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan) -> None:
+        self._sensor, self._dimension, self._plan = sensor, dimension, plan
+
+    def check(self, arrays: Arrays, attributes: Mapping[str, Any], upto: int | None, *, thorough: bool) -> None:
+        """Check all that a memory takes from a generation.
+
+        upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some.
+        """
+        whole("dimension", attributes.get("dimension"), self._dimension, self._dimension)
+        scales = _numbers("scales", attributes.get("scales"), max(VIEWS.values()))
+        own = [scale for scale in self._plan.scales if f"rows-{scale}" in arrays]
+        named = [scale for scale in self._plan.scales if int(scale) in scales]
+        whole_plan = set(self._plan.windows) <= set(own) and own == named and len(set(scales)) == len(scales)
+        expect(whole_plan, "scales", f"{list(map(int, self._plan.scales))}, each with its arrays", scales)
+        materials = _names("materials", attributes.get("materials"))
+        expect(len(set(materials)) == len(materials), "materials", "different names", materials)
+        touches = self._check_touches(arrays, len(materials))
+        totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in own}
+        rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
+        expect(all(touches), "observations", "a touch or more of each material", touches)
+        self._check_sample(arrays, _names("pool", attributes.get("pool"), materials))
+        if "kept" in attributes:
+            self._check_kept(arrays, _names("kept", attributes["kept"], materials))
+        if "exemplars" in attributes:
+            self._check_exemplars(arrays, attributes["exemplars"], rows, upto)
+        for field in ("withdrawn", "excluded"):
+            sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, upto or 2**63 - 1)
+            expect(len(np.unique(sequences)) == len(sequences), field, "different rows", sequences)
+        if upto is not None:
+            _check_capacity(attributes.get("capacity"))
+            whole("tuned_upto", attributes.get("tuned_upto"), 0, upto)
+            _check_descriptions(attributes.get("descriptions", {}))
+            if "tuned" in attributes:
+                self._check_tuned(arrays, attributes["tuned"])
+
+    def _check_touches(self, arrays: Arrays, count: int) -> list[int]:
+        observations = array(arrays, "observations", ("int64",), _folded(arrays, "observations", (count,)))
+        counts("observations", observations, 0, MOST_ROWS)
+        touches: list[int] = (observations if observations.ndim == 1 else observations.sum(axis=1)).tolist()
+        lengths = array(arrays, "lengths", ("int64",), (None, 2))
+        counts("lengths", lengths[:, 0], 0, MOST_COLUMNS)
+        counts("lengths", lengths[:, 1], 1, MOST_ROWS)
+        expect(len(np.unique(lengths[:, 0])) == len(lengths), "lengths", "different lengths", lengths[:, 0])
+        total = int(lengths[:, 1].sum())
+        expect(total == sum(touches), "lengths", f"{sum(touches)} touches, those of observations", total)
+        return touches
+
+    def _check_sums(self, arrays: Arrays, scale: Scale, count: int, thorough: bool) -> IntArray:
+        """The rows of each material at a scale, whose sums and second moment could be of so many."""
+        field = f"rows-{scale}"
+        rows = array(arrays, field, ("int64",), _folded(arrays, field, (count,)))
+        counts(field, rows, 0, MOST_ROWS)
+        total = int(rows.sum())
+        whole(field, total, 0, MOST_ROWS)
+        field = f"sums-{scale}"
+        sums = array(arrays, field, ("int64",), (*rows.shape, self._dimension))
+        codes(field, sums, rows[..., None])
+        folds = [f"second-{scale}"] if rows.ndim == 1 else [f"second-{scale}-{fold}" for fold in range(FOLDS)]
+        moments = [
+            self._second(arrays, field, int(of.sum()))
+            for field, of in zip(folds, rows.reshape(count, len(folds)).T, strict=True)
+            if field in arrays or of.any()
+        ]
+        stray = {f"second-{scale}", *(f"second-{scale}-{fold}" for fold in range(FOLDS))} - set(folds)
+        expect(not stray & set(arrays), f"second-{scale}", f"{folds}", stray)
+        rows, sums = (rows, sums) if rows.ndim == 1 else (rows.sum(axis=1), sums.sum(axis=1))
+        if moments:
+            packed = moments[0] if len(moments) == 1 else np.sum(moments, axis=0)
+            self._check_moment(f"second-{scale}", packed, rows, sums, thorough)
+        return rows
+
+    def _second(self, arrays: Arrays, field: str, rows: int) -> IntArray:
+        size = self._dimension * (self._dimension + 1) // 2
+        most = rows << 2 * BITS
+        return counts(field, array(arrays, field, ("int64",), (size,)), -most, most)
+
+    def _check_moment(self, field: str, packed: IntArray, rows: IntArray, sums: IntArray, thorough: bool) -> None:
+        """Raise Unexpected where a variance within the materials is negative; thorough: where any is, in any direction.
+
+        A readout of such a moment has no answer.
+        """
+        known = rows > 0
+        places = np.cumsum(np.arange(1, self._dimension + 1)) - 1  # of the diagonal
+        diagonal = packed[places].astype(np.float64)
+        between = (sums[known].astype(np.float64) ** 2 / rows[known, None]).sum(axis=0)
+        sound = bool((diagonal + 1e-9 * diagonal.max(initial=0) + 1 >= between).all())
+        if sound and thorough and known.any():
+            scatter = within_scatter(packed, rows[known], sums[known])
+            jitter = JITTER * float(np.trace(scatter)) / self._dimension + 1
+            try:
+                np.linalg.cholesky(scatter + jitter * np.eye(self._dimension))
+            except np.linalg.LinAlgError:
+                sound = False
+        expect(sound, field, "a second moment of rows with these sums", "one that no rows have")
+
+    def _check_sample(self, arrays: Arrays, materials: list[str]) -> None:
+        keys(arrays, "pool-keys", materials)
+        sizes = counts("pool-sizes", array(arrays, "pool-sizes", ("int64",), (len(materials),)), 1, MOST_STAGES**2)
+        pairs = array(arrays, "pool-pairs", ("int64",), (int(sizes.sum()), 3))
+        counts("pool-pairs", pairs[:, :2], 0, MOST_STAGES - 1)
+        counts("pool-pairs", pairs[:, 2], 1, MOST_ROWS)
+        order = np.diff(pairs[:, 0] * MOST_STAGES + pairs[:, 1])
+        order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
+        expect(bool((order > 0).all()), "pool-pairs", "stages and scales in order", pairs)
+        field, most = ("pool-sums", pairs[:, 2:]) if "pool-sums" in arrays else ("pool-rows", 1)
+        rows = array(arrays, field, ("int32",), (len(pairs), self._dimension if len(pairs) else None))
+        codes(field, rows, most)
+
+    def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:
+        keys(arrays, "kept-keys", materials)
+        columns = array(arrays, "kept-columns", ("int64",), (len(materials),))
+        counts("kept-columns", columns, fewest_readings(self._sensor), MOST_COLUMNS)
+        array(arrays, "kept-levels", ("uint8",), (int(columns.sum()) * self._sensor.channels,))
+
+    def _check_exemplars(
+        self, arrays: Arrays, about: Any, rows: Mapping[Scale, Mapping[str, int]], upto: int | None
+    ) -> None:
+        expect(isinstance(about, dict), "exemplars", "their materials", about)
+        known = list(next(iter(rows.values()), {}))
+        materials = _names("exemplars.materials", about.get("materials"), known)
+        keys(arrays, "exemplar-keys", materials)
+        count = len(materials)
+        if "exemplar-sources" in arrays:
+            sources = array(arrays, "exemplar-sources", ("int64",), (count,))
+            counts("exemplar-sources", sources, 0, 2**63 - 1 if upto is None else upto)
+        if "exemplar-readings" not in arrays:
+            return
+        lengths = array(arrays, "exemplar-lengths", ("int64",), (count,))
+        counts("exemplar-lengths", lengths, fewest_readings(self._sensor), MOST_COLUMNS)
+        scales = array(arrays, "exemplar-scales", ("int64",), (count,)).tolist()
+        for material, scale in zip(materials, scales, strict=True):
+            found = next((totals for own, totals in rows.items() if int(own) == scale and own.width), {})
+            expect(found.get(material, 0) > 0, "exemplar-scales", f"windows that {material!r} has", scale)
+        array(arrays, "exemplar-codes", ("int32",), (count, self._dimension if count else None))
+        codes("exemplar-codes", arrays["exemplar-codes"])
+        shape = (int(lengths.sum()), *self._sensor.shape) if count else (0, None)
+        readings = array(arrays, "exemplar-readings", ("float32",), shape)
+        if count:
+            check_readings("exemplar-readings", readings, self._sensor)
+
+    def _check_tuned(self, arrays: Arrays, about: Any) -> None:
+        """An f*: whether a network takes its tensors is known when one is made."""
+        expect(isinstance(about, dict), "tuned", "names, mode, kept and report", about)
+        names = _names("tuned.names", about.get("names"))
+        expect(bool(names) and len(set(names)) == len(names), "tuned.names", "different names", names)
+        expect(about.get("mode") in MODES, "tuned.mode", f"one of {MODES}", about.get("mode"))
+        expect(isinstance(about.get("kept"), bool), "tuned.kept", "true or false", about.get("kept"))
+        expect(isinstance(about.get("report"), dict), "tuned.report", "a report", about.get("report"))
+        heads = {field for field in arrays if field.startswith("tuned-head-")}
+        able = {f"tuned-head-{scale}" for scale in self._plan.windows}
+        expect(bool(heads) and heads <= able, "tuned", f"heads of {sorted(able)}", sorted(heads))
+        for field in heads:
+            _check_finite(field, array(arrays, field, ("float64",), (self._dimension, len(names))))
+        _check_finite("tuned-bias", array(arrays, "tuned-bias", ("float64",), (len(names),)))
+        for field in (field for field in arrays if field.startswith("tuned-net-")):
+            _check_finite(field, array(arrays, field, ("float32",), arrays[field].shape))
+
+
+def _folded(arrays: Arrays, field: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape of a count, which before version 0.3 was apart for each fold."""
+    found = arrays.get(field)
+    return (*shape, FOLDS) if found is not None and found.ndim > len(shape) else shape
+
+
+def _check_finite(field: str, values: npt.NDArray[np.floating]) -> None:
+    expect(bool(np.isfinite(values).all()), field, "finite weights", "others")
+
+
+def _names(field: str, values: Any, among: list[str] | None = None) -> list[str]:
+    expect(isinstance(values, list), field, "names of materials", values)
+    names = [name(field, value) for value in values]
+    strange = [] if among is None else sorted(set(names) - set(among))
+    expect(not strange, field, "materials that were observed", strange)
+    return names
+
+
+def _numbers(field: str, values: Any, most: int) -> list[int]:
+    expect(isinstance(values, list), field, "numbers", values)
+    return [whole(field, value, 0, most) for value in values]
+
+
+def _check_capacity(capacity: Any) -> None:
+    pair = isinstance(capacity, list) and len(capacity) == 2
+    expect(pair, "capacity", "exemplars, and a limit in bytes that is no longer used", capacity)
+    for limit in capacity:
+        if limit is not None:
+            whole("capacity", limit, 0, 2**63 - 1)
+
+
+def _check_descriptions(descriptions: Any) -> None:
+    expect(isinstance(descriptions, dict), "descriptions", "descriptions by material", descriptions)
+    for material, constituents in descriptions.items():
+        expect(constituents is not None, "descriptions", "a description", constituents)
+        check_description("descriptions", name("descriptions", material), constituents)

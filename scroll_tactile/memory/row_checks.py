@@ -1,0 +1,208 @@
+"""What a row of a memory's journal must be: its kind's attributes, and the arrays of the reading it stands for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import DescriptionError, MismatchError
+from scroll_tactile.memory.descriptions import checked
+from scroll_tactile.memory.expected import KEY_BYTES, MOST_COLUMNS, Unexpected, array, codes, expect, name, whole
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    LARGEST,
+    MEMBER,
+    OBSERVE,
+    REST,
+    RETRACT,
+    SHAPE,
+    WHOLE,
+    ZERO,
+    Arrays,
+    only_readings,
+    unpack_readings,
+)
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import fewest_readings
+from scroll_tactile.signals.windows import EARLIER, MOST_WINDOWS, WindowPlan
+from store import Head, Record
+
+__all__ = ["RowChecks", "check_description", "check_readings"]
+
+ITEM = np.dtype(np.float32).itemsize
+MOST_BYTES = 2**30  # of readings: what a row of 256 MiB holds of whole numbers of a byte each
+SMALLEST = -149  # the exponent of the smallest float32
+POWER = re.compile(rf"{WHOLE}(-?[0-9]{{1,3}})")
+WINDOWS = re.compile(r"(stages|codes|values|places)-([0-9]{1,9})")
+
+
+class RowChecks:
+    """The checks of journal rows of one sensor, dimension and plan of windows.
+
+    copies: of each touch, whose rows lie behind its own; None where nobody knows how many.
+
+    Each raises Unexpected; MismatchError for arrays that this version does not know.
+    """
+
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, copies: int | None) -> None:
+        self._sensor, self._dimension, self._plan, self._copies = sensor, dimension, plan, copies
+        self._expected = lru_cache(256)(self._rows_of)
+
+    def check_head(self, head: Head, most_rows: int) -> None:
+        """Check a row without its arrays; most_rows: that the journal can hold."""
+        expect(isinstance(head.time, float), "time", "a number", head.time)
+        if head.kind in (OBSERVE, MEMBER):
+            name("label", head.label)
+            expect(len(head.key) == KEY_BYTES, "key", f"{KEY_BYTES} bytes", head.key)
+        if head.kind == OBSERVE:
+            self._check_observation(head.attributes)
+        elif head.kind == RETRACT:
+            if head.label:
+                name("label", head.label)
+            _check_spans(head.attributes.get("sequences"), head.sequence, most_rows)
+        elif head.kind == DESCRIBE:
+            name("label", head.label)
+            expect("constituents" in head.attributes, "constituents", "a description", None)
+            check_description("constituents", head.label, head.attributes["constituents"])
+
+    def _check_observation(self, attributes: Mapping[str, Any]) -> None:
+        columns = whole("columns", attributes.get("columns"), 1, MOST_COLUMNS)
+        if "nbytes" not in attributes:
+            return
+        each = ITEM * self._sensor.channels
+        size = whole("nbytes", attributes["nbytes"], each * fewest_readings(self._sensor), MOST_BYTES)
+        readings, frame = size // each, self._plan.widths[0]
+        # Of a camera's frames the first may be its resting image, which is no column.
+        fitting = (readings * frame, (readings - 1) * frame) if self._sensor.camera else (readings,)
+        expect(size % each == 0 and columns in fitting, "columns", f"those of {size} bytes of readings", columns)
+
+    def check_observed(self, record: Record) -> None:
+        """Check the arrays of an observation, whose head was checked."""
+        arrays, columns = record.arrays, cast(int, record.attributes["columns"])
+        if unknown := [own for own in arrays if not _is_known(own)]:
+            raise MismatchError(
+                f"row {record.sequence} has arrays {unknown[:5]}, which this version does not know: open the memory "
+                "with the version that wrote it, or a newer one"
+            )
+        packed = only_readings(arrays)
+        size = cast("int | None", record.attributes.get("nbytes"))
+        expect((size is None) == (not packed), "nbytes", "the size of the row's readings", size)
+        if size is not None:
+            check_readings("readings", _unpacked(packed, size, self._sensor), self._sensor)
+        self._check_codes(arrays, columns)
+
+    def _check_codes(self, arrays: Arrays, columns: int) -> None:
+        found: dict[str, dict[int, int]] = {"stages": {}, "codes": {}}
+        for field in arrays:
+            match = WINDOWS.fullmatch(field)
+            if match is not None and match[1] != "places":
+                layout, number = ("codes" if match[1] == "values" else match[1]), int(match[2])
+                expect(number not in found[layout], field, "one array for each scale", field)
+                found[layout][number] = self._check_scale(arrays, match[1], number)
+        expect(not (found["stages"] and found["codes"]), "stages", "one way of packing", sorted(arrays))
+        expect(bool(any(found.values()) or only_readings(arrays)), "arrays", "codes or readings", sorted(arrays))
+        if not any(found.values()):
+            return
+        staged, windows = self._expected(columns)
+        own, rows = (staged, found["stages"]) if found["stages"] else (windows, found["codes"])
+        for number, count in rows.items():
+            if number in EARLIER:  # passed over
+                continue
+            expect(number in own, f"scale {number}", f"scales {sorted(own)} of a touch of {columns} columns", number)
+            more = count if self._copies is None else self._copies * MOST_WINDOWS * len(self._plan.milestones())
+            fits = own[number] <= count <= own[number] + more
+            expect(fits, f"scale {number}", f"{own[number]} rows of {columns} columns, and those of copies", count)
+        views = {int(view) for view in self._plan.views}  # which earlier versions had none of
+        needed = set(own) - (set() if views & set(rows) else views)
+        expect(needed <= set(rows), "scales", f"all of {sorted(needed)}", sorted(rows))
+
+    def _check_scale(self, arrays: Arrays, layout: str, number: int) -> int:
+        """The rows of a scale whose codes are within the grid."""
+        field = f"{layout}-{number}"
+        if layout != "values":
+            rows = array(arrays, field, ("int32",), (None, self._dimension))
+            codes(field, rows)
+            return len(rows)
+        values = array(arrays, field, ("int32",), (None,))
+        codes(field, values)
+        kinds = ("uint8", "uint16", "uint32", "int64")
+        places = array(arrays, f"places-{number}", kinds, (self._dimension, None))
+        inside = not places.size or (places.min() >= 0 and places.max() < len(values))
+        expect(inside, f"places-{number}", f"places among {len(values)} values", "others")
+        return int(places.shape[1])
+
+    def _rows_of(self, columns: int) -> tuple[dict[int, int], dict[int, int]]:
+        """Of a touch of so many columns, by the number of the scale: its rows of stages, and its windows."""
+        staged: dict[int, int] = {}
+        for stage in self._plan.scored_stages(columns):
+            for scale, groups in stage.items():
+                staged[int(scale)] = staged.get(int(scale), 0) + len(groups)
+        return staged, {int(width): len(starts) for width, starts in self._plan.extent(columns).items()}
+
+
+def _is_known(field: str) -> bool:
+    plain = field in ("readings", SHAPE, ZERO, REST)
+    return plain or POWER.fullmatch(field) is not None or WINDOWS.fullmatch(field) is not None
+
+
+def _check_spans(pairs: Any, sequence: int, most_rows: int) -> None:
+    """Raise Unexpected for anything but spans of rows before this one, ascending and apart."""
+    expect(isinstance(pairs, list) and bool(pairs), "sequences", "spans of rows", pairs)
+    before = rows = 0
+    for pair in pairs:
+        pairing = isinstance(pair, list) and len(pair) == 2 and all(type(end) is int for end in pair)
+        expect(pairing and before < pair[0] <= pair[1] < sequence, "sequences", f"rows before {sequence}", pair)
+        before, rows = pair[1], rows + pair[1] - pair[0] + 1
+    expect(rows <= most_rows, "sequences", f"at most {most_rows} rows, which the journal can hold", rows)
+
+
+def check_description(field: str, material: str, constituents: Any) -> None:
+    """Raise Unexpected for what `describe` would not keep; None removes a description."""
+    if constituents is None:
+        return
+    try:
+        kept = checked(material, constituents)
+    except DescriptionError as error:
+        raise Unexpected(f"{field}: {error}") from None
+    same = all(type(value) is type(kept[constituent]) for constituent, value in constituents.items())
+    expect(same, field, "shares as floats", constituents)
+
+
+def _unpacked(packed: Arrays, size: int, sensor: Sensor) -> npt.NDArray[np.float32]:
+    """The readings of a row, whose arrays are looked at before anything is made of them."""
+    count = size // (ITEM * sensor.channels)
+    shape = (count, *sensor.shape)
+    powers = [field for field in packed if field not in ("readings", SHAPE, ZERO, REST)]
+    one_way = len(packed) == 1 if "readings" in packed or powers else set(packed) == {SHAPE, ZERO, REST}
+    expect(one_way, "readings", "one way of packing", sorted(packed))
+    if "readings" in packed:
+        array(packed, "readings", ("float32",), shape)
+    elif powers:
+        power = int(powers[0].removeprefix(WHOLE))
+        whole(powers[0], power, SMALLEST, LARGEST)
+        array(packed, powers[0], ("uint8", "int8", "int16"), (*shape[1:], count))
+    else:
+        kept = array(packed, SHAPE, ("int64",), (len(shape),))
+        expect(kept.tolist() == list(shape), SHAPE, f"{shape}", kept.tolist())
+        values = size // ITEM
+        zero = array(packed, ZERO, ("uint8",), (-(-values // 8),))
+        array(packed, REST, ("float32",), (values - int(np.count_nonzero(np.unpackbits(zero, count=values))),))
+    with np.errstate(over="ignore"):
+        readings = unpack_readings(packed)
+    assert readings is not None
+    return readings
+
+
+def check_readings(field: str, readings: npt.NDArray[np.float32], sensor: Sensor) -> None:
+    """Raise Unexpected for readings that are not finite, or out of the sensor's range."""
+    low, high = sensor.limits
+    if not low.ndim and not high.ndim:
+        inside = bool(readings.min() >= low and readings.max() <= high)
+    else:
+        inside = bool(((readings >= low) & (readings <= high)).all())
+    expect(inside, field, f"values within the range of {sensor.name!r}", "others, or values that are not finite")

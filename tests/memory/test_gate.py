@@ -1,0 +1,514 @@
+"""Folders from somebody else: rows, identities and generations that verify, and are none of a memory's."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from forging import copied, generation_of, get_identity, put_generation, put_row, row_of, set_identity
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from touches import PAD, SETTINGS, contents, filled, stream
+
+from scroll_tactile import Augmented, Kernels, TactileLearner
+from scroll_tactile.errors import MismatchError, ScrollTactileError
+from scroll_tactile.memory.gate import check_memory
+from scroll_tactile.pipelines.plain_export import export_plain
+from scroll_tactile.signals.stream import validate
+from store import DamageError, StoreError
+
+TYPED = (ScrollTactileError, StoreError)
+OTHER = [("d", (9, 60)), ("e", (10, 60)), ("d", (11, 60))]
+
+
+class Inexact(Kernels):
+    """Kernels whose codes are kept in the rows."""
+
+    name = "inexact"
+    capabilities = Kernels.capabilities.__class__(embeds_windows=True, reads_whole_touches=True)
+
+
+STORED = SETTINGS | {"embedding": Inexact(seed=0, dimension=64)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A memory with a generation, one as if its power had failed, one with codes in its rows, and a compacted one."""
+    folder = tmp_path_factory.mktemp("made")
+    for name, settings_ in (("whole", {}), ("coded", STORED), ("compacted", {}), ("other", {})):
+        learner, _ = (
+            filled(folder / name, OTHER, **settings_) if name == "other" else filled(folder / name, **settings_)
+        )
+        learner.describe("a", {"wool": 0.5, "silk": 0.5})
+        if name == "compacted":
+            learner.compact()
+        learner.close()
+    return folder
+
+
+@pytest.fixture
+def path(made, tmp_path):
+    return copied(made / "whole", tmp_path / "m")
+
+
+def opened(path, **settings_):
+    return TactileLearner.open(path, **settings_)
+
+
+def require_refused(path, match, expected=DamageError, others=None, **settings_):
+    """Whoever reads it is told what is wrong, a merge of it changes nothing, and a check finds it."""
+    with pytest.raises(expected, match=match):
+        opened(path, mode="read", **settings_)
+    with pytest.raises(expected, match=match):
+        opened(path, **settings_)
+    if others is not None:
+        with opened(others) as target:
+            before = contents(target)
+            with pytest.raises(expected, match=match) as error:
+                target.merge(path, shared="twice")
+            assert str(path) in str(error.value)
+            assert contents(target) == before
+        with opened(others) as target:
+            assert contents(target) == before
+    assert any(found for found in check_memory(path))
+
+
+def readings_row(path, **changes):
+    """A row of readings as they are, with some of its arrays changed; None leaves one out."""
+    readings = validate(stream((20, 60)), PAD).readings
+    arrays = {"readings": readings, **changes}
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    return put_row(path, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
+
+
+def test_a_sound_memory_has_nothing_that_is_found(made):
+    for name in ("whole", "coded", "compacted", "other"):
+        assert check_memory(made / name) == []
+
+
+def test_a_forged_row_that_fits_is_a_row(path):
+    readings_row(path)
+    with opened(path) as learner:
+        assert learner.materials["silk"] == 1
+    assert check_memory(path) == []
+
+
+NAN = np.full((60, 2), np.nan, np.float32)
+ROWS = {
+    "no attributes": ("columns: expected a whole number", {"attributes": {}}),
+    "columns below one": ("columns", {"attributes": {"columns": -1, "nbytes": 480}}),
+    "columns beyond all": ("columns", {"attributes": {"columns": 10**9, "nbytes": 480}}),
+    "columns of others": ("columns", {"attributes": {"columns": 59, "nbytes": 480}}),
+    "columns true": ("columns", {"attributes": {"columns": True, "nbytes": 480}}),
+    "bytes in words": ("nbytes", {"attributes": {"columns": 60, "nbytes": "a"}}),
+    "bytes of others": ("columns", {"attributes": {"columns": 60, "nbytes": 488}}),
+    "bytes of none": ("nbytes", {"attributes": {"columns": 60, "nbytes": 480}, "payload": {}}),
+    "another shape": ("readings", {"payload": {"readings": np.zeros(3, np.float32)}}),
+    "another type": ("readings", {"payload": {"readings": np.zeros((60, 2))}}),
+    "text": ("readings", {"payload": {"readings": np.full((60, 2), "x")}}),
+    "not finite": ("range of 'pad'", {"payload": {"readings": NAN}}),
+    "out of range": ("range of 'pad'", {"payload": {"readings": np.full((60, 2), 1.5, np.float32)}}),
+    "a power beyond all": ("2e200", {"payload": {"readings-2e200": np.ones((2, 60), np.int8)}}),
+    "two ways": (
+        "one way",
+        {"payload": {"readings": np.zeros((60, 2), np.float32), "readings-2e0": np.ones(3, np.int8)}},
+    ),
+    "a short key": ("key: expected 32 bytes", {"key": b"abc"}),
+    "no name": ("name of 1 to 200", {"label": ""}),
+    "a long name": ("name of 1 to 200", {"label": "x" * 10**6}),
+    "an escape for a name": ("printable", {"label": "\x1b[2J"}),
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_that_is_no_observation_is_damage(made, tmp_path, path, name):
+    match, changes = ROWS[name]
+    row = {
+        "attributes": {"columns": 60, "nbytes": 480},
+        "payload": {"readings": validate(stream((20, 60)), PAD).readings},
+    }
+    put_row(path, **row | changes)
+    require_refused(path, match, others=copied(made / "other", tmp_path / "other"))
+
+
+def test_a_row_of_nothing_is_damage(path):
+    put_row(path, attributes={"columns": 60})
+    require_refused(path, "codes or readings")
+
+
+def test_arrays_that_nobody_knows_are_of_a_newer_version(path):
+    readings_row(path, dreams=np.zeros(3))
+    require_refused(path, r"arrays \['dreams'\], which this version does not know", MismatchError)
+
+
+ZEROS = {
+    "readings-shape": np.array([60, 2]),
+    "readings-zero": np.full(15, 255, np.uint8),
+    "readings-rest": np.zeros(0, np.float32),
+}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"readings-shape": np.array([2**40, 2])},
+        {"readings-shape": np.array([60, 2, 1])},
+        {"readings-shape": np.array([60.0, 2.0])},
+        {"readings-zero": np.full(14, 255, np.uint8)},
+        {"readings-zero": np.full(15, 255, np.int16)},
+        {"readings-rest": np.zeros(1, np.float32)},
+        {"readings-rest": None},
+    ],
+)
+def test_packed_readings_must_fit_together(path, changes):
+    readings_row(path, **{"readings": None} | ZEROS | changes)
+    require_refused(path, "readings")
+
+
+LARGE = 2**20 + 1
+
+
+@pytest.mark.parametrize(
+    ("match", "spoil"),
+    [
+        ("magnitude", lambda codes: codes + LARGE),
+        ("magnitude", lambda codes: np.full_like(codes, np.iinfo(np.int32).min)),
+        ("int32", lambda codes: codes.astype(np.float32) * np.nan),
+        ("int32", lambda codes: codes.astype(np.int64)),
+        ("int32", lambda codes: codes[:, :-1]),
+        ("rows", lambda codes: codes[:-1]),
+        ("rows", lambda codes: np.concatenate([codes, codes])),
+    ],
+)
+@pytest.mark.parametrize("scale", [15, 37, 1048576])
+def test_codes_must_be_those_of_the_touch(made, tmp_path, match, spoil, scale):
+    path = copied(made / "coded", tmp_path / "m")
+    attributes, arrays = row_of(path)
+    put_row(path, attributes=attributes, payload=arrays | {f"stages-{scale}": spoil(arrays[f"stages-{scale}"])})
+    embedding = STORED["embedding"]
+    require_refused(path, match, embedding=embedding)
+
+
+@pytest.mark.parametrize("changes", [{"stages-37": None}, {"stages-38": "stages-37"}, {"codes-37": "stages-37"}])
+def test_scales_must_be_those_of_the_touch(made, tmp_path, changes):
+    path = copied(made / "coded", tmp_path / "m")
+    attributes, arrays = row_of(path)
+    changed = arrays | {name: None if of is None else arrays[of] for name, of in changes.items()}
+    put_row(path, attributes=attributes, payload={name: one for name, one in changed.items() if one is not None})
+    require_refused(path, "scale|stages", embedding=STORED["embedding"])
+
+
+@pytest.mark.parametrize(
+    "sequences",
+    [
+        None,
+        [],
+        "x",
+        [3],
+        [[1]],
+        [[1, 10**12]],
+        [[1, 14]],
+        [[0, 1]],
+        [[2, 1]],
+        [[True, 1]],
+        [[1.0, 1.0]],
+        [[3, 4], [1, 2]],
+        [[1, 2], [2, 3]],
+    ],
+)
+def test_a_retraction_is_of_rows_before_it(made, tmp_path, path, sequences):
+    put_row(path, kind="retract", label="", key=b"", attributes={} if sequences is None else {"sequences": sequences})
+    require_refused(path, "sequences: expected", others=copied(made / "other", tmp_path / "other"))
+
+
+def test_a_description_cannot_be_retracted_and_no_observation_twice(path):
+    put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[13, 13]]})
+    require_refused(path, "retracts")
+
+
+def test_an_observation_cannot_be_retracted_twice(path):
+    for _ in range(2):
+        put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[1, 1]]})
+    require_refused(path, "retracts")
+
+
+@pytest.mark.parametrize(
+    "constituents",
+    ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}],
+)
+def test_a_description_is_one_that_describe_keeps(made, tmp_path, path, constituents):
+    put_row(path, kind="describe", label="a", key=b"", attributes={"constituents": constituents})
+    require_refused(path, "constituents", others=copied(made / "other", tmp_path / "other"))
+
+
+IDENTITIES = {
+    "sensor": ["x", None, [], {}, {"name": "pad"}],
+    "embedding": ["x", {}, [], None],
+    "grid": [None, {}, {"bits": 20, "scales": ["a"]}, {"bits": 20, "scales": []}, {"bits": True, "scales": [15]}],
+    "exemplars": ["abc", [1], [-1, None], [True, None], [10**30, None]],
+    "augmentation": [{"x": 1}, "x", {"copies": 10**9}, {"copies": 2, "speed": 1e300}, {"copies": True}],
+    "recall": ["x", -1, True, 10**30],
+    "views": [1, "true"],
+    "reading": [[1, "all"], ["x", "y"], [True]],
+}
+
+
+@pytest.mark.parametrize(("field", "value"), [(field, value) for field in IDENTITIES for value in IDENTITIES[field]])
+def test_an_identity_that_is_none_is_damage(path, field, value):
+    set_identity(path, get_identity(path) | {field: value})
+    require_refused(path, f"identity of .*{field}")
+
+
+@pytest.mark.parametrize("field", ["dimension", "bound", "name", "fingerprint", "configuration"])
+@pytest.mark.parametrize("value", [0, -5, 10**9, 10**400, True, "", None, [], 1e308])
+def test_an_embedding_that_is_none_is_refused(path, field, value):
+    identity = get_identity(path)
+    identity["embedding"][field] = value
+    set_identity(path, identity)
+    if (field, value) in (("bound", 10**9), ("bound", 1e308), ("configuration", None)):
+        return  # it could be
+    require_refused(path, "identity", TYPED)
+
+
+@pytest.mark.parametrize("field", ["channels", "rate", "low", "high", "duration", "name", "layout"])
+@pytest.mark.parametrize("value", ["x", -1, True, 10**400, 1e308, [], None])
+def test_a_sensor_that_is_none_is_refused(path, field, value):
+    identity = get_identity(path)
+    identity["sensor"][field] = value
+    set_identity(path, identity)
+    if (field, value) in (("layout", None), ("name", "x"), ("low", -1)):
+        return
+    require_refused(path, "identity|range", TYPED)
+
+
+def test_depth_of_an_identity_ends(path):
+    identity = get_identity(path)
+    for depth in (17, 400):
+        identity["embedding"]["configuration"]["parts"] = json.loads("[" * depth + "]" * depth)
+        set_identity(path, identity)
+        require_refused(path, "identity")
+
+
+def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
+    for time in (-1e14, 1e300):
+        readings = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
+        put_row(
+            path,
+            key=readings.key,
+            attributes={"columns": 60, "nbytes": 480},
+            payload={"readings": readings.readings},
+            time=time,
+        )
+    with opened(path, mode="read") as learner:
+        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
+        export_plain(learner, tmp_path / "plain")
+    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
+
+
+SUMS = {
+    "observations": [lambda a: a - 10, lambda a: a + 1, lambda a: a.astype(float), lambda a: a[:-1]],
+    "lengths": [lambda a: -a, lambda a: np.concatenate([a, a]), lambda a: a[:, :1]],
+    "rows-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a * 0],
+    "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
+    "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
+    "second-1048576": [lambda a: a * 0],
+    "pool-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
+    "pool-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
+    "pool-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],
+    "pool-rows": [lambda a: a + LARGE, lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
+    "kept-keys": [lambda a: a * 0],
+    "kept-columns": [lambda a: -a, lambda a: a + 1, lambda a: None],
+    "kept-levels": [lambda a: a[:-1], lambda a: a.astype(np.int16)],
+    "exemplar-keys": [lambda a: a[:-1]],
+    "exemplar-sources": [lambda a: a + 10**6, lambda a: -a - 1, lambda a: a.astype(float)],
+    "withdrawn": [lambda a: np.array([10**12]), lambda a: np.array([0]), lambda a: np.array([1.5])],
+    "excluded": [lambda a: np.array([1, 1])],
+}
+
+
+@pytest.mark.parametrize(("field", "place"), [(field, i) for field, spoils in SUMS.items() for i in range(len(spoils))])
+def test_arrays_of_a_generation_must_be_those_of_touches(path, field, place):
+    attributes, arrays = generation_of(path)
+    changed = SUMS[field][place](arrays.pop(field))
+    put_generation(path, attributes, arrays | ({} if changed is None else {field: changed}))
+    require_refused(
+        path, "generation 2 .*: (observations|lengths|rows|sums|second|pool|kept|exemplar|withdrawn|excluded)"
+    )
+
+
+ABOUT = {
+    "dimension": [63, "x", None],
+    "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20]],
+    "materials": [["a", "a", "b"], ["a", "b", "\n"], ["a", "b", 3], "abc", None],
+    "pool": [[], ["a"], ["z"] * 12, None],
+    "kept": [[], ["z"] * 12, None],
+    "capacity": ["x", [1], [True, None]],
+    "exemplars": [None, [], {}, {"materials": ["z"] * 12}],
+    "descriptions": [[], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
+    "tuned_upto": [None, -1, 10**9, "x"],
+    "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
+}
+
+
+@pytest.mark.parametrize(
+    ("field", "place"), [(field, i) for field, values in ABOUT.items() for i in range(len(values))]
+)
+def test_attributes_of_a_generation_must_be_those_of_touches(path, field, place):
+    attributes, arrays = generation_of(path)
+    put_generation(path, attributes | {field: ABOUT[field][place]}, arrays)
+    require_refused(path, f"generation 2 .*({field}|tuned|exemplar)")
+
+
+def hollow(attributes, arrays):
+    """A second moment that no rows have: its diagonal is theirs, and beside it is more."""
+    dimension = attributes["dimension"]
+    square = np.zeros((dimension, dimension), np.int64)
+    square[np.tril_indices(dimension)] = arrays["second-15"]
+    square[1, 0] = int(np.sqrt(float(square[0, 0])) * np.sqrt(float(square[1, 1]))) * 2
+    limit = int(arrays["rows-15"].sum()) << 40
+    square[1, 0] = min(int(square[1, 0]), limit)
+    return arrays | {"second-15": square[np.tril_indices(dimension)]}
+
+
+def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
+    path = copied(made / "compacted", tmp_path / "m")
+    attributes, arrays = generation_of(path)
+    put_generation(path, attributes, hollow(attributes, arrays), base=True)
+    others = copied(made / "other", tmp_path / "other")
+    with opened(others) as target:
+        before = contents(target)
+        with pytest.raises(DamageError, match="second-15"):
+            target.merge(path, shared="twice")
+        assert contents(target) == before
+    assert any("second-15" in found for found in check_memory(path))
+    with opened(path) as learner, pytest.raises(ScrollTactileError, match="no readout"):
+        learner.predict(stream((7, 25)))
+
+
+def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
+    path = copied(made / "compacted", tmp_path / "m")
+    attributes, arrays = generation_of(path)
+    arrays["observations"] = arrays["observations"] + 1
+    arrays["lengths"][0, 1] += len(arrays["observations"])
+    put_generation(path, attributes, arrays, base=True)
+    assert any("its journal names 4" in found for found in check_memory(path))
+    with opened(copied(made / "other", tmp_path / "other")) as target, pytest.raises(DamageError, match="names 4"):
+        target.merge(path, shared="twice")
+
+
+def test_what_a_base_brings_is_looked_at_again_when_it_is_read(made, tmp_path):
+    others = copied(made / "other", tmp_path / "other")
+    with opened(others) as target:
+        target.merge(made / "compacted", shared="twice")
+    assert check_memory(others) == []
+    with opened(others, mode="read") as learner:
+        assert learner.materials == {"a": 4, "b": 4, "c": 4, "d": 2, "e": 1}
+
+
+JUNK = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inside: st.lists(inside, max_size=3) | st.dictionaries(st.text(max_size=5), inside, max_size=3),
+    max_leaves=5,
+)
+
+
+@st.composite
+def changed_array(draw, array):
+    """An array like another: of another type, shape or values."""
+    kind = draw(st.sampled_from(["type", "cut", "longer", "axis", "value", "empty"]))
+    if kind == "type":
+        types = ["bool", "int8", "uint8", "int16", "int32", "int64", "float16", "float32", "float64", "<U2"]
+        with np.errstate(all="ignore"):
+            return array.astype(draw(st.sampled_from(types)))
+    if kind == "cut" and array.ndim:
+        return array[:-1]
+    if kind == "longer" and array.ndim:
+        return np.concatenate([array, array])
+    if kind == "axis":
+        return array[None]
+    if kind == "value" and array.size and array.dtype.kind in "iuf":
+        changed = array.copy().reshape(-1)
+        extremes = [0, 1, np.finfo(np.float32).max, np.nan] if array.dtype.kind == "f" else [0, 1, -1, 2**20, 2**31]
+        with np.errstate(all="ignore"):
+            changed[draw(st.integers(0, changed.size - 1))] = np.array(draw(st.sampled_from(extremes))).astype(
+                array.dtype
+            )
+        return changed.reshape(array.shape)
+    return array[:0] if array.ndim else array
+
+
+@st.composite
+def changed(draw, attributes, arrays):
+    """Attributes and arrays of which one was changed, left out or added."""
+    attributes, arrays = dict(attributes), dict(arrays)
+    what = draw(st.sampled_from(["attribute", "array"]))
+    chosen = attributes if what == "attribute" else arrays
+    names = sorted(chosen)
+    if names and draw(st.booleans()):
+        name = draw(st.sampled_from(names))
+        chosen[name] = draw(JUNK if what == "attribute" else changed_array(chosen[name]))
+    elif names and draw(st.booleans()):
+        del chosen[draw(st.sampled_from(names))]
+    elif what == "array":
+        arrays[draw(st.sampled_from(["x", "stages-15", "codes-15", "values-37", "readings", "tuned-bias"]))] = np.zeros(
+            3
+        )
+    return attributes, arrays
+
+
+LIMITS = settings(deadline=None, max_examples=20, suppress_health_check=list(HealthCheck))
+
+
+def require_typed_or_equal(path, **settings_):
+    """It answers, or says what is wrong; and a check that finds nothing is of a memory that opens."""
+    found = check_memory(path)
+    try:
+        with opened(path, mode="read", **settings_) as learner:
+            learner.predict(stream((7, 25)))
+            learner.observations()
+            learner.exemplars  # noqa: B018
+    except TYPED:
+        assert found
+        return
+
+
+@LIMITS
+@given(st.data())
+def test_a_row_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    source, settings_ = data.draw(st.sampled_from([("whole", {}), ("coded", {"embedding": STORED["embedding"]})]))
+    path = copied(made / source, tmp_path_factory.mktemp("row") / "m")
+    attributes, arrays = data.draw(changed(*row_of(path, data.draw(st.sampled_from([1, 13])))))
+    kind = data.draw(st.sampled_from(["observe", "observe", "retract", "describe", "merge", "felt", "dream"]))
+    put_row(path, kind=kind, attributes=attributes, payload=arrays)
+    require_typed_or_equal(path, **settings_)
+
+
+@LIMITS
+@given(st.data())
+def test_a_generation_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    source = data.draw(st.sampled_from(["whole", "compacted"]))
+    path = copied(made / source, tmp_path_factory.mktemp("generation") / "m")
+    attributes, arrays = data.draw(changed(*generation_of(path)))
+    put_generation(path, attributes, arrays, base=source == "compacted")
+    require_typed_or_equal(path)
+
+
+@LIMITS
+@given(st.data())
+def test_an_identity_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    path = copied(made / "whole", tmp_path_factory.mktemp("identity") / "m")
+    identity = get_identity(path)
+    part = data.draw(st.sampled_from([identity, identity["sensor"], identity["embedding"], identity["grid"]]))
+    part[data.draw(st.sampled_from(sorted(part)))] = data.draw(JUNK)
+    set_identity(path, json.dumps(identity))
+    require_typed_or_equal(path)
+
+
+def test_copies_have_bounds():
+    for wrong in ({"copies": 1001}, {"speed": 101.0}):
+        with pytest.raises(ValueError, match="expected"):
+            Augmented(**wrong)

@@ -121,14 +121,20 @@ def _limit(folder: Path) -> None:
 
 
 def _check(folder: Path) -> None:
+    # Before the bound: what is imported is no part of the memory.
     import zarr  # noqa: F401
 
-    import store.groups  # noqa: F401 (before the bound: what is imported is no part of the memory)
+    from scroll_tactile.memory.gate import check_memory
 
     _limit(folder)
     try:
-        for problem in check_checksums(folder, progress=lambda *step: _tell("progress", step)):
+        problems = check_checksums(folder, progress=lambda *step: _tell("progress", step))
+        for problem in problems:
             _tell("problem", (str(problem.path), problem.what, problem.kind))
+        # Of rows that are not as they were written there is nothing more to say.
+        if all(problem.kind == "leftover" for problem in problems):
+            for what in check_memory(folder):
+                _tell("problem", (str(folder), what, "lost"))
     except StoreError as error:
         _tell("refused", (type(error).__name__, str(error)))
     except MemoryError:

@@ -5,9 +5,10 @@ import re
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
+from touches import OBSERVED, SETTINGS, stream
 
+from scroll_tactile import TactileLearner
 from scroll_tactile.pipelines import checking
 from scroll_tactile.pipelines.checking import check_memory_apart
 from store import NotAStoreError, Store, check_store
@@ -15,18 +16,26 @@ from store import NotAStoreError, Store, check_store
 
 @pytest.fixture
 def path(tmp_path):
-    with Store.open(tmp_path / "m", identity={}) as store:
-        for number in range(3):
-            store.append("a", f"row {number}", b"", arrays={"x": np.arange(100)})
-        store.commit({"x": np.zeros(5_000_000)}, upto=3)
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+        for name, touch in OBSERVED:
+            learner.observe(name, stream(touch))
     return tmp_path / "m"
+
+
+def test_a_row_that_verifies_and_that_no_touch_could_have_made_is_found(path):
+    with Store.open(path) as store:
+        store.append("observe", "wool", bytes(32), attributes={"columns": 10**9})
+    assert check_store(path) == []
+    (problem,) = check_memory_apart(path)
+    assert (problem.path, problem.kind) == (path, "lost")
+    assert "row 13" in problem.what
 
 
 def test_it_finds_what_the_check_here_finds_and_says_how_far_it_is(path):
     told = []
     assert check_memory_apart(path, progress=lambda *step: told.append(step)) == []
     assert {what for what, _, _ in told} >= {"generations"}
-    (path / "generations" / "00000001" / "x" / "zarr.json").write_text("{}")
+    next((path / "generations").glob("*/sums-*/zarr.json")).write_text("{}")
     found = check_memory_apart(str(path))
     assert [(problem.path, problem.kind) for problem in found] == [
         (problem.path, problem.kind) for problem in check_store(path)

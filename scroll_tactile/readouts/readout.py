@@ -76,7 +76,7 @@ class Task:
         # Of no touch that was sampled may any have rows here: then the first materials that have.
         known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
         own = np.array(known, dtype=np.intp)
-        packed, (counts, sums) = statistics.second(scale).lend(), statistics.totals(scale)
+        packed, (counts, sums) = statistics.second(scale).packed(), statistics.totals(scale)
         return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
 
     @property

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +45,8 @@ class SecondMoment:
     """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
 
     Rows wait in a block of at most 512, whose product is formed by BLAS in float64: products of integers below
-    2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads.
+    2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads. The triangle is never
+    changed in place: whoever has it keeps it as it is, and what is cut short by ctrl-C has changed nothing.
     """
 
     def __init__(self, dimension: int) -> None:
@@ -55,7 +55,6 @@ class SecondMoment:
         self._packed: IntArray | None = None
         self._waiting: npt.NDArray[np.int32] | None = None
         self._count = 0
-        self._lent: list[weakref.ref[IntArray]] = []
 
     def add(self, codes: npt.NDArray[np.int32]) -> None:
         """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
@@ -78,39 +77,35 @@ class SecondMoment:
 
     def remove(self, codes: npt.NDArray[np.int32]) -> None:
         """Take rows out again that were added, shape (rows, d): as if they had never been."""
-        self._flush()
-        packed = self._own()
+        packed = self.packed().copy()
         for first in range(0, len(codes), BLOCK):
             _add_product(packed, codes[first : first + BLOCK], np.subtract)
-        self.rows -= len(codes)
+        self._packed, self.rows = packed, self.rows - len(codes)
 
     def _flush(self) -> None:
-        if self._packed is None:
-            self._packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
+        packed = self._packed
+        if packed is None:
+            packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
         if self._count:
             assert self._waiting is not None
-            _add_product(self._own(), self._waiting[: self._count], np.add)
-            self._count = 0
-
-    def _own(self) -> IntArray:
-        """The lower triangle, to be changed: another where one that was lent is still in use."""
-        assert self._packed is not None
-        if any(lent() is not None for lent in self._lent):
-            self._packed = self._packed.copy()
-        self._lent = []
-        return self._packed
-
-    def lend(self) -> IntArray:
-        """The lower triangle as `packed`, as it is now: it stays so, whatever comes, for as long as it is held."""
-        lent = self.packed().view()
-        self._lent = [*(before for before in self._lent if before() is not None), weakref.ref(lent)]
-        return lent
+            packed = packed.copy() if packed is self._packed else packed
+            _add_product(packed, self._waiting[: self._count], np.add)
+        self._packed, self._waiting, self._count = packed, None, 0
 
     def packed(self) -> IntArray:
-        """The lower triangle of A, row after row, shape (d·(d+1)/2,): the memory itself, not a copy."""
+        """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""
         self._flush()
         assert self._packed is not None
         return self._packed
+
+    def undo(self) -> Callable[[], None]:
+        """What takes the next `add` back, however much of it was done; it can be called again."""
+        state = self._packed, self._waiting, self._count, self.rows
+
+        def undo() -> None:
+            self._packed, self._waiting, self._count, self.rows = state
+
+        return undo
 
     @property
     def empty(self) -> bool:

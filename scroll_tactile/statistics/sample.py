@@ -125,6 +125,15 @@ class Sample(Generic[T]):
             _, _, last = self._last()
             del self._items[last, self._keys[last].pop()]
 
+    def undo(self) -> Callable[[], None]:
+        """What takes the next `add` back, however much of it was done; it can be called again."""
+        keys, items = {material: list(own) for material, own in self._keys.items()}, dict(self._items)
+
+        def undo() -> None:
+            self._keys, self._items = keys, items
+
+        return undo
+
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
         for material, key, item in items:

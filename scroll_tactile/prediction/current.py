@@ -74,8 +74,8 @@ class CurrentModel:
             # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
             with suppress(MemoryError, InputError, RuntimeError):
                 self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-                self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit)
                 self._since = []
+                self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit)
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
@@ -99,14 +99,13 @@ class CurrentModel:
         if ledger.version == self._version:
             return
         added = ledger.added if self._model is not None else None
-        if added is None:
-            self._behind, self._coming = None, None
-        else:
-            self._behind = _with(self._behind, added)
-            if self._coming is not None and _with(self._since, added) is None:
-                self._coming = None
+        # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
+        (behind, coming), (self._behind, self._coming) = (self._behind, self._coming), (None, None)
         self._version = ledger.version
         ledger.follow, ledger.added = True, []
+        if added is not None:
+            coming = coming if coming is not None and _with(self._since, added) is not None else None
+            self._behind, self._coming = _with(behind, added), coming
 
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""

@@ -11,7 +11,7 @@ from typing import Any, Literal, cast
 
 import numpy.typing as npt
 
-from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
+from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
@@ -67,32 +67,31 @@ class Ledger:
         self._saved = self._memory.saved
         self._closed = False
         self._whole = True
+        self._undo: Callable[[], None] | None = None
         self._batching = False
 
     @property
     def memory(self) -> Memory:
-        """The memory; read again from the store after a change that was cut short, by ctrl-C, say.
-
-        Raises ScrollTactileError where there is no store to read it from.
-        """
+        """The memory; after a change that was cut short, by ctrl-C, say, it is read again, or the change is undone."""
         if not self._whole:
-            if self.store is None:
-                raise ScrollTactileError(
-                    "an observation was interrupted while it was added, and a memory without a path cannot be read "
-                    "again: make a new one"
-                )
-            self._memory = self._load()
+            if self._undo is not None:
+                self._undo()
+            else:
+                self._memory = self._load()
             self._whole = True
             self._changed()
         return self._memory
 
     @contextmanager
-    def _mutation(self, revert: Callable[[], None] | None = None) -> Iterator[None]:
+    def _mutation(
+        self, revert: Callable[[], None] | None = None, undo: Callable[[], None] | None = None
+    ) -> Iterator[None]:
         """A change of the memory and its journal: where it is cut short, the memory is read again before its next use.
 
-        revert: undoes in the memory what the journal refused; None where only reading again can.
+        revert: undoes in the memory what the journal refused; None where only reading again can. undo: of a memory
+        without a path, which cannot be read again, takes back what was done of the change.
         """
-        self._whole = False
+        self._undo, self._whole = undo, False
         try:
             yield
         except StoreError:
@@ -148,7 +147,8 @@ class Ledger:
             self.require_open()
             # Before the journal has it: every row there must fit at the next opening.
             self.memory.statistics.require_room(codes)
-            with self._mutation(_nothing):
+            undo = self._memory.undo(material, stream.key, columns) if self.store is None else None
+            with self._mutation(_nothing, undo):
                 sequence = self._append(material, stream, columns, codes)
                 self._changed([(material, codes, 1)])
             self._snapshot_if_due()
@@ -178,7 +178,12 @@ class Ledger:
             memory = self.memory
             if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
                 return
-            with self._mutation(_nothing):
+            before = dict(memory.descriptions)
+
+            def undo() -> None:
+                memory.descriptions = before
+
+            with self._mutation(_nothing, undo if self.store is None else None):
                 if self.store is not None:
                     attributes = {"constituents": constituents}
                     memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -124,6 +125,20 @@ class Memory:
         if self.exemplars is not None and source is not None:
             self.exemplars.add(material, key, source)
         self.sequence = sequence
+
+    def undo(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
+        """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
+        chosen = [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
+        parts = [sample.undo() for sample in chosen if sample.wants(material, key)]
+        parts.append(self.statistics.undo(material, columns))
+        sequence = self.sequence
+
+        def undo() -> None:
+            for part in parts:
+                part()
+            self.sequence = sequence
+
+        return undo
 
     def replay(self, record: Record, store: Store) -> list[Added] | None:
         """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.

@@ -1,10 +1,14 @@
 """An observation that is cut off halfway, by ctrl-C say, is there as a whole or not at all."""
 
+import itertools
+import linecache
+import sys
+
 import pytest
+from touches import PAD, SMALL, SmallSample, stream
 
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.statistics.moments import SecondMoment
 
 SCENE = Scene(sensor=sensors.ROBOSKIN, seed=2)
@@ -54,14 +58,103 @@ def test_going_on_after_it_loses_nothing(tmp_path, cut_off):
         assert again.digest() == expected(TOUCHES)
 
 
-def test_without_a_path_it_is_refused_rather_than_wrong(cut_off):
-    learner = TactileLearner(sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64))
-    learner.observe(*TOUCHES[0])
-    cut_off()
-    with pytest.raises(KeyboardInterrupt):
-        learner.observe(*TOUCHES[1])
-    with pytest.raises(ScrollTactileError, match="interrupted"):
-        learner.digest()
+def interrupted(call, at):
+    """Whether a KeyboardInterrupt in the `at`-th line of scroll_tactile that `call` runs through cut it short.
+
+    Not where a block ends: Python looks for signals at calls and jumps, and not between a block and its exit.
+    """
+    lines = itertools.count()
+
+    def line(frame, event, _):
+        ends = linecache.getline(frame.f_code.co_filename, frame.f_lineno).lstrip().startswith("with ")
+        if event == "line" and not ends and next(lines) == at:
+            raise KeyboardInterrupt
+        return line
+
+    def called(frame, event, _):
+        return line if "/scroll_tactile/" in frame.f_code.co_filename else None
+
+    before = sys.gettrace()
+    sys.settrace(called)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+def state(learner):
+    """All that a memory without a path holds, to the byte."""
+    memory, kept = learner.memory, learner.memory.kept
+    pool = [(name, key, touch.rows.tobytes()) for name, key, touch in memory.sample]
+    recalled = [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
+    return learner.digest(), learner.materials, learner.exemplars, pool, recalled, learner.descriptions, memory.sequence
+
+
+def without_a_path(touches):
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=2, recall=4)
+    learner.memory.sample = SmallSample(4)
+    for touch in touches:
+        learner.observe(*touch)
+    return learner
+
+
+class TestWithoutAPath:
+    """An interrupt at any line leaves it before or after the change, and what comes then is as if it never was."""
+
+    @pytest.mark.parametrize("count", [0, 8, 9, 26])  # nothing, a new material, and blocks of rows that are full
+    def test_observing(self, monkeypatch, count):
+        monkeypatch.setattr("scroll_tactile.statistics.moments.BLOCK", 64)
+        names = [*"abcdefgh", "i"]
+        touches = [(names[min(i, 8)], stream((i, 30))) for i in range(28)]
+        before, after = (state(without_a_path(touches[: count + more])) for more in (0, 1))
+        whole = without_a_path([*touches[:count], touches[count], touches[27]])
+        end, answer = state(whole), (whole.settle(), whole.predict(stream((99, 30))))[1]
+        at, cut = 0, True
+        while cut:
+            learner = without_a_path(touches[:count])
+            if count > 8:
+                learner.predict(stream((98, 30)))
+            cut = interrupted(lambda made=learner: made.observe(*touches[count]), at)
+            found = state(learner)
+            assert found in (before, after), at
+            if found == before:
+                learner.observe(*touches[count])
+            learner.observe(*touches[27])
+            assert state(learner) == end, at
+            followed = dict(learner.predict(stream((99, 30))).ranking)
+            assert followed == pytest.approx(dict(answer.ranking), abs=0.2), at
+            learner.settle()
+            assert learner.predict(stream((99, 30))) == answer, at
+            at += 1 + at // 4
+        assert at > 60
+
+    def test_describing(self):
+        at, cut = 0, True
+        while cut:
+            learner = without_a_path([("a", stream((0, 30)))])
+            learner.describe("a", {"wool": 1.0})
+            before = state(learner)
+            cut = interrupted(lambda made=learner: made.describe("a", {"silk": 1.0}), at)
+            assert learner.descriptions in ({"a": {"wool": 1.0}}, {"a": {"silk": 1.0}})
+            learner.describe("a", {"wool": 1.0})
+            assert state(learner) == before
+            at += 1
+        assert at > 10
+
+    def test_summing_what_waits(self):
+        """Whoever only reads sums up the rows that wait: cut short there, nothing is counted twice."""
+        touches = [(name, stream((i, 30))) for i, name in enumerate("abcabcabc")]
+        digest = without_a_path(touches).digest()
+        at, cut = 0, True
+        while cut:
+            learner = without_a_path(touches)
+            cut = interrupted(learner.digest, at)
+            assert learner.digest() == digest, at
+            at += 1 + at // 6
+        assert at > 50
 
 
 def test_closing_after_it_saves_no_half(tmp_path, cut_off):

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import DescriptionError, InputError
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import open_store
@@ -36,7 +37,7 @@ from scroll_tactile.prediction.recalling import judged
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import Settings, candidates_of, require_name
+from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_text
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
@@ -83,6 +84,7 @@ class TactileLearner:
         augmentation: Augmented | None = None,
         **settings: Any,
     ) -> None:
+        require_arguments({"sensor": sensor}, {"embedding": embedding, "augmentation": augmentation})
         require_augmentable(sensor, augmentation)
         chosen = usual_embedding(sensor) if embedding is None else embedding
         given = Settings(**settings)
@@ -136,6 +138,8 @@ class TactileLearner:
         only earlier versions have, or with a user's own embedding that is not passed; InputError where a new memory is
         given no sensor; StoreError (locked, damaged, not a store, a newer version …).
         """
+        made_with = {"sensor": sensor, "embedding": embedding, "augmentation": augmentation}
+        require_arguments({"path": path, "mode": mode}, made_with)
         chosen = Settings(**settings)
         finish_interrupted(Path(path))
         if sensor is None and not Path(path).exists():
@@ -305,6 +309,7 @@ class TactileLearner:
         Raises UnknownMaterialError for a material never observed, and ObservationError (nothing was changed) where some
         of them were compacted; InputError in a memory without a path; StoreError.
         """
+        require_text(material)
         return self._ledger.forget(material)
 
     def merge(
@@ -325,11 +330,8 @@ class TactileLearner:
         they must agree; ObservationError where a shared stream was compacted and cannot be left out; CapacityError,
         InputError, StoreError. Nothing was changed then.
         """
-        if shared not in ("once", "twice"):
-            raise InputError(f"expected shared as 'once' or 'twice'; came {shared!r}")
-        if descriptions not in ("same", "ours", "theirs"):
-            raise InputError(f"expected descriptions as 'same', 'ours' or 'theirs'; came {descriptions!r}")
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
+        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
         return self._ledger.merge(path, shared, descriptions, progress or _silent)
 
     def backup(
@@ -340,6 +342,7 @@ class TactileLearner:
         Raises InputError in a memory without a path; StoreError where something is there already, or it cannot be
         written or verified.
         """
+        require_arguments({"destination": destination}, {"progress": progress})
         self._ledger.require_store("be copied").backup(destination, progress=progress)
 
     def compact(self, *, keep: int = 0) -> Compacted:
@@ -368,6 +371,7 @@ class TactileLearner:
         Raises MismatchError where readings are missing, as in a compacted memory; InputError in a memory without a
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.
         """
+        require_arguments({}, {"embedding": embedding, "progress": progress})
         store = self._ledger.require_store("be embedded again")
         self._ledger.require_writing()
         chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
@@ -402,13 +406,14 @@ class TactileLearner:
         Raises StreamError, UnknownMaterialError for a scene that names a material never observed, InputError for an
         empty one. Before anything was observed the answer is material None, known False.
         """
+        wanted = names_of("scene", scene)
         touch = self._extractor.stream(stream)
 
         def evaluate() -> tuple[int, Callable[[], Prediction]]:
             with self._ledger.lock:
                 model = self._current.present(self._ledger)
                 version, reader = self._ledger.version, self._reader() if tuned else None
-                candidates = candidates_of(scene, model.names, model.known)
+                candidates = candidates_of(wanted, model.names, model.known)
             if not candidates:
                 return version, lambda: Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
             encoded = self._extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
@@ -447,13 +452,13 @@ class TactileLearner:
         Raises StreamError; DescriptionError where nothing was described, or for a constituent that no description
         names; InputError for an unfamiliar that is no probability.
         """
-        if not 0 <= unfamiliar <= 1:
-            raise InputError(f"expected unfamiliar as a probability from 0 to 1; came {unfamiliar!r}")
+        require_arguments({"unfamiliar": unfamiliar})
+        named = names_of("constituents", constituents, DescriptionError)
         touch = self._extractor.stream(stream)
 
         def evaluate() -> tuple[int, Callable[[], Composition]]:
             with self._ledger.lock:
-                wanted = require_constituents(self._ledger.memory.descriptions, constituents)
+                wanted = require_constituents(self._ledger.memory.descriptions, named)
                 model, version = self._current.present(self._ledger), self._ledger.version
                 if not model.names:
                     nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
@@ -577,6 +582,7 @@ class TactileLearner:
         """
         from scroll_tactile.finetune.fine_tune import fine_tune
 
+        require_arguments({}, {"progress": progress})
         self._verified()
         with self._ledger.lock:
             self._ledger.require_writing()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialError
 
-__all__ = ["LONGEST_NAME", "FrozenModel", "Settings", "candidates_of", "require_name"]
+__all__ = ["LONGEST_NAME", "FrozenModel", "Settings", "candidates_of", "names_of", "require_name", "require_text"]
 
 LONGEST_NAME = 200  # characters
 
@@ -60,13 +60,30 @@ def _described(error: ValidationError, model: type[BaseModel]) -> str:
 
 def require_name(material: str) -> str:
     """The name of a material, of no subclass of str such as numpy's; raises MaterialError for what cannot be one."""
-    if not isinstance(material, str):
-        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
+    require_text(material)
     if not material or len(material) > LONGEST_NAME:
         raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
     if not material.isprintable():
         raise MaterialError(f"expected a name of printable characters; came {material!r}")
     return str(material)
+
+
+def require_text(material: str) -> None:
+    """Raise MaterialError for a name that is no string; one that came from elsewhere may be any."""
+    if not isinstance(material, str):
+        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
+
+
+def names_of(what: str, names: Iterable[str] | None, wrong: type[InputError] = InputError) -> list[str] | None:
+    """The names in a sequence or an iterator, None where it is None; `what` and `wrong` say how others are refused."""
+    if names is None:
+        return None
+    advice = f". Use [{names!r:.60}]" if isinstance(names, str) else ""
+    found = [None] if isinstance(names, str | bytes) or not isinstance(names, Iterable) else list(names)
+    if not all(isinstance(name, str) for name in found):
+        came = f"{type(names).__name__} {names!r:.60}"
+        raise wrong(f"expected {what} as a sequence of names; came {came}{advice}")
+    return cast("list[str]", found)
 
 
 def candidates_of(scene: Sequence[str] | None, names: list[str], known: AbstractSet[str]) -> list[str]:
@@ -78,8 +95,6 @@ def candidates_of(scene: Sequence[str] | None, names: list[str], known: Abstract
     """
     if scene is None:
         return names
-    if isinstance(scene, str):
-        raise InputError(f"expected a scene as a sequence of names; came the string {scene!r}. Use [{scene!r}]")
     wanted = list(dict.fromkeys(scene))
     if not wanted:
         raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")

@@ -83,8 +83,8 @@ class Stream:
         Raises InputError if seconds is not a number, StreamTooShortError if it asks for less than two readings (or one
         frame of a camera), NotFiniteError if all values until then are missing.
         """
-        if math.isnan(seconds):
-            raise InputError("first() needs a number of seconds; came NaN")
+        if not isinstance(seconds, numbers.Real) or math.isnan(seconds):
+            raise InputError(f"first() needs a number of seconds; came {seconds!r:.60}")
         # min() first: infinity and 1e300 s have no number of readings.
         count = round(min(max(seconds, 0.0), self.seconds) * self.sensor.rate)
         _require_length(count, self.sensor)
@@ -211,13 +211,25 @@ def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:
     if torch is not None and isinstance(readings, torch.Tensor):
         return _from_torch(readings)
     if isinstance(readings, numbers.Number | memoryview) or hasattr(readings, "__array__"):
-        return np.asarray(readings)
+        return _converted(readings, what, sensor)
     if isinstance(readings, str | bytes | bytearray | Mapping | Set) or not isinstance(readings, Iterable):
         raise ReadingsTypeError(
             f"expected {what} of sensor {sensor.name!r} as numbers in an array, tensor, list or iterable; "
             f"came {_article(type(readings).__name__)}"
         )
     return _stack(list(readings), sensor)
+
+
+def _converted(readings: Any, what: str, sensor: Sensor) -> _Array:
+    try:
+        return np.asarray(readings)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever the object's own code raises
+        raise ReadingsTypeError(
+            f"expected {what} of sensor {sensor.name!r} as numbers; {_article(type(readings).__name__)} cannot be made "
+            f"into an array: {error!r:.100}"
+        ) from error
 
 
 def _from_torch(tensor: "torch.Tensor") -> _Array:

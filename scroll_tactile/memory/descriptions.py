@@ -89,8 +89,6 @@ def require_constituents(descriptions: Mapping[str, Description], wanted: Collec
         raise DescriptionError("nothing was described yet: say with describe() what some material is made of")
     if wanted is None:
         return sorted(known)
-    if isinstance(wanted, str):
-        raise DescriptionError(f"expected constituents as a sequence of names; came the string {wanted!r}")
     missing = sorted(set(wanted) - known)
     if missing or not wanted:
         raise DescriptionError(f"expected constituents out of {sorted(known)}; came {missing or 'none'}")

@@ -29,8 +29,24 @@ A message says what was expected, what came, where, and what to do about it; it 
 """
 
 
+def printable(text: str, keep: str = "") -> str:
+    """Text with what does not print as Python's escapes: control characters, line ends, marks of direction, surrogates.
+
+    Names and paths come from elsewhere, and must not drive the terminal that shows them. keep: what stays all the same.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        character if character.isprintable() or character in keep else character.encode("unicode_escape").decode()
+        for character in text
+    )
+
+
 class ScrollTactileError(Exception):
     """Every error that scroll-tactile raises on purpose; catch it to catch them all."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), keep="\n")
 
 
 class InputError(ScrollTactileError, ValueError):
@@ -78,14 +94,13 @@ class UnknownMaterialError(InputError, KeyError):
 
     def __str__(self) -> str:
         # KeyError would show the message as a quoted repr.
-        return Exception.__str__(self)
+        return printable(Exception.__str__(self), keep="\n")
 
 
 class ObservationError(InputError, KeyError):
     """An observation is not in the memory, was retracted already, or was compacted and can be retracted no more."""
 
-    def __str__(self) -> str:
-        return Exception.__str__(self)
+    __str__ = UnknownMaterialError.__str__
 
 
 class MismatchError(ScrollTactileError):

@@ -1,5 +1,5 @@
 """`python -m scroll_tactile.cli`."""
 
-from scroll_tactile.cli import app
+from scroll_tactile.cli import main
 
-app(prog_name="scroll-tactile")
+main()

@@ -1,4 +1,4 @@
-"""The command line: `scroll-tactile`, or `python -m scroll_tactile.cli`."""
+"""The commands, put together."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.terminal import confusion_text, console, percent, say, verdict
+from scroll_tactile.cli.terminal import confusion_text, console, percent, say, shown, verdict
 
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.demo import Demo, Outcome
@@ -51,8 +51,8 @@ def demo(
         folder=memory,
     )
     say(
-        f"[bold]Simulated[/] {task.sensor.name} touches, seed {seed}: the names are only names, and nothing here is a "
-        f"result.\nEach material is learned from {touches} touches and tested on {held_out} others, "
+        f"[bold]Simulated[/] {shown(task.sensor.name)} touches, seed {seed}: the names are only names, and nothing "
+        f"here is a result.\nEach material is learned from {touches} touches and tested on {held_out} others, "
         f"with {features} features."
     )
     table = Table("#", "learned", "its own touches", "all materials so far", title="accuracy on touches never observed")
@@ -82,7 +82,7 @@ def _report(task: Demo, outcome: Outcome) -> None:
     say(f"  of 0.3 s of every material it names {percent(outcome.short.accuracy)} right")
     say(f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}")
     if task.folder is not None:
-        say(f"kept: try  scroll-tactile inspect {task.folder / 'memory'}")
+        say(f"kept: try  scroll-tactile inspect {shown(task.folder / 'memory')}")
 
 
 def _show_confusions(task: Demo, outcome: Outcome) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
-from scroll_tactile.cli.terminal import console, opened, opened_for_upkeep, percent, say, verdict
+from scroll_tactile.cli.terminal import console, opened, opened_for_upkeep, percent, say, say_json, shown, verdict
+from scroll_tactile.settings import require_name
 
 __all__ = ["inspect", "observe", "predict"]
 
@@ -33,15 +32,18 @@ def observe(
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
-    from scroll_tactile.recordings.arrays import read_sensor, read_stream
+    from scroll_tactile.recordings.arrays import read_sensor, read_stream, require_readable
 
-    readings = read_stream(file)  # before a memory is made for a file that cannot be read
+    require_name(material)
+    readings = read_stream(file)
     chosen = None if sensor is None else read_sensor(sensor)
+    if chosen is not None and not memory.exists():
+        require_readable(readings, chosen)  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         receipt = learner.observe(material, readings)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
-    say(f"{escape(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 
@@ -70,11 +72,11 @@ def predict(
             "seconds": prediction.seconds,
             "ranking": prediction.ranking,
         }
-        typer.echo(json.dumps(answer, ensure_ascii=False))
+        say_json(answer)
         return
     say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
     for name, probability in prediction.ranking[:5]:
-        say(f"  {percent(probability):>8}  {escape(name)}")
+        say(f"  {percent(probability):>8}  {shown(name)}")
 
 
 def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
@@ -97,17 +99,17 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
             "digest": digest,
             "bytes": size,
         }
-        typer.echo(json.dumps(found, ensure_ascii=False))
+        say_json(found)
         return
     table = Table("material", "observations")
     for name, count in materials.items():
-        table.add_row(escape(name), str(count))
+        table.add_row(shown(name), str(count))
     console().print(table)
     say(f"[bold]observations:[/] {sum(materials.values())} of {len(materials)} materials")
     say(f"[bold]kept for recall:[/] {kept} touches")
-    say(f"[bold]sensor:[/] {escape(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
+    say(f"[bold]sensor:[/] {shown(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
     say(
-        f"[bold]embedding:[/] {escape(embedding.name)}, {embedding.dimension} features, "
+        f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, "
         f"fingerprint {embedding.fingerprint[:12]}"
     )
     say(f"[bold]digest:[/] {digest}")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from scroll_tactile.cli.everyday import MemoryFolder, StreamFile
-from scroll_tactile.cli.terminal import console, opened, percent, say
+from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown
 from scroll_tactile.errors import DescriptionError
 
 __all__ = ["compose", "describe"]
@@ -38,8 +36,8 @@ def describe(
     with opened(memory) as learner:
         learner.describe(material, shares or None)
         count = learner.materials.get(material, 0)
-    now = "its description is removed" if not shares else f"made of {', '.join(map(escape, shares))}"
-    say(f"{escape(material)}: {now}; observed {count} time{'s' * (count != 1)}")
+    now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
+    say(f"{shown(material)}: {now}; observed {count} time{'s' * (count != 1)}")
 
 
 def _constituent(text: str) -> tuple[str, float | bool | None]:
@@ -77,14 +75,14 @@ def compose(
             for constituent in made_of.constituents
         ]
         answer = {"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material}
-        typer.echo(json.dumps(answer, ensure_ascii=False))
+        say_json(answer)
         return
     table = Table("constituent", "there with", "share", "feels most like")
     for constituent in made_of.constituents:
-        there = escape(constituent.unlearned) if constituent.presence is None else percent(constituent.presence)
+        there = shown(constituent.unlearned) if constituent.presence is None else percent(constituent.presence)
         share = "" if constituent.share is None else percent(constituent.share)
         table.add_row(
-            escape(constituent.name), there, share, escape(constituent.evidence[0][0]) if constituent.evidence else ""
+            shown(constituent.name), there, share, shown(constituent.evidence[0][0]) if constituent.evidence else ""
         )
     console().print(table)
     say(f"a material never observed: {percent(made_of.unfamiliar)}")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,7 +16,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from typer.core import TyperGroup
 
-from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.cli import INTERRUPTED
+from scroll_tactile.errors import InputError, ScrollTactileError, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
 
@@ -32,10 +34,10 @@ __all__ = [
     "percent",
     "progress_bar",
     "say",
+    "say_json",
+    "shown",
     "verdict",
 ]
-
-INTERRUPTED = 130  # what a shell reports for a command ended by ctrl-C: 128 + SIGINT
 
 
 def console(*, error: bool = False) -> Console:
@@ -48,25 +50,39 @@ def say(text: str) -> None:
     console().print(text)
 
 
+def say_json(found: Mapping[str, Any]) -> None:
+    """Print JSON in ASCII, whatever the names in it."""
+    typer.echo(json.dumps(found).replace("\x7f", "\\u007f"))
+
+
+def shown(text: object) -> str:
+    """A name, a path or a message in rich's markup, with what does not print escaped."""
+    return escape(printable(str(text)))
+
+
 class Commands(TyperGroup):
-    """Commands that end with one red line and exit code 1 on an expected error, and with 130 on ctrl-C."""
+    """Commands that end with one red line and exit code 1 on an expected error, and with 130 on ctrl-C.
+
+    Errors of the system are expected: files that cannot be read, a device that is full.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
         try:
             return super().invoke(ctx)
-        except (ScrollTactileError, StoreError) as error:
-            text = " ".join(str(error).split())
-            notes = " ".join(getattr(error, "__notes__", []))
-            Console(stderr=True, highlight=False, soft_wrap=True).print(
-                f"[bold red]Error:[/] [red]{escape(text)}{escape(' ' + notes) if notes else ''}[/]"
-            )
+        except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
+            if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
+                text = " ".join([*(str(error) or "no memory is left").split(), *getattr(error, "__notes__", [])])
+                _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
             raise typer.Exit(1) from error
         except KeyboardInterrupt:
-            Console(stderr=True, highlight=False, soft_wrap=True).print(
-                "[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on."
-            )
+            _warn("[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on.")
             raise typer.Exit(INTERRUPTED) from None
+
+
+def _warn(text: str) -> None:
+    with suppress(OSError):  # there is nobody to tell
+        Console(stderr=True, highlight=False, soft_wrap=True).print(text)
 
 
 def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "read"] = "write") -> TactileLearner:
@@ -101,7 +117,7 @@ def verdict(prediction: Prediction) -> str:
     """A prediction in words."""
     if prediction.material is None:
         return "never felt anything yet"
-    name = escape(prediction.material)
+    name = shown(prediction.material)
     if prediction.known:
         return f"[bold green]{name}[/] with {percent(prediction.probability)} (novelty {prediction.novelty:.1f})"
     return f"[bold yellow]never felt this[/]; nearest is {name} (novelty {prediction.novelty:.1f})"
@@ -111,7 +127,8 @@ def verdict(prediction: Prediction) -> str:
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console(error=True), transient=True) as progress:
+    screen = console(error=True)
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("starting", total=None)
         yield lambda what, done, of: progress.update(task, description=what, completed=done, total=of)
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from scroll_tactile.cli.everyday import MemoryFolder
-from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say
+from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say, say_json, shown
 from scroll_tactile.errors import ScrollTactileError
 from store import Store, StoreError, repair_store
 
@@ -46,7 +44,7 @@ def reembed(
         chosen = usual_embedding(Identity.read(store).sensor) if default else None
     with progress_bar() as progress:
         before = reembed_memory(folder, chosen, progress=progress)
-    say(f"the memory before is in {escape(str(before))}: remove it once the new one is as you want it")
+    say(f"the memory before is in {shown(before)}: remove it once the new one is as you want it")
 
 
 @memory.command()
@@ -62,16 +60,16 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
     damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
         found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]
-        typer.echo(json.dumps({"sound": not damaged, "problems": found}, ensure_ascii=False))
+        say_json({"sound": not damaged, "problems": found})
     else:
         for problem in problems:
             colour = {"lost": "red", "spare": "yellow"}.get(problem.kind, "dim")
-            say(f"[{colour}]{problem.kind}:[/] {escape(problem.what)}")
+            say(f"[{colour}]{problem.kind}:[/] {shown(problem.what)}")
         say("[green]sound:[/] every checksum holds" if not damaged else f"[red]{len(damaged)} damaged[/]")
         if damaged:
             say(
                 "it is not to be used as it is. To trust it again, put back a copy from before; or copy the folder, "
-                f"then: scroll-tactile memory repair {escape(str(folder))} (it keeps the rows up to the first that is "
+                f"then: scroll-tactile memory repair {shown(folder)} (it keeps the rows up to the first that is "
                 "lost, and names the others), and check it again"
             )
         else:
@@ -92,9 +90,9 @@ def repair(folder: MemoryFolder) -> None:
     with progress_bar() as progress:
         done = repair_store(folder, progress=progress)
     for what in done.lost:
-        say(f"[yellow]lost:[/] {escape(what)}")
+        say(f"[yellow]lost:[/] {shown(what)}")
     if done.aside is not None:
-        say(f"the damaged journal was put aside: {escape(str(done.aside))}")
+        say(f"the damaged journal was put aside: {shown(done.aside)}")
     whole = done.aside is None and not done.lost
     say(f"nothing was damaged; rows 1 to {done.kept} verify" if whole else f"kept up to row {done.kept}")
 
@@ -125,7 +123,7 @@ def backup(
     with Store.open(folder, mode="read") as store, progress_bar() as progress:
         store.backup(target, progress=progress)
     with Store.open(target, mode="read") as copy:
-        say(f"written: {escape(str(target))}, with rows 1 to {copy.last}; every checksum holds")
+        say(f"written: {shown(target)}, with rows 1 to {copy.last}; every checksum holds")
 
 
 @memory.command()
@@ -138,7 +136,7 @@ def export(
 
     with opened_for_upkeep(folder, mode="read") as learner, progress_bar() as progress:
         export_plain(learner, target, progress)
-    say(f"written: {escape(str(target))}")
+    say(f"written: {shown(target)}")
 
 
 @memory.command()
@@ -162,7 +160,7 @@ def forget(
     with opened_for_upkeep(folder) as learner:
         count = learner.forget(material)
         left = len(learner.materials)
-    say(f"{escape(material)}: {count} observations were retracted; {left} materials are left")
+    say(f"{shown(material)}: {count} observations were retracted; {left} materials are left")
 
 
 @memory.command()

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor, known
 
-__all__ = ["read_sensor", "read_stream"]
+__all__ = ["read_sensor", "read_stream", "require_readable"]
 
 
 def read_stream(path: Path) -> npt.NDArray[Any]:
@@ -77,6 +77,13 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def require_readable(readings: npt.NDArray[Any], sensor: Sensor) -> None:
+    """Raise StreamError for readings that a new memory of the sensor would refuse."""
+    from scroll_tactile.learner import TactileLearner
+
+    TactileLearner(sensor=sensor).predict(readings)  # without anything observed it embeds nothing
 
 
 def read_sensor(text: str) -> Sensor:

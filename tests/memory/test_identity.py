@@ -103,7 +103,7 @@ def test_a_network_says_what_is_missing(tmp_path):
 def test_inspecting_embeds_nothing_and_imports_no_torch(tmp_path):
     filled(tmp_path / "m").close()
     code = (
-        "import sys; from scroll_tactile.cli import app\n"
+        "import sys; from scroll_tactile.cli.application import app\n"
         "try: app(['inspect', sys.argv[1], '--json'])\n"
         "except SystemExit: pass\n"
         "print('torch' in sys.modules)"

@@ -129,7 +129,7 @@ class Memory:
     def undo(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
         """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
         chosen = [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
-        parts = [sample.undo() for sample in chosen if sample.wants(material, key)]
+        parts = [sample.undo(material, key) for sample in chosen if sample.wants(material, key)]
         parts.append(self.statistics.undo(material, columns))
         sequence = self.sequence
 

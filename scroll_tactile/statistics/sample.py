@@ -125,12 +125,17 @@ class Sample(Generic[T]):
             _, _, last = self._last()
             del self._items[last, self._keys[last].pop()]
 
-    def undo(self) -> Callable[[], None]:
-        """What takes the next `add` back, however much of it was done; it can be called again."""
-        keys, items = {material: list(own) for material, own in self._keys.items()}, dict(self._items)
+    def undo(self, material: str, key: bytes) -> Callable[[], None]:
+        """What takes the next `add` back, of an item that is wanted, however much was done; it can be repeated."""
+        touched = {material, self._last()[2]} if len(self) >= self.capacity else {material}
+        keys = {name: list(self._keys.get(name, [])) for name in touched}
+        # What falls out is the last of its material.
+        items = {(name, own[-1]): self._items[name, own[-1]] for name, own in keys.items() if own}
 
         def undo() -> None:
-            self._keys, self._items = keys, items
+            self._items.pop((material, key), None)
+            self._items.update(items)
+            self._keys.update(keys)
 
         return undo
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import warnings
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -24,6 +25,8 @@ def main() -> NoReturn:
     if ours:
         signal.signal(signal.SIGINT, _interrupt)
     sys.unraisablehook = _unraisable
+    # zarr's, of a call that ctrl-C cut short before it began.
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     _require_streams()
     code = 1
     try:

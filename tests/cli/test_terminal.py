@@ -163,6 +163,21 @@ def test_an_interrupt_during_imports(path, tmp_path, name):
     assert (running.returncode, errors) == (130, "Interrupted.\n")
 
 
+CUT_SHORT = """
+import zarr.core.sync
+def cut():
+    raise KeyboardInterrupt
+zarr.core.sync._get_loop = cut
+"""
+
+
+def test_an_interrupt_while_a_generation_is_read(path):
+    _, errors = begun(CUT_SHORT, "inspect", path).communicate(timeout=60)
+    assert errors.splitlines() == [
+        "Interrupted. What was observed is kept where there is a memory; start again to go on."
+    ]
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7, 0.9])
 def test_an_interrupt_at_any_time(path, tmp_path, share):
     whole = time.monotonic()

@@ -10,13 +10,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Literal, cast
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.errors import MismatchError, ScrollTactileError
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.expected import Unexpected
 from scroll_tactile.memory.generation_checks import GenerationChecks
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
@@ -25,7 +24,7 @@ from scroll_tactile.memory.rows import KINDS, MEMBER, MERGE, OBSERVE, RETRACT, u
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import WindowPlan
-from store import DamageError, Generation, Head, NotAStoreError, Record, Store, StoreError
+from store import DamageError, Generation, Head, NotAStoreError, Record, Store
 
 __all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted"]
 
@@ -50,40 +49,42 @@ class Gate:
 
     def head(self, head: Head) -> Head:
         """This row, which is what its kind must be but for its arrays. Raises DamageError."""
-        with self._named(f"row {head.sequence}", head.sequence):
-            self._rows.check_head(head, self._most_rows())
+        try:
+            self._rows.check_head(head, self._most_rows)
+        except WRONG as error:
+            raise self._damage(f"row {head.sequence}", error, head.sequence) from error
         return head
 
     def record(self, record: Record) -> Record:
         """This row with its arrays. Raises DamageError; MismatchError for what this version does not know."""
         self.head(record)
-        with self._named(f"row {record.sequence}", record.sequence):
+        try:
             if record.kind == OBSERVE:
                 self._rows.check_observed(record)
             elif record.kind == MERGE:
                 self._generations.check(record.arrays, record.attributes, None, thorough=self._thorough)
+        except WRONG as error:
+            raise self._damage(f"row {record.sequence}", error, record.sequence) from error
         return record
 
     def generation(self, generation: Generation) -> Generation:
         """This generation. Raises DamageError."""
-        with self._named(f"generation {generation.number}"):
-            self._generations.check(generation.arrays, generation.attributes, generation.upto, thorough=self._thorough)
+        try:
+            arrays, attributes, upto = generation.arrays, generation.attributes, generation.upto
+            self._generations.check(arrays, attributes, upto, thorough=self._thorough)
+        except WRONG as error:
+            raise self._damage(f"generation {generation.number}", error) from error
         return generation
 
-    @contextmanager
-    def _named(self, what: str, sequence: int | None = None) -> Iterator[None]:
-        try:
-            yield
-        except (ScrollTactileError, StoreError):
-            raise
-        except WRONG as error:  # Unexpected, and as a last net what a check did not expect
-            came = str(error) if isinstance(error, Unexpected) else f"{type(error).__name__}: {error!s:.200}"
-            raise DamageError(
-                f"{what} of {self._path} is not what is written there: {came}. It is damaged, or was made by another "
-                "program: use none of this memory before you know who made it (scroll-tactile memory check)",
-                path=self._path,
-                sequence=sequence,
-            ) from error
+    def _damage(self, what: str, error: Exception, sequence: int | None = None) -> DamageError:
+        """The error for what is Unexpected and, as a last net, for what a check itself did not expect."""
+        came = str(error) if isinstance(error, Unexpected) else f"{type(error).__name__}: {error!s:.200}"
+        return DamageError(
+            f"{what} of {self._path} is not what is written there: {came}. It is damaged, or was made by another "
+            "program: use none of this memory before you know who made it (scroll-tactile memory check)",
+            path=self._path,
+            sequence=sequence,
+        )
 
     def _most_rows(self) -> int:
         """How many rows the journal can hold, by its size."""

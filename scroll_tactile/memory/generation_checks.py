@@ -24,7 +24,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import fewest_readings
 from scroll_tactile.signals.windows import VIEWS, Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.moments import MOST_ROWS, within_scatter
+from scroll_tactile.statistics.moments import MOST_ROWS, one_thread, within_scatter
 
 __all__ = ["GenerationChecks"]
 
@@ -126,9 +126,10 @@ class GenerationChecks:
         sound = bool((diagonal + 1e-9 * diagonal.max(initial=0) + 1 >= between).all())
         if sound and thorough and known.any():
             scatter = within_scatter(packed, rows[known], sums[known])
-            jitter = JITTER * float(np.trace(scatter)) / self._dimension + 1
+            scatter[np.diag_indices(self._dimension)] += JITTER * float(np.trace(scatter)) / self._dimension + 1
             try:
-                np.linalg.cholesky(scatter + jitter * np.eye(self._dimension))
+                with one_thread():
+                    np.linalg.cholesky(scatter)
             except np.linalg.LinAlgError:
                 sound = False
         expect(sound, field, "a second moment of rows with these sums", "one that no rows have")

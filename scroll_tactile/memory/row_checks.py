@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, cast
 
@@ -53,8 +53,8 @@ class RowChecks:
         self._sensor, self._dimension, self._plan, self._copies = sensor, dimension, plan, copies
         self._expected = lru_cache(256)(self._rows_of)
 
-    def check_head(self, head: Head, most_rows: int) -> None:
-        """Check a row without its arrays; most_rows: that the journal can hold."""
+    def check_head(self, head: Head, most_rows: Callable[[], int]) -> None:
+        """Check a row without its arrays; most_rows: gives how many the journal can hold."""
         expect(isinstance(head.time, float), "time", "a number", head.time)
         if head.kind in (OBSERVE, MEMBER):
             name("label", head.label)
@@ -64,7 +64,7 @@ class RowChecks:
         elif head.kind == RETRACT:
             if head.label:
                 name("label", head.label)
-            _check_spans(head.attributes.get("sequences"), head.sequence, most_rows)
+            _check_spans(head.attributes.get("sequences"), head.sequence, most_rows())
         elif head.kind == DESCRIBE:
             name("label", head.label)
             expect("constituents" in head.attributes, "constituents", "a description", None)

@@ -82,13 +82,12 @@ class ArrayFiles:
 
     def _fill_all(self, plain: np.ndarray, data: bytes) -> None:
         """Fill an array from its only shard, whose chunks are in the order of the grid, their index at the end."""
-        places = list(self._content.places(self._chunk))
-        index = len(data) - CHECKSUM - SHARD_INDEX.itemsize * len(places)
-        if index < 0:
-            raise ValueError("a shard ends in its index")
-        for place, (start, size) in zip(
-            places, np.frombuffer(data[index:-CHECKSUM], SHARD_INDEX).tolist(), strict=True
-        ):
+        count = prod(self._content.grid(self._chunk))
+        index = len(data) - CHECKSUM - SHARD_INDEX.itemsize * count
+        if index < 0 or count > MOST_CHUNKS:
+            raise ValueError(f"a shard of {len(data)} bytes claims {count} chunks")
+        chunks = np.frombuffer(data[index:-CHECKSUM], SHARD_INDEX).tolist()
+        for place, (start, size) in zip(self._content.places(self._chunk), chunks, strict=True):
             if start == size == NOTHING:
                 plain[self._region(place)] = 0
                 continue

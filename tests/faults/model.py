@@ -47,7 +47,7 @@ def warm() -> None:
     learner.predict(stream((9, 90)))
     import filelock  # noqa: F401  # what the store imports late
     import zarr  # noqa: F401
-    from numcodecs import blosc  # noqa: F401
+    from numcodecs import zstd  # noqa: F401
 
 
 # Fewer kept touches than are observed, so that what was left out of them has to come back.

@@ -14,7 +14,9 @@
     │   ├── MaterialError                    a material's name is not usable
     │   ├── DescriptionError                 what a material is said to be made of cannot be
     │   ├── UnknownMaterialError (KeyError)  a material that was never observed is asked for
-    │   └── ObservationError (KeyError)      an observation that is not there, or can no longer be retracted
+    │   ├── ObservationError (KeyError)      an observation that is not there, or can no longer be retracted
+    │   └── RecordingError                   a file of readings is damaged, empty or of no known format
+    │       └── FieldError                   it has no such topic or field: choose one that it has
     ├── MismatchError                        two things that do not belong together: open the right one
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
@@ -101,6 +103,14 @@ class ObservationError(InputError, KeyError):
     """An observation is not in the memory, was retracted already, or was compacted and can be retracted no more."""
 
     __str__ = UnknownMaterialError.__str__
+
+
+class RecordingError(InputError):
+    """A file of readings is not there, damaged, empty, ragged, of no known format, or lacks the library to read it."""
+
+
+class FieldError(RecordingError):
+    """A recording has no such topic, field or column, or it holds no numbers; the message lists what there is."""
 
 
 class MismatchError(ScrollTactileError):

@@ -1,1 +1,32 @@
-"""Recordings: streams in files."""
+"""Recordings: files of robots, as readings with times and labels.
+
+recording = read("touch.mcap", topic="/rh/tactile", field="tactiles[0].electrodes")
+recording.readings, recording.times      # (T, n), (T,) seconds
+print(recording.report)                  # rate, jitter, gaps, lost and repeated readings, the clock
+print(describe("touch.mcap"))            # what there is to read
+"""
+
+from scroll_tactile.recordings.blocks import Contents, Entry
+from scroll_tactile.recordings.presets import PRESETS, Preset
+from scroll_tactile.recordings.reader import describe, iterate, read
+from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, resampled
+from scroll_tactile.recordings.touches import Interval, Touch, read_intervals, touches
+
+__all__ = [
+    "PRESETS",
+    "Contents",
+    "Entry",
+    "Episode",
+    "Gap",
+    "Interval",
+    "Preset",
+    "Recording",
+    "Report",
+    "Touch",
+    "describe",
+    "iterate",
+    "read",
+    "read_intervals",
+    "resampled",
+    "touches",
+]

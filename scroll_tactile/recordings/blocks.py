@@ -1,0 +1,161 @@
+"""What every format's reader gives: blocks of readings with their clocks and counters, and a list of what there is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
+
+__all__ = ["LARGEST", "Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
+
+LARGEST = 1 << 30
+"""The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
+
+_ROWS = 4096  # of a block …
+_BYTES = 1 << 24  # … unless they would hold more than this
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a file; see `read`."""
+
+    topic: str | None = None
+    field: str | None = None
+    clock: str | None = None
+    rate: float | None = None
+    labels: str | None = None
+    header: bool | None = None
+    delimiter: str | None = None
+    decimal: str = "."
+    definitions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class Block:
+    """Some readings in the order of the file.
+
+    readings: shape (k, n), or (k, height, width, 3) for pictures.
+    clocks: seconds, float64 of shape (k,), by the clock's name; the first that runs is preferred.
+    counters: what counts readings at their source, int64 of shape (k,), by name.
+    episodes: the number of the episode of each reading, int64 of shape (k,), where a file has episodes.
+    """
+
+    readings: npt.NDArray[Any]
+    clocks: dict[str, npt.NDArray[np.float64]] = dataclasses.field(default_factory=dict)
+    counters: dict[str, npt.NDArray[np.int64]] = dataclasses.field(default_factory=dict)
+    episodes: npt.NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Numbers that a file has: where they are, and how many; `rate` in Hz and `count` as far as was looked."""
+
+    topic: str | None
+    field: str
+    shape: tuple[int, ...]
+    count: int | None = None
+    rate: float | None = None
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file has, as `describe` gives it; as text, a table with a line to copy.
+
+    source: the file's address. entries: the numbers in it. looked: how far was looked, where not to the end.
+    """
+
+    source: str
+    entries: tuple[Entry, ...]
+    looked: str = ""
+
+    def __str__(self) -> str:
+        if not self.entries:
+            return f"{self.source} has no numbers in it"
+        lines = [f"{self.source} has{f' {self.looked}' if self.looked else ''}:"]
+        for entry in self.entries[:40]:
+            where = f"{entry.topic}  " if entry.topic else ""
+            count = "" if entry.count is None else f", {entry.count} readings"
+            rate = "" if entry.rate is None else f", {entry.rate:.4g} Hz"
+            kind = f"  ({entry.kind})" if entry.kind else ""
+            lines.append(f"  {where}{entry.field}  {list(entry.shape)}{count}{rate}{kind}")
+        if len(self.entries) > 40:
+            lines.append(f"  … and {len(self.entries) - 40} more")
+        first = self.entries[0]
+        topic = f"topic={first.topic!r}, " if first.topic else ""
+        lines.append(f"read({self.source!r}, {topic}field={first.field!r})")
+        return "\n".join(lines)
+
+
+class Source(Protocol):
+    """A file that was opened for reading; `notes` and `names` fill up as blocks are read.
+
+    address: where it is. topic: the topic that is read; None where the format has none.
+    notes: what went wrong without losing everything, as sentences.
+    cut_off: whether the file ends before its end.
+    names: what each episode is called, by its number.
+    marks: what a topic of labels said when: seconds by the clock "log", and a text.
+    """
+
+    address: str
+    topic: str | None
+    notes: list[str]
+    cut_off: bool
+    names: dict[int, str]
+    marks: list[tuple[float, str]]
+
+    def contents(self) -> Contents:
+        """What the file has."""
+
+    def field(self) -> str:
+        """The field that is read, in full."""
+
+    def blocks(self) -> Iterator[Block]:
+        """The readings that were requested, in the order of the file."""
+
+
+def rows_of(width: int) -> int:
+    """How many readings of so many bytes make a block."""
+    return max(1, min(_ROWS, _BYTES // max(width, 1)))
+
+
+def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same numbers as float32 where it holds them all (16 bit, float32), as float64 otherwise; pictures stay.
+
+    Raises FieldError for what are no real numbers.
+    """
+    if array.dtype.kind not in "biuf":
+        raise FieldError(f"expected numbers; came values of type {array.dtype}")
+    if array.ndim == 4 and array.dtype == np.uint8 and array.shape[3] == 3:
+        return array
+    exact = np.can_cast(array.dtype, np.float32, "safe")
+    kind = np.float32 if exact else np.float64
+    return array.reshape(len(array), -1).astype(kind, copy=False) if array.ndim != 2 else array.astype(kind, copy=False)
+
+
+def missing(module: str, extra: str, what: str) -> RecordingError:
+    """The error of a library that is not installed, with the line that installs it."""
+    return RecordingError(f"{what} needs {module}, which is not installed: pip install 'scroll-tactile[{extra}]'")
+
+
+@contextmanager
+def guarded(path: str) -> Iterator[None]:
+    """Damaged bytes make parsers fail in many ways: all of them become a RecordingError that names the file."""
+    try:
+        yield
+    except (ScrollTactileError, GeneratorExit):
+        raise
+    except MemoryError as error:
+        raise RecordingError(f"{path} claims to hold more than fits into memory, and may be damaged") from error
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [""]
+        raise RecordingError(
+            f"{path} cannot be read, and may be damaged or half copied: {type(error).__name__}: {reason[0]:.200}"
+        ) from error

@@ -1,0 +1,160 @@
+"""LeRobotDataset v3 as a source: parquet files of many episodes each, tasks as text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import FieldError, RecordingError
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, floats, missing, rows_of
+from scroll_tactile.recordings.keys import matched
+from scroll_tactile.recordings.paths import select
+
+__all__ = ["LeRobot", "is_lerobot"]
+
+_BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (path / "meta" / "info.json").is_file()
+
+
+class LeRobot:
+    """A LeRobotDataset; see `Source`. An episode is called what its task is."""
+
+    def __init__(self, path: Path, address: str, request: Request) -> None:
+        try:
+            from pyarrow import parquet
+        except ImportError as error:
+            raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
+        self.parquet: Any = parquet
+        self.path, self.address, self.request = path, address, request
+        self.topic: str | None = None
+        self.notes: list[str] = []
+        self.cut_off = False
+        self.names: dict[int, str] = {}
+        self.marks: list[tuple[float, str]] = []
+        self.info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+        version = str(self.info.get("codebase_version", ""))
+        if not version.startswith("v3"):
+            raise RecordingError(
+                f"{address} is a LeRobotDataset {version or 'of no version'}; expected v3: LeRobot converts older ones "
+                "(python -m lerobot.datasets.v30.convert_dataset_v21_to_v30)"
+            )
+        self.features: dict[str, Any] = self.info["features"]
+
+    def field(self) -> str:
+        """The column that is read."""
+        return str(self.request.field)
+
+    def contents(self) -> Contents:
+        """The columns that hold numbers, touch first."""
+        fps, count = self.info.get("fps"), self.info.get("total_frames")
+        entries = [
+            Entry(None, name, tuple(about["shape"]), count, fps, about["dtype"])
+            for name, about in self.features.items()
+            if name not in _BOOKKEEPING and about["dtype"] not in ("video", "image", "string")
+        ]
+        entries.sort(key=lambda entry: "tact" not in entry.field.lower())
+        return Contents(self.address, tuple(entries))
+
+    def blocks(self) -> Iterator[Block]:
+        """The readings of the column, file after file."""
+        key, rest = self._column()
+        clock = self.request.clock or "timestamp"
+        tasks = self._tasks()
+        columns = list(dict.fromkeys([key, clock, *_BOOKKEEPING]))
+        shape = self.features[key]["shape"]
+        for path in self._files():
+            with self.parquet.ParquetFile(path) as file:
+                there = [name for name in columns if name in file.schema_arrow.names]
+                for name in (key, clock):
+                    if name not in there:
+                        raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
+                width = 8 * int(np.prod(shape, dtype=np.int64))
+                for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
+                    if batch.num_rows:
+                        yield self._block(batch, key, rest, clock, tasks)
+
+    def _block(self, batch: Any, key: str, rest: str, clock: str, tasks: dict[int, str]) -> Block:
+        values = select(floats(self._rows(batch.column(key), key)), rest, self.field())
+        times = self._rows(batch.column(clock), clock).astype(np.float64).reshape(batch.num_rows, -1)[:, 0]
+        numbers = {}
+        for name in ("episode_index", "frame_index", "task_index"):
+            if name in batch.schema.names:
+                numbers[name] = self._rows(batch.column(name), name).astype(np.int64).reshape(-1)
+        for episode, task in zip(
+            numbers.get("episode_index", np.empty(0)), numbers.get("task_index", np.empty(0)), strict=False
+        ):
+            if int(task) in tasks:
+                self.names.setdefault(int(episode), tasks[int(task)])
+        counters = {"message": numbers["frame_index"]} if "frame_index" in numbers else {}
+        return Block(values, {clock: times}, counters, numbers.get("episode_index"))
+
+    def _column(self) -> tuple[str, str]:
+        if self.request.field is None:
+            raise FieldError(f"expected a field to read\n{self.contents()}")
+        key, rest = matched(self.request.field, self.features, self.address)
+        kind = self.features[key]["dtype"]
+        if kind in ("video", "image", "string"):
+            raise FieldError(f"field {key!r} of {self.address} is of type {kind}; expected numbers")
+        return key, rest
+
+    def _rows(self, column: Any, name: str) -> npt.NDArray[Any]:
+        """A column as (rows, …), nested lists flattened; raises RecordingError where rows differ in length."""
+        count, array = len(column), getattr(column, "storage", column)
+        while hasattr(array.type, "value_type"):
+            if array.null_count:
+                raise RecordingError(f"column {name!r} of {self.address} has rows without a value")
+            inner = array.flatten()
+            if len(array) and len(inner) % len(array) == 0 and hasattr(array, "offsets"):
+                lengths = np.diff(array.offsets.to_numpy())
+                if len(lengths) and (lengths != lengths[0]).any():
+                    self._ragged(name)
+            elif len(array) and len(inner) % len(array):
+                self._ragged(name)
+            array = inner
+        values = array.to_numpy(zero_copy_only=False)
+        if values.dtype.kind not in "biuf":
+            raise FieldError(f"column {name!r} of {self.address} holds {array.type}; expected numbers")
+        return np.ascontiguousarray(values).reshape(count, -1)
+
+    def _ragged(self, name: str) -> None:
+        raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
+
+    def _files(self) -> list[Path]:
+        """The parquet files that the episodes are in; raises RecordingError where one is missing."""
+        listed: dict[tuple[int, int], None] = {}
+        for path in sorted((self.path / "meta" / "episodes").glob("**/*.parquet")):
+            table = self.parquet.read_table(path, columns=["data/chunk_index", "data/file_index"])
+            listed |= dict.fromkeys(zip(*(column.to_pylist() for column in table.columns), strict=True))
+        pattern = str(self.info["data_path"])
+        files = [self.path / pattern.format(chunk_index=chunk, file_index=file) for chunk, file in sorted(listed)]
+        files = files or sorted((self.path / "data").glob("**/*.parquet"))
+        root = self.path.resolve()
+        if not all(file.resolve().is_relative_to(root) for file in files):
+            raise RecordingError(f"{self.address} names data outside its folder: {pattern!r}")
+        absent = [str(file.relative_to(self.path)) for file in files if not file.is_file()]
+        if absent or not files:
+            raise RecordingError(
+                f"{self.address} is not whole: {', '.join(absent[:5]) or 'its parquet files'}"
+                f"{f' and {len(absent) - 5} more' if len(absent) > 5 else ''} missing; copy it again"
+            )
+        return files
+
+    def _tasks(self) -> dict[int, str]:
+        path = self.path / "meta" / "tasks.parquet"
+        if not path.is_file():
+            self.notes.append("the tasks are missing, meta/tasks.parquet: episodes have no name")
+            return {}
+        table = self.parquet.read_table(path).to_pydict()
+        indices = table.pop("task_index")
+        # pandas writes an index without a name under one of its own
+        texts: list[Any] = next(iter(table.values()), [])
+        return {int(i): str(text) for i, text in zip(indices, texts, strict=False)}

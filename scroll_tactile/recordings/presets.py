@@ -1,0 +1,103 @@
+"""Where known tactile sensors keep their numbers: the topic, the field, and the sensor with its range.
+
+Ranges are what a driver's type and data sheet allow, in its own units. Where a preset's range is wider than what a
+sensor sends in use, a `Sensor` of one's own with the range seen resolves more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.recordings.paths import FieldPath, nearest
+from scroll_tactile.sensors import CONTACTILE, Sensor
+
+__all__ = ["PRESETS", "Preset", "fields_for", "find", "is_known"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A known sensor under its driver.
+
+    sensor: what its readings are. topic: as its driver names it; None where that is up to the robot.
+    field: the path to its numbers. types: the messages it is sent in, by their name after the package, in lower case.
+    """
+
+    sensor: Sensor
+    topic: str | None
+    field: str
+    types: tuple[str, ...]
+
+    def sized(self, channels: int) -> Sensor:
+        """The sensor with as many channels as a recording has: pads are sold in several sizes."""
+        if channels == self.sensor.channels:
+            return self.sensor
+        return self.sensor.model_copy(update={"channels": channels, "layout": None})
+
+
+def _biotac(name: str, electrodes: int) -> Preset:
+    sensor = Sensor(name=name, channels=electrodes, rate=100.0, low=0.0, high=4095.0, unit="counts", duration=4.0)
+    return Preset(sensor, "/rh/tactile", "tactiles[0].electrodes", ("biotacall",))
+
+
+def _camera(name: str, rate: float) -> Preset:
+    sensor = Sensor(
+        name=name,
+        channels=320 * 240 * 3,
+        rate=rate,
+        low=0.0,
+        high=255.0,
+        unit="counts",
+        duration=1.0,
+        layout=(320, 240, 3) if name == "digit" else (240, 320, 3),
+        camera=True,
+    )
+    return Preset(sensor, None, "data", ())
+
+
+_USKIN = Sensor(name="xela-uskin", channels=48, rate=100.0, low=0.0, high=65535.0, unit="counts", duration=4.0)
+_ANYSKIN = Sensor(name="anyskin", channels=15, rate=50.0, low=-5000.0, high=5000.0, unit="µT", duration=4.0)
+_ROBOTIQ = Sensor(name="robotiq-tsf", channels=56, rate=60.0, low=0.0, high=65535.0, unit="counts", duration=4.0)
+
+PRESETS = {
+    "biotac": _biotac("biotac-electrodes", 19),
+    "biotac-sp": _biotac("biotac-sp", 24),
+    "xela-uskin": Preset(_USKIN, None, "sensors[0].taxels[*].{x,y,z}", ("sensstream",)),
+    "papillarray": Preset(CONTACTILE, "/hub_0/sensor_0", "pillars[*].{fX,fY,fZ}", ("sensorstate",)),
+    "anyskin": Preset(_ANYSKIN, None, "data", ()),
+    "robotiq-tsf": Preset(_ROBOTIQ, None, "taxels[*].values", ("staticdata",)),
+    "digit": _camera("digit", 30.0),
+    "gelsight": _camera("gelsight-mini", 25.0),
+}
+"""The presets by name."""
+
+# Further fields of known messages that are worth listing first.
+_ALSO = {"tactilestate": ("sensors[*].values",), "float32multiarray": ("data",), "float64multiarray": ("data",)}
+
+
+def find(name: str) -> Preset:
+    """The preset of this name; raises InputError, with the nearest, for one that is not there."""
+    if name not in PRESETS:
+        raise InputError(f"expected a preset; came {name!r}{nearest(name, list(PRESETS))}")
+    return PRESETS[name]
+
+
+def is_known(kind: str) -> bool:
+    """Whether messages of this type are of a known tactile sensor."""
+    return _short(kind) in _ALSO or any(_short(kind) in preset.types for preset in PRESETS.values())
+
+
+def fields_for(kind: str, message: object) -> list[tuple[str, tuple[int, ...]]]:
+    """The fields that presets know in a message of this type, and the shapes of what they lead to."""
+    texts = [preset.field for preset in PRESETS.values() if _short(kind) in preset.types]
+    found = {}
+    for text in (*texts, *_ALSO.get(_short(kind), ())):
+        try:
+            found[text] = FieldPath(text).reading(message).shape
+        except FieldError:
+            continue
+    return list(found.items())
+
+
+def _short(kind: str) -> str:
+    return kind.rpartition("/")[2].lower()

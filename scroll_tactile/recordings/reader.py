@@ -1,0 +1,212 @@
+"""The way in: `read` gives a recording, `iterate` its blocks, `describe` what a file has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
+from scroll_tactile.recordings import presets
+from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
+from scroll_tactile.recordings.clocks import choose
+from scroll_tactile.recordings.locations import local
+from scroll_tactile.recordings.recording import Recording, assemble, resampled
+
+__all__ = ["describe", "iterate", "read"]
+
+_Address = str | PathLike[str]
+
+
+def read(
+    path: _Address,
+    *,
+    topic: str | None = None,
+    field: str | None = None,
+    clock: str | None = None,
+    preset: str | None = None,
+    rate: float | None = None,
+    labels: str | None = None,
+    resample: float | None = None,
+    header: bool | None = None,
+    delimiter: str | None = None,
+    decimal: str = ".",
+    definitions: Mapping[str, str] | None = None,
+) -> Recording:
+    """All readings of a file, or of a folder that is one recording.
+
+    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v3; robomimic's HDF5; a
+        Zarr replay buffer; `.npy`; `.csv`. On this machine, or an address that fsspec knows.
+    topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
+        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
+    clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
+        that runs; see `Report`.
+    preset: a known sensor, in place of topic and field: see `presets`.
+    rate: in Hz, counts times where a file has no clock.
+    labels: a topic with texts, or a column: what they say become episodes.
+    resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
+    header, delimiter, decimal: how a table is written, where it does not show.
+    definitions: of messages that a bag does not define, the text of the .msg by the type's name.
+
+    Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
+    file is not there, damaged, ragged, empty, of no known format, or needs a library that is not installed;
+    ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
+    """
+    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, dict(definitions or {}))
+    request = _with_preset(request, preset)
+    address = fspath(path)
+    with local(address) as place, guarded(address):
+        source = _open(place, address, request)
+        whole = _joined(_timed(source, request))
+        recording = _recording(whole, source, _clock(whole, request.clock))
+    _require(recording, preset)
+    return recording if resample is None else resampled(recording, resample)
+
+
+def iterate(
+    path: _Address,
+    *,
+    topic: str | None = None,
+    field: str | None = None,
+    clock: str | None = None,
+    preset: str | None = None,
+    rate: float | None = None,
+    labels: str | None = None,
+    header: bool | None = None,
+    delimiter: str | None = None,
+    decimal: str = ".",
+    definitions: Mapping[str, str] | None = None,
+) -> Iterator[Recording]:
+    """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
+
+    Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
+    readings; the clock is chosen from the first.
+    """
+    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, dict(definitions or {}))
+    request = _with_preset(request, preset)
+    address = fspath(path)
+    with local(address) as place:
+        with guarded(address):
+            source = _open(place, address, request)
+            blocks = _timed(source, request)
+            name = request.clock
+        first = True
+        while True:
+            with guarded(address):
+                block = next(blocks, None)
+                if block is None:
+                    return
+                name = _clock(block, name) if first else name
+                recording = _recording(block, source, name)
+            if first:
+                _require(recording, preset)
+            first = False
+            yield recording
+
+
+def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) -> Contents:
+    """What a file has: its topics and fields with their shapes and rates, and a line to copy.
+
+    Of a bag the first 2000 messages are looked at. Raises RecordingError as `read` does.
+    """
+    address = fspath(path)
+    with local(address) as place, guarded(address):
+        return _open(place, address, Request(definitions=dict(definitions or {}))).contents()
+
+
+def _open(path: Path, address: str, request: Request) -> Source:
+    """The reader that knows this file's format, by its name or by what a folder holds."""
+    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag
+
+    if rosbag.is_rosbag(path):
+        return rosbag.RosBag(path, address, request)
+    if path.is_dir() and lerobot.is_lerobot(path):
+        return lerobot.LeRobot(path, address, request)
+    if arraystores.is_zarr(path):
+        return arraystores.ZarrBuffer(path, address, request)
+    suffix = path.suffix.lower()
+    if path.is_file() and suffix == ".npy":
+        return arraystores.Npy(path, address, request)
+    if path.is_file() and suffix in (".h5", ".hdf5", ".hdf"):
+        return arraystores.Hdf5(path, address, request)
+    if path.is_file() and delimited.is_table(path):
+        return delimited.Delimited(path, address, request)
+    what = "a folder with neither metadata.yaml, meta/info.json nor a Zarr group" if path.is_dir() else repr(path.name)
+    raise RecordingError(
+        f"expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, or the folder of a bag or of a LeRobot data "
+        f"set; came {what} at {address}"
+    )
+
+
+def _timed(source: Source, request: Request) -> Iterator[Block]:
+    """The blocks, with times counted at a rate where they have none; from 0 in each episode."""
+    if request.rate is not None and not (np.isfinite(request.rate) and request.rate > 0):
+        raise InputError(f"expected a positive rate in Hz; came {request.rate!r}")
+    last, count = None, 0
+    for block in source.blocks():
+        if request.rate is not None and not block.clocks:
+            length = len(block.readings)
+            numbers = np.zeros(length, np.int64) if block.episodes is None else block.episodes
+            index = np.arange(count, count + length)
+            for begin in np.flatnonzero(np.diff(numbers, prepend=numbers[0] if last is None else last)):
+                index[begin:] = np.arange(length - begin)
+            last, count = numbers[-1], index[-1] + 1
+            block.clocks["rate"] = index / request.rate
+        yield block
+
+
+def _joined(blocks: Iterator[Block]) -> Block:
+    """All blocks as one; raises RecordingError where there are none."""
+    parts = list(blocks)
+    if not parts:
+        raise RecordingError("the recording holds no readings")
+    if len(parts) == 1:
+        return parts[0]
+    if len({part.readings.shape[1:] for part in parts}) > 1:
+        raise RecordingError(f"readings are ragged: they have {sorted({p.readings.shape[1:] for p in parts})} values")
+
+    def whole(name: str) -> dict[str, Any]:
+        columns = [getattr(part, name) for part in parts]
+        return {key: np.concatenate([column[key] for column in columns]) for key in columns[0]}
+
+    episodes = None if parts[0].episodes is None else np.concatenate([part.episodes for part in parts])
+    return Block(np.concatenate([part.readings for part in parts]), whole("clocks"), whole("counters"), episodes)
+
+
+def _recording(block: Block, source: Source, clock: str | None) -> Recording:
+    readings, times, episodes, report = assemble(block, clock, source.names, source.marks)
+    report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
+    return Recording(source.address, source.topic, source.field(), readings, times, episodes, report)
+
+
+def _clock(block: Block, asked: str | None) -> str | None:
+    # Arrays and columns call their clock by the name of what was asked for, or by their only one.
+    if asked is not None and asked not in block.clocks and len(block.clocks) == 1 and "log" not in block.clocks:
+        return next(iter(block.clocks))
+    return choose(block.clocks, asked)
+
+
+def _with_preset(request: Request, name: str | None) -> Request:
+    if name is None:
+        return request
+    preset = presets.find(name)
+    return replace(request, topic=request.topic or preset.topic, field=request.field or preset.field)
+
+
+def _require(recording: Recording, name: str | None) -> None:
+    """Raises ChannelCountError where the readings are not those of the preset's sensor, naming one that has as many."""
+    if name is None:
+        return
+    sensor, shape = presets.find(name).sensor, recording.readings.shape[1:]
+    if sensor.camera != (len(shape) == 3) or (not sensor.camera and shape != sensor.shape):
+        alike = [other for other, preset in presets.PRESETS.items() if preset.sensor.shape == shape]
+        raise ChannelCountError(
+            f"expected readings of {name!r}, shape {sensor.shape}; field {recording.field!r} of {recording.source} has "
+            f"{shape}"
+            + (f", as of {' or '.join(alike)}" if alike else "")
+            + ". For another size give topic= and field="
+        )

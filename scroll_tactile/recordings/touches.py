@@ -1,0 +1,205 @@
+"""Touches out of a recording: cut by episodes, by intervals in a table, or by a function; and what names them."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from os import PathLike, fspath
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.recordings.paths import nearest
+from scroll_tactile.recordings.recording import Episode, Recording
+
+__all__ = ["Interval", "Touch", "read_intervals", "touches"]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A touch of `material` in a file, from `begin` to before `end` in seconds of the recording's clock.
+
+    Where a recording's times are times of day, those below a million count from its first reading. `row` is where it
+    stands.
+    """
+
+    file: str
+    begin: float
+    end: float
+    material: str
+    row: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """Some readings of a recording in one piece, with their times; material is None where nothing names it.
+
+    source: the recording's address. begin, end: which of its readings.
+    """
+
+    source: str
+    begin: int
+    end: int
+    readings: npt.NDArray[Any]
+    times: npt.NDArray[np.float64]
+    material: str | None
+
+    @property
+    def name(self) -> str:
+        """The file's name and where in it: "felt.mcap[120:240]"."""
+        return f"{_place(self.source).name}[{self.begin}:{self.end}]"
+
+
+Cut = Literal["whole", "episodes"] | Sequence[Interval] | Callable[[Recording], Iterable[tuple[int, int]]]
+Label = Literal["topic", "file", "folder", "task"] | None
+
+
+def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tuple[Touch, ...]:
+    """The touches in a recording.
+
+    cut: "whole" (all readings are one touch), "episodes", a table's intervals (those of this file), or a function that
+        gives the begin and end of each touch, such as one that watches for contact.
+    label: what names a touch: the "topic", the name of the "file" (without suffix) or of its "folder", or the "task"
+        that its episode is called. Without it intervals and episodes name their own, and the whole recording has no
+        name but that of all its episodes, where they have the same.
+
+    Raises InputError for a recording without episodes, without the label asked for or with an empty one, for intervals
+    of which none is of this file or which lie outside it, and for spans that a function gives outside the recording.
+    """
+    if isinstance(cut, str):
+        if cut not in ("whole", "episodes"):
+            raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
+        if cut == "episodes" and not recording.episodes:
+            raise InputError(f"{recording.source} has no episodes: cut it by intervals, or not")
+        spans = recording.episodes if cut == "episodes" else (Episode(0, len(recording), _only(recording)),)
+    elif callable(cut):
+        spans = tuple(Episode(begin, end, _during(recording, begin, end)) for begin, end in cut(recording))
+        for span in spans:
+            if not 0 <= span.begin < span.end <= len(recording):
+                raise InputError(f"a cut gave readings {span.begin} to {span.end} of {len(recording)}")
+    else:
+        spans = _of_intervals(recording, cut)
+    return tuple(
+        Touch(
+            recording.source,
+            span.begin,
+            span.end,
+            recording.readings[span.begin : span.end],
+            recording.times[span.begin : span.end],
+            _label(recording, span, label),
+        )
+        for span in spans
+    )
+
+
+def _label(recording: Recording, span: Episode, label: Label) -> str | None:
+    place = _place(recording.source)
+    if label is None:
+        return span.name
+    if label not in ("topic", "file", "folder", "task"):
+        raise InputError(f"expected a label by 'topic', 'file', 'folder' or 'task'; came {label!r}")
+    if label == "task":
+        name = span.name
+    elif label == "topic":
+        name = None if recording.topic is None else recording.topic.rstrip("/").rpartition("/")[2]
+    else:
+        name = place.name.partition(".")[0] if label == "file" else place.parent.name
+    if name is None or not name.strip():
+        raise InputError(f"{recording.source}, readings {span.begin} to {span.end}, has no {label} to be named by")
+    return name.strip()
+
+
+def _place(source: str) -> PurePosixPath:
+    if "://" in source:
+        return PurePosixPath(source.partition("://")[2])
+    return PurePosixPath(Path(source).resolve().as_posix())
+
+
+def _only(recording: Recording) -> str | None:
+    """The name of all episodes, where they have the same."""
+    names = {episode.name for episode in recording.episodes}
+    return names.pop() if len(names) == 1 else None
+
+
+def _during(recording: Recording, begin: int, end: int) -> str | None:
+    """The name of the episode in which the middle of a span lies."""
+    middle = (begin + end) // 2
+    return next((e.name for e in recording.episodes if e.begin <= middle < e.end), None)
+
+
+def _of_intervals(recording: Recording, intervals: Sequence[Interval]) -> tuple[Episode, ...]:
+    mine = [interval for interval in intervals if _same(interval.file, recording.source)]
+    if not mine:
+        files = list(dict.fromkeys(interval.file for interval in intervals))
+        raise InputError(f"no interval is of {recording.source}{nearest(_place(recording.source).name, files)}")
+    times = recording.times
+    if not np.isfinite(times).all():
+        raise InputError(f"{recording.source} has no clock to cut intervals by: give clock= or rate= as it is read")
+    if (np.diff(times) < 0).any():
+        raise InputError(f"{recording.source}: time goes back, so that intervals have no place: give another clock=")
+    first = float(times[0]) if len(times) else 0.0
+    spans = []
+    for interval in mine:
+        start = first if first > 1e6 and interval.end < 1e6 else 0.0
+        begin, end = np.searchsorted(times, [interval.begin + start, interval.end + start]).tolist()
+        if end <= begin:
+            raise InputError(
+                f"row {interval.row} of the intervals, {interval.begin:g} to {interval.end:g} s, holds no reading of "
+                f"{recording.source}, which lasts from {times[0] - start:g} to {times[-1] - start:g} s"
+            )
+        spans.append(Episode(begin, end, interval.material))
+    return tuple(spans)
+
+
+def _same(file: str, source: str) -> bool:
+    """Whether a file in a table is this one: its path ends alike, part by part; a suffix may be left out."""
+    asked, place = PurePosixPath(file.replace("\\", "/")), _place(source)
+    parts = [part for part in asked.parts if part not in (".", "..")]
+    ending = place.parts[-len(parts) :]
+    alike = tuple(parts[:-1]) == ending[:-1] and bool(parts)
+    return alike and parts[-1] in (place.name, place.stem)
+
+
+def read_intervals(path: str | PathLike[str], files: Iterable[str | PathLike[str]] | None = None) -> list[Interval]:
+    """The intervals in a table with the columns file, begin, end and material (or label), in any order.
+
+    files: the recordings they are meant for; with them, a row of a file that is not among these is refused.
+
+    Raises FieldError for a column that is missing; RecordingError for a table that cannot be read; InputError for a row
+    whose times are no numbers or end before they begin, whose material is empty, or whose file is not there.
+    """
+    try:
+        with Path(fspath(path)).open(encoding="utf-8-sig", newline="") as file:
+            first = file.readline(1 << 16)
+            delimiter = next((mark for mark in ";\t," if mark in first), ",")
+            names = [cell.strip().lower() for cell in next(csv.reader([first], delimiter=delimiter), [])]
+            table = [(i + 2, row) for i, row in enumerate(csv.reader(file, delimiter=delimiter)) if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path} cannot be read as a table of intervals: {error}") from error
+    names = ["material" if name == "label" else name for name in names]
+    for name in ("file", "begin", "end", "material"):
+        if name not in names:
+            raise FieldError(f"{path} has no column {name!r}; expected file, begin, end, material; there are {names}")
+    sources = None if files is None else [fspath(file) for file in files]
+    return [_interval(path, row, dict(zip(names, cells, strict=False)), sources) for row, cells in table]
+
+
+def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | None) -> Interval:
+    file, material = cells.get("file", "").strip(), cells.get("material", "").strip()
+    where = f"{path}, row {row}"
+    if not file or not material:
+        raise InputError(f"{where}: expected a file and a material; came {file!r} and {material!r}")
+    try:
+        begin, end = float(cells.get("begin", "")), float(cells.get("end", ""))
+    except ValueError as error:
+        raise InputError(f"{where}: expected begin and end in seconds: {error}") from error
+    if not (math.isfinite(begin) and math.isfinite(end) and begin < end):
+        raise InputError(f"{where}: expected begin before end; came {begin:g} and {end:g}")
+    if files is not None and not any(_same(file, source) for source in files):
+        raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
+    return Interval(file, begin, end, material, row)

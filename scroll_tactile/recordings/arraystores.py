@@ -42,7 +42,7 @@ class _Arrays:
     def _listed(self, arrays: dict[str, list[Any]]) -> Contents:
         """The arrays that hold numbers in rows, touch first; the parts of one are its episodes."""
         entries = [
-            Entry(None, key, tuple(parts[0].shape[1:]), sum(len(part) for part in parts), None, str(parts[0].dtype))
+            Entry(None, key, tuple(parts[0].shape[1:]), sum(part.shape[0] for part in parts), None, str(parts[0].dtype))
             for key, parts in arrays.items()
             if parts[0].ndim and parts[0].dtype.kind in "biuf" and key.rpartition("/")[2] not in CLOCK_KEYS
         ]
@@ -73,12 +73,12 @@ class _Arrays:
         width = int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
         if width > LARGEST:
             raise RecordingError(f"{self.address} claims readings of {width} bytes in {key!r}, and may be damaged")
-        if times is not None and (times.ndim != 1 or len(times) != len(array)):
+        if times is not None and (times.ndim != 1 or times.shape[0] != array.shape[0]):
             raise RecordingError(
-                f"{self.address}: the times have shape {times.shape}, and {key!r} has {len(array)} readings"
+                f"{self.address}: the times have shape {times.shape}, and {key!r} has {array.shape[0]} readings"
             )
         rows = rows_of(width)
-        for i in range(0, len(array), rows):
+        for i in range(0, array.shape[0], rows):
             part = floats(np.asarray(array[i : i + rows]))
             clocks = {} if times is None else {"times": np.asarray(times[i : i + rows]).astype(np.float64)}
             episodes = None if number is None else np.full(len(part), number, np.int64)

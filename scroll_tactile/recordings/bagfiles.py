@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import bz2
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -78,19 +80,29 @@ def _decompress(kind: str, data: bytes, size: int, *, whole: bool) -> bytes:
         raise ValueError(f"a chunk of {size} bytes is claimed")
     if kind in ("", "none"):
         result = data
-    elif kind == "bz2":
-        result = bz2.BZ2Decompressor().decompress(data, max_length=size)
-    elif kind == "lz4":
-        import lz4.frame  # comes with rosbags
-
-        result = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
-    elif kind == "zstd":
-        result = _zstd().ZstdDecompressor().decompress(data, max_length=size)
     else:
-        raise RecordingError(f"chunks are compressed as {kind!r}; expected lz4, zstd or bz2")
+        decompressor = _decompressor(kind)
+        try:
+            result = decompressor.decompress(data, max_length=size)
+        except Exception as error:  # each library has errors of its own
+            raise ValueError(str(error)) from error
     if whole and len(result) != size:
         raise ValueError(f"a chunk of {size} bytes is claimed; there are {len(result)}")
     return result
+
+
+def _decompressor(kind: str) -> Any:
+    if kind == "bz2":
+        return bz2.BZ2Decompressor()
+    if kind == "lz4":
+        try:
+            from lz4.frame import LZ4FrameDecompressor  # comes with rosbags
+        except ImportError as error:
+            raise missing("lz4", "ros", "a file compressed by lz4") from error
+        return LZ4FrameDecompressor()
+    if kind == "zstd":
+        return _zstd().ZstdDecompressor()
+    raise RecordingError(f"chunks are compressed as {kind!r}; expected lz4, zstd or bz2")
 
 
 def _zstd() -> Any:
@@ -118,6 +130,7 @@ def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
             raise RecordingError(f"{path} does not begin as a ROS 1 bag does, with {_BAG.decode().strip()!r}")
         reader = _Bag(scan)
         try:
+            _index(file, size, reader)
             while file.tell() < size:
                 header, length = _record_head(file, size)
                 left = size - file.tell()
@@ -146,6 +159,22 @@ def _header(data: bytes) -> dict[bytes, bytes]:
         fields[name] = value
         i += 4 + length
     return fields
+
+
+def _index(file: BinaryIO, size: int, reader: _Bag) -> None:
+    """Take the connections at the end of a whole bag: those in a damaged chunk are needed by later ones."""
+    begin = file.tell()
+    header, _ = _record_head(file, size)
+    with suppress(*_DAMAGE, _CutOff):
+        (start,) = struct.unpack("<Q", header[b"index_pos"])
+        file.seek(start if 0 < start < size else size)
+        while file.tell() < size:
+            header, length = _record_head(file, size)
+            if header[b"op"] != bytes([_CONNECTION]):
+                break
+            for _ in reader.record(header, _take(file, length, size - file.tell())):
+                pass
+    file.seek(begin)
 
 
 class _Bag:
@@ -211,6 +240,7 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise RecordingError(f"{path} does not begin as an MCAP file does")
         reader = _Mcap(scan)
+        _summary(file, size, reader)
         try:
             while True:
                 kind, length = _HEAD.unpack(_take(file, _HEAD.size, size - file.tell()))
@@ -229,6 +259,24 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
                 yield from reader.chunk(data, whole=True) if kind == _MCAP_CHUNK else reader.record(kind, data)
         except _CutOff as error:
             scan.cut_off = str(error)
+
+
+def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
+    """Take the schemas and channels at the end of a whole file: those in a damaged chunk are needed by later ones."""
+    begin, tail = file.tell(), 9 + 20 + len(_MAGIC)  # a footer and the magic
+    file.seek(max(size - tail, begin))
+    footer = file.read(tail)
+    if len(footer) == tail and footer.endswith(_MAGIC) and footer[0] == _FOOTER:
+        (start,) = struct.unpack_from("<Q", footer, 9)
+        with suppress(*_DAMAGE, _CutOff):
+            file.seek(start if 0 < start < size else size)
+            while file.tell() < size - tail:
+                kind, length = _HEAD.unpack(_take(file, _HEAD.size, size - file.tell()))
+                data = _take(file, length, size - file.tell())
+                if kind in (_SCHEMA, _CHANNEL):
+                    for _ in reader.record(kind, data):
+                        pass
+    file.seek(begin)
 
 
 class _Mcap:
@@ -293,12 +341,9 @@ def _text(data: bytes, i: int) -> tuple[str, int]:
 def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Message]:
     """The messages of a ROS 2 SQLite file, in the order they were written; `compressed`: each by itself, by zstd."""
     import sqlite3
-    from contextlib import closing
 
-    with path.open("rb") as file:
-        if file.read(16) not in (b"SQLite format 3\0", b""):
-            raise RecordingError(f"{path} does not begin as an SQLite file does")
-    with closing(_connect(path)) as base:
+    with ExitStack() as stack:
+        base = stack.enter_context(closing(_connect(_whole_pages(path, scan, stack))))
         try:
             channels = _channels(base)
         except sqlite3.DatabaseError as error:
@@ -312,6 +357,26 @@ def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Me
                 yield Message(channels[number], log, None, None, 0, whole)
         except sqlite3.DatabaseError as error:
             scan.cut_off = str(error)
+
+
+def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
+    """A file that ends inside a page without that page, as a copy: SQLite would read zeros for what is missing."""
+    with path.open("rb") as file:
+        head = file.read(100)
+        if head[:16] != b"SQLite format 3\0" or len(head) < 100:
+            raise RecordingError(f"{path} does not begin as an SQLite file does")
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        size = path.stat().st_size
+        if page < 512 or size % page == 0:
+            return path
+        scan.cut_off = "it ends in the middle of a page"
+        target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
+        file.seek(0)
+        with target.open("wb") as copy:
+            for _ in range(size // page):
+                copy.write(file.read(page))
+    return target
 
 
 def _connect(path: Path) -> Any:

@@ -98,11 +98,17 @@ class RosBag:
         self._field = path = FieldPath(text)
         stamps = Stamps(request.clock, text)
         rows: list[npt.NDArray[Any]] = []
-        width, most = -1, 1
+        width, most, unfit = -1, 1, 0
         labels = request.labels
         for i, message in enumerate(self._messages(lambda name: name in (topic, labels))):
             channel = message.channel
-            decoded = self.types.decode(channel, message.data)
+            try:
+                decoded = self.types.decode(channel, message.data)
+            except RecordingError:
+                if width < 0:
+                    raise
+                unfit += 1
+                continue
             if channel.topic == labels:
                 self.marks.append((message.log / 1e9, _text_in(decoded, channel)))
                 if labels != topic:
@@ -123,6 +129,8 @@ class RosBag:
             if len(rows) >= most:
                 yield Block(floats(np.stack(rows)), *stamps.take())
                 rows = []
+        if unfit:
+            self.notes.append(f"{unfit} messages do not fit their type, and were left out")
         if rows:
             yield Block(floats(np.stack(rows)), *stamps.take())
         elif width < 0:

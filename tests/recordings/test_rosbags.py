@@ -1,0 +1,312 @@
+"""Bags of ROS 1 and ROS 2: the numbers to the bit, the clocks, and what goes wrong with them."""
+
+import shutil
+import sqlite3
+import struct
+from pathlib import Path
+
+import bags
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
+from scroll_tactile.recordings import describe, iterate, read, resampled
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
+RNG = np.random.default_rng(7)
+
+
+@pytest.fixture(scope="module")
+def store2():
+    return bags.typestore(2)
+
+
+@pytest.fixture(scope="module")
+def store1():
+    return bags.typestore(1)
+
+
+def floats(store, count=50, width=19, start=float(bags.START)):
+    values = RNG.standard_normal((count, width)).astype(np.float32)
+    return values, [(start + i / 100, bags.array(store, row)) for i, row in enumerate(values)]
+
+
+def by_other(path, topic, numbers):
+    """The truth as rosbags gives it."""
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic == topic]
+        return np.array([numbers(reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages(wanted)])
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "numbers"),
+    [
+        ("biotac", {"topic": "/rh/tactile", "field": "tactiles[0].electrodes"}, lambda m: m.tactiles[0].electrodes),
+        ("biotac", {"preset": "biotac"}, lambda m: m.tactiles[0].electrodes),
+        ("multiarray", {"topic": "/skin", "field": "data"}, lambda m: m.data),
+        ("papillarray", {"preset": "papillarray"}, lambda m: [v for p in m.pillars for v in (p.fx, p.fy, p.fz)]),
+    ],
+)
+def test_files_of_others_read_with_one_line_as_rosbags_reads_them(name, options, numbers):
+    if not SHARED.exists():
+        pytest.skip(f"no recordings of others: {SHARED} does not exist, and the project ships none")
+    path = SHARED / f"{name}.mcap"
+    recording = read(path, **options)
+    np.testing.assert_array_equal(recording.readings, by_other(path, recording.topic, numbers))
+    assert recording.report.lost == 2
+    assert not recording.report.cut_off
+    if recording.report.clock != "device":
+        assert [gap.seconds > 1.9 for gap in recording.report.gaps] == [True]
+    assert f"field={recording.field!r}" in str(describe(path))
+
+
+@pytest.mark.parametrize(
+    ("form", "compress"),
+    [
+        ("bag", ""),
+        ("bag", "bz2"),
+        ("bag", "lz4"),
+        ("db3", ""),
+        ("db3", "FILE ZSTD"),
+        ("db3", "MESSAGE ZSTD"),
+        ("mcap", ""),
+        ("mcap", "STORAGE ZSTD"),
+    ],
+)
+def test_every_container_gives_the_same_numbers_and_times(tmp_path, store1, store2, form, compress):
+    store = store1 if form == "bag" else store2
+    values = RNG.integers(0, 4096, (300, 19)).astype(np.int16)
+    stamps = bags.START + np.cumsum(RNG.uniform(0.005, 0.015, 300)).round(6)
+    messages = [
+        (stamp + 0.001, bags.biotac(store, row, stamp, i))
+        for i, (stamp, row) in enumerate(zip(stamps, values, strict=True))
+    ]
+    other = [(bags.START + i, bags.text(store, "hm")) for i in range(3)]
+    path = tmp_path / ("b.bag" if form == "bag" else "b")
+    bags.write(path, store, {"/rh/tactile": messages, "/other": other}, form=form, compress=compress)
+    files = [path] if path.is_file() or compress in ("FILE ZSTD", "MESSAGE ZSTD") else [path, *path.glob(f"*.{form}")]
+    for file in files:
+        recording = read(file, topic="/rh/tactile", field="tactiles[0].electrodes")
+        assert recording.readings.dtype == np.float32
+        np.testing.assert_array_equal(recording.readings, values)
+        np.testing.assert_allclose(recording.times, stamps, rtol=0, atol=3e-7)
+        assert recording.report.clock == "header"
+        logged = read(file, topic="/rh/tactile", field="tactiles[0].electrodes", clock="log")
+        np.testing.assert_allclose(logged.times - recording.times, 0.001, atol=1e-6)
+        together = np.concatenate([block.readings for block in iterate(file, preset="biotac")])
+        np.testing.assert_array_equal(together, values)
+
+
+def test_the_parts_of_a_split_bag_are_one_recording(tmp_path, store2):
+    values, messages = floats(store2, 60)
+    for i in range(3):
+        bags.write(tmp_path / f"p{i}", store2, {"/skin": messages[20 * i : 20 * i + 20]}, form="mcap")
+        next((tmp_path / f"p{i}").glob("*.mcap")).rename(tmp_path / f"p_{i if i < 2 else 10}.mcap")
+        shutil.rmtree(tmp_path / f"p{i}")
+    np.testing.assert_array_equal(read(tmp_path, topic="/skin", field="data").readings, values)
+
+
+def test_xela_has_a_clock_and_a_count_of_its_own(tmp_path, store2):
+    taxels = RNG.integers(0, 65536, (40, 16, 3))
+    counts = [*range(65520, 65536), *range(3, 27)]  # of 16 bits, here: three are lost as it wraps
+    messages = [
+        (bags.START + i * 0.011, bags.uskin(store2, row, count, 100 + i * 0.01))
+        for i, (row, count) in enumerate(zip(taxels, counts, strict=True))
+    ]
+    path = bags.write(tmp_path / "x", store2, {"/x_taxel/sensor_0": messages}, form="mcap")
+    recording = read(path, topic="/x_taxel/sensor_0", field="sensors[0].taxels[*].{x,y,z}")
+    np.testing.assert_array_equal(recording.readings, taxels.reshape(40, 48))
+    np.testing.assert_array_equal(recording.times, [100 + i * 0.01 for i in range(40)])
+    assert (recording.report.clock, recording.report.lost) == ("device", 3)
+    assert read(path, preset="xela-uskin", clock="publish").report.clock == "publish"
+    assert read(path, field="sensors[0].forces[*].{x,y,z}").topic == "/x_taxel/sensor_0"
+
+
+def test_papillarray_counts_microseconds_and_ros_2_writes_in_lower_case(tmp_path, store1):
+    forces = RNG.standard_normal((30, 9, 3)).astype(np.float32)
+    messages = [
+        (bags.START + i * 0.002, bags.papillarray(store1, row, 2000 * i, bags.START + i * 0.002))
+        for i, row in enumerate(forces)
+    ]
+    path = bags.write(tmp_path / "p.bag", store1, {"/hub_0/sensor_0": messages}, form="bag")
+    for field in ("pillars[*].{fX,fY,fZ}", "pillars[*].{fx,fy,fz}"):
+        recording = read(path, topic="/hub_0/sensor_0", field=field)
+        np.testing.assert_array_equal(recording.readings, forces.reshape(30, 27))
+    np.testing.assert_array_equal(recording.times, np.arange(30) * 2000 / 1e6)
+    assert read(path, preset="papillarray", clock="header").times[0] == bags.START
+    assert "dX" in str(describe(path)) or "fX" in str(describe(path))
+
+
+def test_a_header_of_zeros_and_no_header_fall_back(tmp_path, store2):
+    values = np.arange(20 * 19, dtype=np.int16).reshape(20, 19)
+    zero = [(bags.START + i / 100, bags.biotac(store2, row, 0.0)) for i, row in enumerate(values)]
+    path = bags.write(tmp_path / "z", store2, {"/rh/tactile": zero}, form="mcap")
+    report = read(path, preset="biotac").report
+    assert (report.clock, report.unset) == ("publish", 20)
+    path = bags.write(tmp_path / "d", store2, {"/rh/tactile": zero}, form="db3")
+    assert read(path, preset="biotac").report.clock == "log"
+    with pytest.raises(InputError, match="expected a clock of this recording, header, log; came 'publish'"):
+        read(path, preset="biotac", clock="publish")
+
+
+def test_time_that_goes_back_and_readings_that_repeat_are_counted(tmp_path, store2):
+    stamps = [1.0, 1.1, 1.2, 1.2, 0.5, 0.6, 0.7]
+    messages = [
+        (bags.START + i / 10, bags.biotac(store2, np.zeros(19, np.int16), stamp)) for i, stamp in enumerate(stamps)
+    ]
+    recording = read(bags.write(tmp_path / "b", store2, {"/t": messages}, form="db3"), field="tactiles[0].electrodes")
+    assert (recording.report.backward, recording.report.repeated) == (1, 1)
+    even = resampled(recording, 10.0)  # what goes back is left out
+    np.testing.assert_allclose(even.times, [1.0, 1.1, 1.2])
+    assert "resampled to 10 Hz" in str(even.report)
+
+
+def test_labels_of_a_topic_become_episodes(tmp_path, store2):
+    values, messages = floats(store2, 50)
+    said = [(0.1, "felt"), (0.2, "felt"), (0.3, ""), (0.4, " cork ")]
+    labels = [(bags.START + seconds - 1e-4, bags.text(store2, name)) for seconds, name in said]
+    path = bags.write(tmp_path / "b", store2, {"/skin": messages, "/material": labels}, form="mcap")
+    recording = read(path, topic="/skin", field="data", labels="/material")
+    assert [(e.begin, e.end, e.name) for e in recording.episodes] == [(10, 30, "felt"), (40, 50, "cork")]
+    np.testing.assert_array_equal(recording.readings, values)
+
+
+def test_big_endian_messages_read_alike(tmp_path, store2):
+    values, messages = floats(store2, 5)
+    path = next(bags.write(tmp_path / "b", store2, {"/skin": messages}, form="db3").glob("*.db3"))
+    base = sqlite3.connect(path)
+    for number, row in enumerate(values):
+        data = struct.pack(">BBH", 0, 0, 0) + struct.pack(">III19f", 0, 0, 19, *row)
+        base.execute("UPDATE messages SET data = ? WHERE id = ?", (data, number + 1))
+    base.commit()
+    base.close()
+    np.testing.assert_array_equal(read(path, topic="/skin", field="data").readings, values)
+
+
+@pytest.mark.parametrize("form", ["bag", "mcap", "db3"])
+def test_a_file_that_was_cut_off_gives_what_comes_before(tmp_path, store1, store2, form):
+    store = store1 if form == "bag" else store2
+    values, messages = floats(store, 4000)
+    path = bags.write(tmp_path / ("b.bag" if form == "bag" else "b"), store, {"/skin": messages}, form=form)
+    path = path if path.is_file() else next(path.glob(f"*.{form}"))
+    whole, seen = path.read_bytes(), 0
+    for share in (0.3, 0.6, 0.9):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        recording = read(path, topic="/skin", field="data")
+        assert recording.report.cut_off
+        assert "cut off" in str(recording.report)
+        assert len(recording) > max(seen, 0.5 * share * 4000 * (form != "db3"))
+        seen = len(recording)
+        np.testing.assert_array_equal(recording.readings, values[:seen])
+    path.write_bytes(whole[:600])
+    with pytest.raises(RecordingError):
+        read(path, topic="/skin", field="data")
+
+
+def test_a_damaged_chunk_is_left_out_and_said(tmp_path, store2):
+    _, messages = floats(store2, 30_000)
+    path = next(
+        bags.write(tmp_path / "b", store2, {"/skin": messages}, form="mcap", compress="STORAGE ZSTD").glob("*.mcap")
+    )
+    whole = bytearray(path.read_bytes())
+    first = whole.index(b"\x28\xb5\x2f\xfd")  # as what is compressed by zstd begins
+    whole[first] ^= 1
+    path.write_bytes(whole)
+    recording = read(path, topic="/skin", field="data")
+    assert 0 < len(recording) < 30_000
+    assert "damaged chunk" in str(recording.report)
+
+
+def test_a_message_that_does_not_fit_its_type_is_left_out_and_said(tmp_path, store2):
+    values, messages = floats(store2, 5)
+    path = next(bags.write(tmp_path / "b", store2, {"/skin": messages}, form="db3").glob("*.db3"))
+    base = sqlite3.connect(path)
+    base.execute("UPDATE messages SET data = ? WHERE id = 3", (b"\0\1\0\0\xff",))
+    base.commit()
+    recording = read(path, topic="/skin", field="data")
+    np.testing.assert_array_equal(recording.readings, values[[0, 1, 3, 4]])
+    assert "1 messages do not fit" in str(recording.report)
+    base.execute("UPDATE messages SET data = ?", (b"\0\1\0\0\xff",))
+    base.commit()
+    base.close()
+    with pytest.raises(RecordingError, match="does not fit its type std_msgs/msg/Float32MultiArray"):
+        read(path, topic="/skin", field="data")
+
+
+def test_a_wrong_topic_or_field_names_what_there_is(tmp_path, store2):
+    _, messages = floats(store2, 5)
+    other = [(bags.START, bags.biotac(store2, np.zeros(19, np.int16), 1.0))]
+    names = [(bags.START, bags.text(store2, "felt"))]
+    path = bags.write(tmp_path / "b", store2, {"/skin": messages, "/rh/tactile": other, "/name": names}, form="mcap")
+    for options, message in [
+        ({"topic": "/skn", "field": "data"}, "no message of topic '/skn'; nearest is '/skin'"),
+        ({"topic": "/skin", "field": "dta"}, r"no 'dta'; nearest is 'data' \(of layout, data\)"),
+        ({"topic": "/name", "field": "data"}, "leads to text, 'felt'"),
+        ({"topic": "/rh/tactile", "field": "tactiles"}, "leads to a message, not to numbers; inside it are pac0"),
+        ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is asked of an array of 5"),
+        ({"topic": "/rh/tactile", "field": "tactiles.electrodes"}, r"write \[0\] or \[\*\]"),
+        ({"topic": "/skin"}, r"read\('.*', topic='/skin', field='data'\)"),
+        ({}, r"/skin  data  \[19\], 5 readings, 100 Hz(?s:.*)/rh/tactile  tactiles\[0\].electrodes  \[19\]"),
+        ({"topic": "/skin", "field": "data", "clock": "layout"}, "clock 'layout' leads to"),
+    ]:
+        with pytest.raises(FieldError, match=message):
+            read(path, **options)
+    assert read(path, field="data").topic == "/skin"
+
+
+def test_ragged_empty_and_undefined(tmp_path, store2):
+    rows = [np.zeros(19), np.zeros(19), np.zeros(20)]
+    messages = [(bags.START + i, bags.array(store2, row)) for i, row in enumerate(rows)]
+    path = bags.write(tmp_path / "ragged", store2, {"/skin": messages}, form="db3")
+    with pytest.raises(RecordingError, match=r"ragged: message 2 of '/skin' has 20 values .* have 19"):
+        read(path, topic="/skin", field="data")
+    assert read(path, topic="/skin", field="data[0:19]").readings.shape == (3, 19)
+    empty = bags.write(tmp_path / "empty", store2, {"/skin": messages[:1]}, form="db3")
+    base = sqlite3.connect(next(empty.glob("*.db3")))
+    base.execute("DELETE FROM messages")
+    base.commit()
+    base.close()
+    for options in ({}, {"topic": "/skin", "field": "data"}):
+        with pytest.raises(RecordingError, match="holds no message"):
+            read(empty, **options)
+    biotac = [(bags.START + i, bags.biotac(store2, np.arange(24, dtype=np.int16), 1.0 + i)) for i in range(3)]
+    path = bags.write(tmp_path / "sp", store2, {"/rh/tactile": biotac}, form="db3")
+    with pytest.raises(ChannelCountError, match="as of biotac-sp"):
+        read(path, preset="biotac")
+    assert read(path, preset="biotac-sp").readings.shape == (3, 24)
+    base = sqlite3.connect(next(path.glob("*.db3")))
+    base.execute("DELETE FROM message_definitions")  # as before ROS 2 Iron
+    base.commit()
+    base.close()
+    with pytest.raises(RecordingError, match="pass definitions="):
+        read(path, preset="biotac-sp")
+    full = bags.DEFINITIONS["sr_robot_msgs/msg/BiotacAll"]
+    parts = {"sr_robot_msgs/Biotac": bags.DEFINITIONS["sr_robot_msgs/msg/Biotac"]}
+    parts |= {"std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id"}
+    parts |= {"builtin_interfaces/Time": "int32 sec\nuint32 nanosec"}
+    text = full + "".join(f"\n{'=' * 80}\nMSG: {name}\n{part}" for name, part in parts.items())
+    recording = read(path, preset="biotac-sp", definitions={"sr_robot_msgs/msg/BiotacAll": text})
+    np.testing.assert_array_equal(recording.readings[0], np.arange(24))
+
+
+def test_pictures_come_as_frames(tmp_path, store2):
+    types, pixels = store2.types, RNG.integers(0, 256, (3, 4, 5, 3), dtype=np.uint8)
+    messages = []
+    for i, picture in enumerate(pixels):
+        lines = np.zeros((4, 16), np.uint8)  # a line may be longer than its pixels
+        lines[:, :15] = picture[:, :, ::-1].reshape(4, 15)
+        image = types["sensor_msgs/msg/Image"](
+            header=bags.header(store2, 1.0 + i),
+            height=4,
+            width=5,
+            encoding="bgr8",
+            is_bigendian=0,
+            step=16,
+            data=lines.ravel(),
+        )
+        messages.append((bags.START + i, image))
+    path = bags.write(tmp_path / "i", store2, {"/digit": messages}, form="mcap")
+    recording = read(path, topic="/digit", field="data")
+    np.testing.assert_array_equal(recording.readings, pixels)
+    assert recording.readings.dtype == np.uint8

@@ -1,0 +1,274 @@
+"""Data sets of arrays: LeRobot, robomimic, Zarr replay buffers, `.npy`; and addresses."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import fsspec
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import zarr
+
+from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
+from scroll_tactile.recordings import describe, iterate, read, resampled
+from scroll_tactile.sensors import BIOTAC, CONTACTILE
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
+RNG = np.random.default_rng(3)
+TIP = RNG.standard_normal((30, 19)).astype(np.float32)
+PAD = RNG.standard_normal((30, 4, 6, 3)).astype(np.float32)
+
+
+def lerobot(folder: Path) -> Path:
+    """A LeRobotDataset v3 of three episodes in two files, as its writer lays it out."""
+    episode = np.repeat([0, 1, 2], 10)
+    columns = {
+        "tip": pa.FixedSizeListArray.from_arrays(pa.array(TIP.ravel()), 19),
+        "pad": pa.array(PAD.tolist(), pa.list_(pa.list_(pa.list_(pa.float32())))),
+        "timestamp": pa.array(np.tile(np.arange(10) / 100, 3).astype(np.float32)),
+        "frame_index": pa.array(np.tile(np.arange(10), 3)),
+        "episode_index": pa.array(episode),
+        "index": pa.array(np.arange(30)),
+        "task_index": pa.array(np.where(episode == 1, 1, 0)),
+    }
+    table = pa.table({("observation.tactile." + k if k in ("tip", "pad") else k): v for k, v in columns.items()})
+    for name in ("data/chunk-000", "meta/episodes/chunk-000"):
+        (folder / name).mkdir(parents=True)
+    pq.write_table(table[:20], folder / "data/chunk-000/file-000.parquet")
+    pq.write_table(table[20:], folder / "data/chunk-000/file-001.parquet")
+    episodes = {"episode_index": [0, 1, 2], "data/chunk_index": [0, 0, 0], "data/file_index": [0, 0, 1]}
+    pq.write_table(pa.table(episodes), folder / "meta/episodes/chunk-000/file-000.parquet")
+    tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["slide over felt", "slide over cork"]})
+    pq.write_table(tasks, folder / "meta/tasks.parquet")
+    features = {
+        "observation.tactile.tip": {"dtype": "float32", "shape": [19]},
+        "observation.tactile.pad": {"dtype": "float32", "shape": [4, 6, 3]},
+        "observation.image": {"dtype": "video", "shape": [4, 4, 3]},
+    } | {name: {"dtype": "int64", "shape": [1]} for name in list(columns)[2:]}
+    about = {"codebase_version": "v3.0", "fps": 100, "total_frames": 30, "features": features}
+    about["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    (folder / "meta/info.json").write_text(json.dumps(about))
+    return folder
+
+
+def test_lerobot_of_others_is_read_to_the_bit():
+    if not SHARED.exists():
+        pytest.skip(f"no recordings of others: {SHARED} does not exist, and the project ships none")
+    recording = read(SHARED / "lerobot_v3_tactile", field="observation.tactile.tip")
+    truth = np.load(SHARED / "lerobot_v3_tactile_truth.npy")
+    assert recording.readings.tobytes() == truth.tobytes()
+    assert [e.name for e in recording.episodes] == ["slide over felt", "slide over denim", "slide over cork"]
+
+
+def test_lerobot_episodes_over_several_files(tmp_path):
+    folder = lerobot(tmp_path / "set")
+    recording = read(folder, field="observation.tactile.tip")
+    assert recording.readings.tobytes() == TIP.tobytes()
+    assert [(e.begin, e.end, e.name) for e in recording.episodes] == [
+        (0, 10, "slide over felt"),
+        (10, 20, "slide over cork"),
+        (20, 30, "slide over felt"),
+    ]
+    assert recording.report.backward == 0  # time begins anew in each episode
+    assert (recording.report.lost, round(recording.report.rate)) == (0, 100)
+    assert read(folder, field="pad").readings.tobytes() == PAD.tobytes()
+    assert read(folder, field="tip[0:3]").readings.tobytes() == np.ascontiguousarray(TIP[:, :3]).tobytes()
+    assert [len(block) for block in iterate(folder, field="tip")] == [20, 10]
+    text = str(describe(folder))
+    assert "observation.tactile.pad  [4, 6, 3], 30 readings, 100 Hz" in text
+    assert "field='observation.tactile.tip')" in text
+    even = resampled(recording, 50)
+    assert [(e.begin, e.end) for e in even.episodes] == [(0, 5), (5, 10), (10, 15)]
+    np.testing.assert_allclose(even.readings[1], TIP[2], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("damage", "options", "error", "message"),
+    [
+        (
+            lambda p: (p / "data/chunk-000/file-001.parquet").unlink(),
+            {"field": "tip"},
+            RecordingError,
+            "file-001.parquet",
+        ),
+        (
+            lambda p: (p / "data/chunk-000/file-001.parquet").write_bytes(b"PAR1"),
+            {"field": "tip"},
+            RecordingError,
+            "damaged",
+        ),
+        (lambda p: (p / "meta/info.json").write_text("{"), {"field": "tip"}, RecordingError, "damaged"),
+        (lambda p: (p / "meta/info.json").write_text("[]"), {"field": "tip"}, RecordingError, "damaged"),
+        (
+            lambda p: (p / "meta/info.json").write_text('{"codebase_version": "v2.1"}'),
+            {},
+            RecordingError,
+            "expected v3",
+        ),
+        (lambda p: None, {"field": "observation.tactile.tap"}, FieldError, "nearest is 'observation.tactile.tip'"),
+        (lambda p: None, {"field": "observation.image"}, FieldError, "of type video; expected numbers"),
+        (lambda p: None, {}, FieldError, "expected a field to read"),
+        (lambda p: None, {"field": "tip[40]"}, FieldError, "beyond its 19 columns"),
+        (lambda p: None, {"field": "tip", "clock": "when"}, FieldError, "no column 'when'"),
+    ],
+)
+def test_lerobot_sets_that_are_not_whole(tmp_path, damage, options, error, message):
+    folder = lerobot(tmp_path / "set")
+    damage(folder)
+    with pytest.raises(error, match=message):
+        read(folder, **options)
+
+
+def test_lerobot_tasks_may_be_missing_and_rows_may_not_differ(tmp_path):
+    folder = lerobot(tmp_path / "set")
+    (folder / "meta/tasks.parquet").unlink()
+    recording = read(folder, field="tip")
+    assert {e.name for e in recording.episodes} == {None}
+    assert "tasks are missing" in str(recording.report)
+    path = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    rows = table["observation.tactile.pad"].to_pylist()
+    rows[3][1] = rows[3][1][:5]
+    for broken in (rows, [None, *rows[1:]]):
+        column = pa.array(broken, pa.list_(pa.list_(pa.list_(pa.float32()))))
+        pq.write_table(table.set_column(1, "observation.tactile.pad", column), path)
+        with pytest.raises(RecordingError, match=r"ragged|without a value"):
+            read(folder, field="pad")
+
+
+def robomimic(path: Path, odd: bool = False) -> Path:
+    with h5py.File(path, "w") as file:
+        for i in (10, 2, 0):
+            demo = file.create_group(f"data/demo_{i}")
+            demo["obs/tactile"] = TIP[: i + 3, : 18 if odd and i == 2 else 19]
+            demo["obs/pad"] = PAD[: i + 3]
+            demo["obs/time"] = np.arange(i + 3) / 20
+            demo["actions"] = np.zeros((i + 3, 7))
+        file["name"] = "cup"
+    return path
+
+
+def test_robomimic_demos_are_episodes_in_the_order_of_their_numbers(tmp_path):
+    path = robomimic(tmp_path / "demo.hdf5")
+    recording = read(path, field="obs/tactile")
+    np.testing.assert_array_equal(recording.readings, np.concatenate([TIP[:3], TIP[:5], TIP[:13]]))
+    assert [(e.begin, e.end) for e in recording.episodes] == [(0, 3), (3, 8), (8, 21)]
+    np.testing.assert_array_equal(recording.times[3:8], np.arange(5) / 20)
+    assert (round(recording.report.rate), recording.report.backward) == (20, 0)
+    assert read(path, field="actions", rate=10).times[3:6].tolist() == [0, 0.1, 0.2]
+    assert read(path, field="pad").readings.shape == (21, 72)
+    assert "obs/tactile  [19], 21 readings" in str(describe(path))
+    for field, message in [
+        ("tactil", "nearest is 'obs/tactile'"),
+        (None, "expected a field"),
+        ("name", "expected numbers"),
+    ]:
+        with pytest.raises(FieldError, match=message):
+            read(path, field=field)
+    with pytest.raises(RecordingError, match="ragged"):
+        read(robomimic(tmp_path / "odd.h5", odd=True), field="obs/tactile")
+
+
+def test_zarr_replay_buffers_have_episodes(tmp_path):
+    for version in (2, 3):
+        group = zarr.open_group(tmp_path / f"b{version}.zarr", mode="w", zarr_format=version)
+        group.create_array("data/tactile", data=TIP.astype(np.float64), chunks=(7, 19))
+        group.create_array("data/camera", data=RNG.integers(0, 255, (30, 8, 6, 3), dtype=np.uint8))
+        ends = group.create_array("meta/episode_ends", data=np.array([5, 12, 30]))
+        path = tmp_path / f"b{version}.zarr"
+        recording = read(path, field="data/tactile", rate=10)
+        np.testing.assert_array_equal(recording.readings, TIP.astype(np.float64))
+        assert [(e.begin, e.end) for e in recording.episodes] == [(0, 5), (5, 12), (12, 30)]
+        assert recording.times[[4, 5, 11, 12]].tolist() == [0.4, 0, 0.6, 0]
+        assert read(path, field="camera").readings.shape == (30, 8, 6, 3)
+        assert "data/tactile  [19], 30 readings" in str(describe(path))
+        shutil.make_archive(str(tmp_path / f"z{version}.zarr"), "zip", path)
+        np.testing.assert_array_equal(
+            read(tmp_path / f"z{version}.zarr.zip", field="tactile").readings, recording.readings
+        )
+        ends[:] = [5, 3, 30]
+        with pytest.raises(RecordingError, match="does not rise"):
+            read(path, field="tactile")
+        with pytest.raises(FieldError, match="nearest"):
+            read(path, field="tactole")
+
+
+def test_npy_of_any_shape(tmp_path):
+    path = tmp_path / "a.npy"
+    for array, shape in [
+        (TIP, (30, 19)),
+        (PAD, (30, 72)),
+        (np.arange(5), (5, 1)),
+        (RNG.integers(0, 255, (2, 4, 5, 3), dtype=np.uint8), (2, 4, 5, 3)),
+        (np.array([[True, False]]), (1, 2)),
+    ]:
+        np.save(path, array)
+        recording = read(path, rate=100.0)
+        assert recording.readings.shape == shape
+        np.testing.assert_array_equal(recording.readings.ravel(), array.ravel())
+    np.save(path, TIP)
+    assert read(path, field="[2:4]").readings.tobytes() == np.ascontiguousarray(TIP[:, 2:4]).tobytes()
+    assert read(path).stream(BIOTAC).readings.shape == (30, 19)
+    with pytest.raises(ChannelCountError, match="another sensor's recording"):
+        read(path).stream(CONTACTILE)
+    for array, message in [
+        (np.array(5.0), "expected numbers"),
+        (np.array(["a"]), "expected numbers"),
+        (np.zeros((0, 3)), "no readings"),
+        (np.zeros(3, complex), "expected numbers"),
+    ]:
+        np.save(path, array)
+        with pytest.raises(RecordingError, match=message):
+            read(path)
+
+
+def test_addresses_of_file_systems(tmp_path):
+    files = fsspec.filesystem("memory")
+    np.save(tmp_path / "a.npy", TIP)
+    files.put(str(tmp_path / "a.npy"), "/robots/a.npy")
+    files.put(str(lerobot(tmp_path / "set")), "/robots/set", recursive=True)
+    assert read("memory://robots/a.npy").readings.tobytes() == TIP.tobytes()
+    assert read("memory://robots/set", field="tip").readings.tobytes() == TIP.tobytes()
+    for address, message in [
+        ("memory://robots/b.npy", "is not there"),
+        ("nosuch://x/a.npy", "cannot be reached"),
+        (str(tmp_path / "none.npy"), "is not there"),
+        (str(tmp_path), "a folder with neither"),
+        (str(lerobot(tmp_path / "again") / "meta/info.json"), "expected a recording: .bag"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            read(address)
+
+
+@pytest.mark.parametrize(
+    ("library", "extra", "name"),
+    [("rosbags", "ros", "b.mcap"), ("pyarrow", "lerobot", "set"), ("h5py", "hdf5", "demo.h5")],
+)
+def test_a_library_that_is_not_installed_is_named_with_its_line(tmp_path, library, extra, name):
+    import bags
+
+    robomimic(tmp_path / "demo.h5")
+    lerobot(tmp_path / "set")
+    store = bags.typestore(2)
+    message = bags.array(store, np.zeros(3))
+    next(bags.write(tmp_path / "b", store, {"/s": [(1.0, message)]}, form="mcap").glob("*.mcap")).rename(
+        tmp_path / "b.mcap"
+    )
+    code = f"""
+import sys
+sys.modules[{library!r}] = None
+from scroll_tactile.recordings import read
+from scroll_tactile.errors import RecordingError
+try:
+    read({str(tmp_path / name)!r}, topic='/s', field='data')
+except RecordingError as error:
+    assert "pip install 'scroll-tactile[{extra}]'" in str(error), error
+else:
+    raise AssertionError('read without it')
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -116,7 +116,7 @@ class RosBag:
             row = _picture(decoded, path) if "encoding" in fields_of(decoded) else None
             row = path.reading(decoded) if row is None else row
             if width < 0:
-                width, most = row.size, rows_of(row.nbytes)
+                width, most = row.size, rows_of(max(row.nbytes, 4 * row.size))
                 if not width:
                     raise FieldError(f"field {text!r} of topic {topic!r} holds no value: its array is empty")
             if row.size != width:

@@ -8,7 +8,7 @@ print(describe("touch.mcap"))            # what there is to read
 
 from scroll_tactile.recordings.blocks import Contents, Entry
 from scroll_tactile.recordings.presets import PRESETS, Preset
-from scroll_tactile.recordings.reader import describe, iterate, read
+from scroll_tactile.recordings.reader import describe, find, iterate, read
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, resampled
 from scroll_tactile.recordings.touches import Interval, Touch, read_intervals, touches
 
@@ -24,6 +24,7 @@ __all__ = [
     "Report",
     "Touch",
     "describe",
+    "find",
     "iterate",
     "read",
     "read_intervals",

@@ -95,7 +95,7 @@ class Npy(_Arrays):
     def blocks(self) -> Iterator[Block]:
         """Its rows."""
         array = self._array()
-        if self.request.field is not None and not self.request.field.startswith("["):
+        if self.request.field and not self.request.field.startswith("["):
             raise FieldError(f"{self.address} holds one array without a name; came field {self.request.field!r}")
         if self.request.clock is not None:
             raise FieldError(f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place")

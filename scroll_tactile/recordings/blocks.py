@@ -34,6 +34,7 @@ class Request:
     header: bool | None = None
     delimiter: str | None = None
     decimal: str = "."
+    likely: str | None = None  # the topic, where several have the field
     definitions: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -89,8 +90,8 @@ class Contents:
         if len(self.entries) > 40:
             lines.append(f"  … and {len(self.entries) - 40} more")
         first = self.entries[0]
-        topic = f"topic={first.topic!r}, " if first.topic else ""
-        lines.append(f"read({self.source!r}, {topic}field={first.field!r})")
+        topic = f", topic={first.topic!r}" if first.topic else ""
+        lines.append(f"read({self.source!r}{topic}{f', field={first.field!r}' if first.field else ''})")
         return "\n".join(lines)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -17,7 +17,7 @@ from scroll_tactile.recordings.clocks import choose
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Recording, assemble, resampled
 
-__all__ = ["describe", "iterate", "read"]
+__all__ = ["describe", "find", "iterate", "read"]
 
 _Address = str | PathLike[str]
 
@@ -56,7 +56,7 @@ def read(
     file is not there, damaged, ragged, empty, of no known format, or needs a library that is not installed;
     ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, dict(definitions or {}))
+    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
     request = _with_preset(request, preset)
     address = fspath(path)
     with local(address) as place, guarded(address):
@@ -86,7 +86,7 @@ def iterate(
     Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
     readings; the clock is chosen from the first.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, dict(definitions or {}))
+    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
     request = _with_preset(request, preset)
     address = fspath(path)
     with local(address) as place:
@@ -115,31 +115,56 @@ def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) ->
     """
     address = fspath(path)
     with local(address) as place, guarded(address):
-        return _open(place, address, Request(definitions=dict(definitions or {}))).contents()
+        return _open(place, address, Request(definitions=definitions or {})).contents()
+
+
+def find(path: _Address) -> list[Path]:
+    """The recordings in a local folder and the folders inside it, in the order of their names.
+
+    A file is a recording by its suffix (`.txt` and `.dat` only where they are named themselves), and so is a folder
+    that is one recording. Raises RecordingError for a path where nothing is.
+    """
+    place = Path(path)
+    if not place.exists():
+        raise RecordingError(f"expected recordings in {place}; it is not there")
+    if _kind(place) is not None:
+        return [place]
+    found: list[Path] = []
+    for inside in sorted(place.iterdir()) if place.is_dir() else ():
+        if inside.is_dir() and not inside.name.startswith("."):
+            found += find(inside)
+        elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
+            found.append(inside)
+    return found
 
 
 def _open(path: Path, address: str, request: Request) -> Source:
     """The reader that knows this file's format, by its name or by what a folder holds."""
+    kind = _kind(path)
+    if kind is None:
+        what = "a folder that is none of these" if path.is_dir() else repr(path.name)
+        raise RecordingError(
+            "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
+            f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
+        )
+    return kind(path, address, request)
+
+
+def _kind(path: Path) -> Callable[[Path, str, Request], Source] | None:
     from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag
 
     if rosbag.is_rosbag(path):
-        return rosbag.RosBag(path, address, request)
+        return rosbag.RosBag
     if path.is_dir() and lerobot.is_lerobot(path):
-        return lerobot.LeRobot(path, address, request)
+        return lerobot.LeRobot
     if arraystores.is_zarr(path):
-        return arraystores.ZarrBuffer(path, address, request)
-    suffix = path.suffix.lower()
-    if path.is_file() and suffix == ".npy":
-        return arraystores.Npy(path, address, request)
-    if path.is_file() and suffix in (".h5", ".hdf5", ".hdf"):
-        return arraystores.Hdf5(path, address, request)
-    if path.is_file() and delimited.is_table(path):
-        return delimited.Delimited(path, address, request)
-    what = "a folder with neither metadata.yaml, meta/info.json nor a Zarr group" if path.is_dir() else repr(path.name)
-    raise RecordingError(
-        f"expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, or the folder of a bag or of a LeRobot data "
-        f"set; came {what} at {address}"
-    )
+        return arraystores.ZarrBuffer
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    if suffix in (".h5", ".hdf5", ".hdf"):
+        return arraystores.Hdf5
+    if suffix and delimited.is_table(path):
+        return delimited.Delimited
+    return arraystores.Npy if suffix == ".npy" else None
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:
@@ -194,7 +219,7 @@ def _with_preset(request: Request, name: str | None) -> Request:
     if name is None:
         return request
     preset = presets.find(name)
-    return replace(request, topic=request.topic or preset.topic, field=request.field or preset.field)
+    return replace(request, field=request.field or preset.field, likely=preset.topic)
 
 
 def _require(recording: Recording, name: str | None) -> None:

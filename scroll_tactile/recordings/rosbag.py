@@ -7,18 +7,22 @@ import json
 import re
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings import presets
-from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag, scan_db3, scan_mcap
+from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, floats, missing, rows_of
 from scroll_tactile.recordings.clocks import Stamps
+from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
+from scroll_tactile.recordings.sqlitefile import scan_db3
 
 __all__ = ["SUFFIXES", "RosBag", "is_rosbag"]
 
@@ -30,9 +34,13 @@ _LOOKED = 2000  # messages are looked at to say what a bag holds
 
 def is_rosbag(path: Path) -> bool:
     """Whether this is a recording of ROS: one of its files, or a folder of them."""
-    if path.is_dir():
-        return (path / "metadata.yaml").exists() or any(_is_file(inside) for inside in path.iterdir())
-    return _is_file(path)
+    return (path / "metadata.yaml").exists() or bool(_parts(path)) if path.is_dir() else _is_file(path)
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The parts of one recording in their order: files whose names differ in a last number alone; otherwise none."""
+    files = sorted((inside for inside in folder.iterdir() if _is_file(inside)), key=lambda file: _natural(file.name))
+    return files if len({re.sub(r"\d+(?=\.|$)", "", file.name, count=1) for file in files}) == 1 else []
 
 
 def _is_file(path: Path) -> bool:
@@ -74,10 +82,8 @@ class RosBag:
                     self.notes.append(str(error))
                     entries[key] = []
                     continue
-                known = presets.fields_for(message.channel.type, decoded)
-                entries[key] = [
-                    Entry(key[0], text, shape, kind=key[1]) for text, shape in (known or list(_numbers(decoded)))
-                ]
+                fields = dict([*presets.fields_for(message.channel.type, decoded), *_numbers(decoded)])
+                entries[key] = [Entry(key[0], text, shape, kind=key[1]) for text, shape in fields.items()]
         total = sum(map(len, seen.values()))
         found = [
             Entry(entry.topic, entry.field, entry.shape, len(logs), _rate(logs), entry.kind)
@@ -113,7 +119,7 @@ class RosBag:
                 self.marks.append((message.log / 1e9, _text_in(decoded, channel)))
                 if labels != topic:
                     continue
-            row = _picture(decoded, path) if "encoding" in fields_of(decoded) else None
+            row = _picture(decoded) if path.text == "data" else None
             row = path.reading(decoded) if row is None else row
             if width < 0:
                 width, most = row.size, rows_of(max(row.nbytes, 4 * row.size))
@@ -149,20 +155,33 @@ class RosBag:
             if not fields:
                 self._absent(topic)
             raise FieldError(f"expected a topic and a field to read\n{Contents(contents.source, tuple(fields))}")
-        root = re.split(r"[.\[{]", text.strip(), maxsplit=1)[0].lower()
-        topics = {e.topic for e in contents.entries if re.split(r"[.\[{]", e.field, maxsplit=1)[0].lower() == root}
+        topics = self._having(FieldPath(text))
+        if len(topics) > 1 and self.request.likely in topics:
+            topics = [self.request.likely]
         if len(topics) != 1:
             raise FieldError(f"{'several topics have' if topics else 'no topic has'} a field {text!r}\n{contents}")
-        return str(topics.pop()), text
+        return topics[0], text
 
-    def _absent(self, topic: str | None) -> None:
-        topics: dict[str, None] = {}
-        for message in itertools.islice(self._messages(lambda name: True), _LOOKED):
-            topics[message.channel.topic] = None
+    def _having(self, path: FieldPath) -> list[str]:
+        """The topics in whose first message a path leads to numbers."""
+        topics: dict[str, bool] = {}
+        for message in itertools.islice(self._messages(lambda name: name not in topics), _LOOKED):
+            topics[message.channel.topic] = False
+            with suppress(RecordingError):
+                topics[message.channel.topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
+        return [topic for topic, has in topics.items() if has]
+
+    def _absent(self, topic: str | None) -> NoReturn:
+        problems = self.notes
+        topics = {
+            message.channel.topic: None for message in itertools.islice(self._messages(lambda name: True), _LOOKED)
+        }
         if not topics:
             raise RecordingError(
                 f"{self.address} holds no message" + (f": {'; '.join(self.notes)}" if self.notes else "")
             )
+        if topic is None:
+            raise RecordingError(f"{self.address} has no numbers in {', '.join(topics)}: {'; '.join(problems)}")
         raise FieldError(f"{self.address} holds no message of topic {topic!r}{nearest(str(topic), list(topics))}")
 
     def _messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
@@ -189,7 +208,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
     """The files of a recording in their order, and whether its messages are compressed one by one."""
     if not path.is_dir():
         return [path], False
-    there = sorted((p for p in path.iterdir() if _is_file(p)), key=lambda p: _natural(p.name))
+    there = _parts(path)
     listed = path / "metadata.yaml"
     if not listed.exists():
         return there, False
@@ -301,16 +320,29 @@ def _text_in(message: object, channel: Channel) -> str:
     raise FieldError(f"topic {channel.topic!r} of type {channel.type} cannot label: expected one field with text")
 
 
-def _picture(message: Any, path: FieldPath) -> npt.NDArray[np.uint8] | None:
-    """The pixels of a sensor_msgs/Image, shape (height, width, 3) in red, green, blue; None for anything else."""
-    orders = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0], "mono8": [0, 0, 0]}
-    order = orders.get(message.encoding)
-    if path.text != "data" or order is None or not {"height", "width", "step"} <= set(fields_of(message)):
+_ORDERS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0], "mono8": [0, 0, 0]}
+
+
+def _picture(message: Any) -> npt.NDArray[np.uint8] | None:
+    """The pixels of a sensor_msgs Image or CompressedImage, (height, width, 3) in red, green, blue; None otherwise."""
+    fields = set(fields_of(message))
+    if fields == {"header", "format", "data"}:
+        return _decompressed(bytes(message.data))
+    if not {"height", "width", "step", "encoding"} <= fields or message.encoding not in _ORDERS:
         return None
-    depth = len(message.encoding.removesuffix("8")) if message.encoding != "mono8" else 1
+    depth = 1 if message.encoding == "mono8" else len(message.encoding) - 1
     height, width = message.height, message.width
     pixels = np.frombuffer(bytes(message.data), np.uint8)
     if message.step < width * depth or pixels.size < height * message.step:
         raise RecordingError(f"a picture of {height} × {width} pixels is claimed; there are {pixels.size} bytes")
     lines = pixels[: height * message.step].reshape(height, message.step)[:, : width * depth]
-    return lines.reshape(height, width, depth)[:, :, order]
+    return lines.reshape(height, width, depth)[:, :, _ORDERS[message.encoding]]
+
+
+def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise missing("Pillow", "gelsight", "a topic of compressed pictures") from error
+    with Image.open(BytesIO(data)) as picture:
+        return np.asarray(picture.convert("RGB"))

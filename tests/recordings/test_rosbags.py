@@ -1,17 +1,21 @@
 """Bags of ROS 1 and ROS 2: the numbers to the bit, the clocks, and what goes wrong with them."""
 
+import io
 import shutil
 import sqlite3
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import bags
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
-from scroll_tactile.recordings import describe, iterate, read, resampled
+from scroll_tactile.recordings import describe, find, iterate, read, resampled
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
 RNG = np.random.default_rng(7)
@@ -310,3 +314,88 @@ def test_pictures_come_as_frames(tmp_path, store2):
     recording = read(path, topic="/digit", field="data")
     np.testing.assert_array_equal(recording.readings, pixels)
     assert recording.readings.dtype == np.uint8
+
+
+def test_compressed_pictures_come_as_frames(tmp_path, store2):
+    pixels = RNG.integers(0, 256, (2, 8, 6, 3), dtype=np.uint8)
+    messages = []
+    for i, picture in enumerate(pixels):
+        buffer = io.BytesIO()
+        Image.fromarray(picture).save(buffer, "PNG")
+        kind = store2.types["sensor_msgs/msg/CompressedImage"]
+        data = np.frombuffer(buffer.getvalue(), np.uint8)
+        messages.append((bags.START + i, kind(header=bags.header(store2, 1.0 + i), format="png", data=data)))
+    path = bags.write(tmp_path / "i", store2, {"/gel": messages}, form="mcap")
+    np.testing.assert_array_equal(read(path, preset="gelsight").readings, pixels)
+
+
+def test_a_preset_finds_its_field_under_any_topic(tmp_path, store2):
+    values = np.arange(3 * 19, dtype=np.int16).reshape(3, 19)
+    mine = [(bags.START + i, bags.biotac(store2, row, 1.0 + i)) for i, row in enumerate(values)]
+    path = bags.write(tmp_path / "one", store2, {"/my/hand": mine}, form="mcap")
+    assert read(path, preset="biotac").topic == "/my/hand"
+    path = bags.write(tmp_path / "two", store2, {"/my/hand": mine, "/rh/tactile": mine[:2]}, form="mcap")
+    assert len(read(path, preset="biotac")) == 2
+    path = bags.write(tmp_path / "three", store2, {"/my/hand": mine, "/my/other": mine[:2]}, form="mcap")
+    with pytest.raises(FieldError, match="several topics have"):
+        read(path, preset="biotac")
+    with pytest.raises(FieldError, match="no topic has"):
+        read(path, preset="papillarray")
+    with pytest.raises(InputError, match="nearest is 'biotac'"):
+        read(path, preset="biotak")
+
+
+def test_recordings_are_found_in_folders(tmp_path, store2):
+    _, messages = floats(store2, 3)
+    for name in ("felt/a", "felt/b"):
+        (tmp_path / "felt").mkdir(exist_ok=True)
+        bags.write(tmp_path / name, store2, {"/skin": messages}, form="mcap")
+    (tmp_path / "cork").mkdir()
+    for name in ("take.mcap", "other.mcap", "notes.txt", "labels.csv"):
+        shutil.copy(next((tmp_path / "felt/a").glob("*.mcap")), tmp_path / "cork" / name)
+    found = [path.relative_to(tmp_path).as_posix() for path in find(tmp_path)]
+    assert found == ["cork/labels.csv", "cork/other.mcap", "cork/take.mcap", "felt/a", "felt/b"]
+    assert find(tmp_path / "felt" / "a") == [tmp_path / "felt" / "a"]
+    with pytest.raises(RecordingError, match="a folder that is none of these"):  # two takes are no split recording
+        read(tmp_path / "cork", topic="/skin", field="data")
+    with pytest.raises(RecordingError, match="not there"):
+        find(tmp_path / "none")
+
+
+def test_messages_in_json_and_of_ros_1_in_mcap(tmp_path, store1):
+    def record(kind, data):
+        return struct.pack("<BQ", kind, len(data)) + data
+
+    def text(value):
+        return struct.pack("<I", len(value)) + value
+
+    def file(encoding, kind, definition, payloads):
+        body = record(1, text(b"") + text(b"")) + record(
+            3, struct.pack("<H", 1) + text(kind) + text(b"") + text(definition)
+        )
+        body += record(4, struct.pack("<HH", 1, 1) + text(b"/skin") + text(encoding) + text(b""))
+        for i, payload in enumerate(payloads):
+            body += record(5, struct.pack("<HIQQ", 1, i, 10**9 * (i + 1), 10**9 * (i + 1)) + payload)
+        path = tmp_path / "m.mcap"
+        path.write_bytes(b"\x89MCAP0\r\n" + body)
+        return path
+
+    path = file(b"json", b"Skin", b"", [b'{"skin": [{"v": [1, 2]}, {"v": [3.5, 4]}], "name": "a"}'] * 2)
+    assert read(path, topic="/skin", field="skin[*].v").readings.tolist() == [[1, 2, 3.5, 4]] * 2
+    assert read(path, topic="/skin", field="skin[*].v").report.cut_off
+    with pytest.raises(FieldError, match="leads to text"):
+        read(path, field="name", topic="/skin")
+    message = bags.array(store1, np.arange(3))
+    definition, _ = store1.generate_msgdef(message.__msgtype__)
+    data = bytes(store1.serialize_ros1(message, message.__msgtype__))
+    path = file(b"ros1", b"std_msgs/Float32MultiArray", definition.encode(), [data])
+    assert read(path, topic="/skin", field="data").readings.tolist() == [[0, 1, 2]]
+    path = file(b"protobuf", b"Skin", b"", [b"x"])
+    with pytest.raises(RecordingError, match="encoded as 'protobuf'; expected cdr, ros1 or json"):
+        read(path, topic="/skin", field="data")
+
+
+def test_importing_brings_no_library_of_a_format():
+    heavy = ["rosbags", "pyarrow", "h5py", "zarr", "fsspec", "torch", "lz4", "sqlite3", "PIL"]
+    code = f"import sys, scroll_tactile.recordings; print([name for name in {heavy} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout.strip() == b"[]"

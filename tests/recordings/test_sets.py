@@ -213,6 +213,7 @@ def test_npy_of_any_shape(tmp_path):
         np.testing.assert_array_equal(recording.readings.ravel(), array.ravel())
     np.save(path, TIP)
     assert read(path, field="[2:4]").readings.tobytes() == np.ascontiguousarray(TIP[:, 2:4]).tobytes()
+    assert str(describe(path)).endswith(f"read({str(path)!r})")
     assert read(path).stream(BIOTAC).readings.shape == (30, 19)
     with pytest.raises(ChannelCountError, match="another sensor's recording"):
         read(path).stream(CONTACTILE)
@@ -238,7 +239,7 @@ def test_addresses_of_file_systems(tmp_path):
         ("memory://robots/b.npy", "is not there"),
         ("nosuch://x/a.npy", "cannot be reached"),
         (str(tmp_path / "none.npy"), "is not there"),
-        (str(tmp_path), "a folder with neither"),
+        (str(tmp_path), "a folder that is none of these"),
         (str(lerobot(tmp_path / "again") / "meta/info.json"), "expected a recording: .bag"),
     ]:
         with pytest.raises(InputError, match=message):

@@ -1,0 +1,88 @@
+"""Messages out of ROS 2's SQLite files, `.db3`, whole or cut off, in the order they were written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+from scroll_tactile.errors import RecordingError
+from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, zstd
+
+__all__ = ["scan_db3"]
+
+
+def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Message]:
+    """The messages of a ROS 2 SQLite file, in the order they were written; `compressed`: each by itself, by zstd."""
+    import sqlite3
+
+    with ExitStack() as stack:
+        base = stack.enter_context(closing(_connect(_whole_pages(path, scan, stack))))
+        try:
+            channels = _channels(base)
+        except sqlite3.DatabaseError as error:
+            raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
+        wanted = [number for number, channel in channels.items() if scan.wanted(channel.topic)]
+        marks = ",".join("?" * len(wanted))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
+        try:
+            for number, log, data in base.execute(query, wanted):
+                whole = zstd().decompress(data) if compressed else data
+                yield Message(channels[number], log, None, None, 0, whole)
+        except sqlite3.DatabaseError as error:
+            scan.cut_off = str(error)
+
+
+def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
+    """A file that ends inside a page without that page, as a copy: SQLite would read zeros for what is missing."""
+    with path.open("rb") as file:
+        head = file.read(100)
+        if head[:16] != b"SQLite format 3\0" or len(head) < 100:
+            raise RecordingError(f"{path} does not begin as an SQLite file does")
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        size = path.stat().st_size
+        if page < 512 or size % page == 0:
+            return path
+        scan.cut_off = "it ends in the middle of a page"
+        target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
+        file.seek(0)
+        with target.open("wb") as copy:
+            for _ in range(size // page):
+                copy.write(file.read(page))
+    return target
+
+
+def _connect(path: Path) -> Any:
+    import sqlite3
+
+    address = path.resolve().as_uri()
+    for mode in ("mode=ro", "mode=ro&immutable=1"):  # a write-ahead log cannot be read where nothing may be written
+        base = sqlite3.connect(f"{address}?{mode}", uri=True)
+        base.text_factory = lambda data: data.decode(errors="replace")
+        try:
+            base.execute("PRAGMA writable_schema=ON")  # otherwise SQLite gives nothing of a file that was cut off
+            base.execute("SELECT 1 FROM sqlite_master").fetchone()
+            return base
+        except sqlite3.OperationalError:
+            base.close()
+        except sqlite3.DatabaseError as error:
+            base.close()
+            raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
+    raise RecordingError(f"{path} cannot be opened as an SQLite file: is it being written, or readable at all?")
+
+
+def _channels(base: Any) -> dict[int, Channel]:
+    tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if not {"topics", "messages"} <= tables:
+        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)}")
+    definitions = {}
+    if "message_definitions" in tables:  # since ROS 2 Iron
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        definitions = {name: (text, form == "ros2idl") for name, form, text in base.execute(query)}
+    return {
+        number: Channel(topic, name, form, *definitions.get(name, ("", False)))
+        for number, topic, name, form in base.execute("SELECT id, name, type, serialization_format FROM topics")
+    }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import LARGEST, Block, Contents, Entry, Request, floats, missing, rows_of
+from scroll_tactile.recordings.blocks import LARGEST, Block, Contents, Entry, Source, floats, missing, rows_of
 from scroll_tactile.recordings.keys import CLOCK_KEYS, matched
 from scroll_tactile.recordings.paths import select
 
@@ -24,20 +24,8 @@ def is_zarr(path: Path) -> bool:
     return path.name.lower().endswith(".zarr.zip")
 
 
-class _Arrays:
-    """What the three have in common; see `Source`."""
-
-    def __init__(self, path: Path, address: str, request: Request) -> None:
-        self.path, self.address, self.request = path, address, request
-        self.topic: str | None = None
-        self.notes: list[str] = []
-        self.cut_off = False
-        self.names: dict[int, str] = {}
-        self.marks: list[tuple[float, str]] = []
-
-    def field(self) -> str:
-        """The array that is read."""
-        return self.request.field or ""
+class _Arrays(Source):
+    """What the three have in common."""
 
     def _listed(self, arrays: dict[str, list[Any]]) -> Contents:
         """The arrays that hold numbers in rows, touch first; the parts of one are its episodes."""

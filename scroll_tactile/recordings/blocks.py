@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -95,31 +97,35 @@ class Contents:
         return "\n".join(lines)
 
 
-class Source(Protocol):
-    """A file that was opened for reading; `notes` and `names` fill up as blocks are read.
+class Source(ABC):
+    """A file that was opened for reading; `notes`, `names` and `marks` fill up as blocks are read.
 
-    address: where it is. topic: the topic that is read; None where the format has none.
-    notes: what went wrong without losing everything, as sentences.
-    cut_off: whether the file ends before its end.
+    path, address: where it is on this machine, and as it was asked for. request: what is asked of it.
+    topic: the topic that is read; None where the format has none.
+    notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
     names: what each episode is called, by its number.
     marks: what a topic of labels said when: seconds by the clock "log", and a text.
     """
 
-    address: str
-    topic: str | None
-    notes: list[str]
-    cut_off: bool
-    names: dict[int, str]
-    marks: list[tuple[float, str]]
+    def __init__(self, path: Path, address: str, request: Request) -> None:
+        self.path, self.address, self.request = path, address, request
+        self.topic = request.topic
+        self.notes: list[str] = []
+        self.cut_off = False
+        self.names: dict[int, str] = {}
+        self.marks: list[tuple[float, str]] = []
 
+    def field(self) -> str:
+        """The field that is read, as far as it is known before reading."""
+        return self.request.field or ""
+
+    @abstractmethod
     def contents(self) -> Contents:
         """What the file has."""
 
-    def field(self) -> str:
-        """The field that is read, in full."""
-
+    @abstractmethod
     def blocks(self) -> Iterator[Block]:
-        """The readings that were requested, in the order of the file."""
+        """The readings that were requested, in the order of the file; raises FieldError where they are not there."""
 
 
 def rows_of(width: int) -> int:

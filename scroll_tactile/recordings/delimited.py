@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, rows_of
 from scroll_tactile.recordings.paths import nearest
 
 __all__ = ["Delimited", "is_missing", "is_number", "is_table"]
@@ -46,7 +46,7 @@ def is_missing(cell: str) -> bool:
     return cell.strip().lower() in _MISSING
 
 
-class Delimited:
+class Delimited(Source):
     """A table of text; see `Source`.
 
     A first row is a header where it has text in it, or counts 0, 1, 2 … as pandas does. A first column without a name
@@ -54,12 +54,7 @@ class Delimited:
     """
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
-        self.path, self.address, self.request = path, address, request
-        self.topic: str | None = None
-        self.notes: list[str] = []
-        self.cut_off = False
-        self.names: dict[int, str] = {}
-        self.marks: list[tuple[float, str]] = []
+        super().__init__(path, address, request)
         if request.decimal not in (".", ","):
             raise RecordingError(f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}")
         with self._text() as file:
@@ -67,6 +62,9 @@ class Delimited:
         self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
         rows = [(number, self._cells(line, number)) for number, line in lines]
         self.width = len(rows[0][1])
+        mark = re.escape(self.delimiter)
+        tokens = "|".join(re.escape(token) for token in sorted(_MISSING, key=len, reverse=True))
+        self._empty = re.compile(rf"(?:(?<={mark})|^)[^\S{mark}]*(?:{tokens})[^\S{mark}]*(?={mark}|$)", re.IGNORECASE)
         self.header = self._header(rows)
         names = rows[0][1] if self.header else [str(i) for i in range(self.width)]
         if not self.header and self.comment and len(self.comment.split()) == self.width:
@@ -133,11 +131,6 @@ class Delimited:
         """All numbers at once, by numpy's parser; None where a row needs a closer look."""
         if self.label is not None or self.delimiter == '"' or len(self.delimiter) != 1:
             return None
-        text = "".join(lines)
-        if not text.isascii() or any(
-            mark in text for mark in '"_xXnN'
-        ):  # quotes, 1_000, hexadecimals, NaN in all forms
-            return None
         if self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines):
             return None
         if self.request.decimal == ",":
@@ -147,6 +140,7 @@ class Delimited:
             if self.delimiter == " ":
                 whole = np.loadtxt(lines, comments=None, ndmin=2)
                 return whole[:, columns] if whole.shape[1] == self.width else None
+            lines = [self._empty.sub("nan", line) for line in lines]  # numpy's parser refuses what is missing
             return np.loadtxt(lines, delimiter=self.delimiter, comments=None, ndmin=2, usecols=columns)
         except ValueError:
             return None

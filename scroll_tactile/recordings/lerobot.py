@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, floats, missing, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
 from scroll_tactile.recordings.keys import matched
 from scroll_tactile.recordings.paths import select
 
@@ -25,7 +25,7 @@ def is_lerobot(path: Path) -> bool:
     return (path / "meta" / "info.json").is_file()
 
 
-class LeRobot:
+class LeRobot(Source):
     """A LeRobotDataset; see `Source`. An episode is called what its task is."""
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
@@ -34,12 +34,7 @@ class LeRobot:
         except ImportError as error:
             raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
         self.parquet: Any = parquet
-        self.path, self.address, self.request = path, address, request
-        self.topic: str | None = None
-        self.notes: list[str] = []
-        self.cut_off = False
-        self.names: dict[int, str] = {}
-        self.marks: list[tuple[float, str]] = []
+        super().__init__(path, address, request)
         self.info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
         version = str(self.info.get("codebase_version", ""))
         if not version.startswith("v3"):
@@ -48,10 +43,6 @@ class LeRobot:
                 "(python -m lerobot.datasets.v30.convert_dataset_v21_to_v30)"
             )
         self.features: dict[str, Any] = self.info["features"]
-
-    def field(self) -> str:
-        """The column that is read."""
-        return str(self.request.field)
 
     def contents(self) -> Contents:
         """The columns that hold numbers, touch first."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, floats, missing, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
 from scroll_tactile.recordings.clocks import Stamps
 from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
@@ -48,24 +48,13 @@ def _is_file(path: Path) -> bool:
     return name.endswith(SUFFIXES)
 
 
-class RosBag:
+class RosBag(Source):
     """A ROS 1 or ROS 2 recording: one file, or a folder of the parts that it was split into; see `Source`."""
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
-        self.address = address
-        self.request = request
-        self.topic = request.topic
-        self.notes: list[str] = []
-        self.cut_off = False
-        self.names: dict[int, str] = {}
-        self.marks: list[tuple[float, str]] = []
+        super().__init__(path, address, request)
         self.files, self.compressed = _files(path)
         self.types = _Types(request)
-        self._field: FieldPath | None = None
-
-    def field(self) -> str:
-        """The path to the numbers, as requested."""
-        return self._field.text if self._field is not None else ""
 
     def contents(self) -> Contents:
         """The numbers in the first messages of each topic, those of known sensors first."""
@@ -101,7 +90,7 @@ class RosBag:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
         request = self.request
         self.topic, text = topic, _ = self._choose()
-        self._field = path = FieldPath(text)
+        path = FieldPath(text)
         stamps = Stamps(request.clock, text)
         rows: list[npt.NDArray[Any]] = []
         width, most, unfit = -1, 1, 0

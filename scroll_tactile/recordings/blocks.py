@@ -105,7 +105,10 @@ class Source(ABC):
     notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
     names: what each episode is called, by its number.
     marks: what a topic of labels said when: seconds by the clock "log", and a text.
+    continuous: whether time goes on from one episode to the next, and does not begin anew.
     """
+
+    continuous = False
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request

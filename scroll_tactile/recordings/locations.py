@@ -42,7 +42,9 @@ def _copied(address: str, folder: Path) -> Path:
 
         files, path = fsspec.core.url_to_fs(address)
     except ImportError as error:
-        raise missing("s3fs" if scheme in ("s3", "s3a") else f"fsspec for {scheme}", "s3", address) from error
+        if scheme in ("s3", "s3a"):
+            raise missing("s3fs", "s3", address) from error
+        raise RecordingError(f"{address} cannot be reached: {error}") from error
     except ValueError as error:
         raise RecordingError(f"{address} cannot be reached: {error}") from error
     target = folder / (Path(path.rstrip("/")).name or "recording")

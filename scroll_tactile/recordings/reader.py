@@ -61,7 +61,7 @@ def read(
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request)
-        whole = _joined(_timed(source, request))
+        whole = _joined(_timed(source, request), address)
         recording = _recording(whole, source, _clock(whole, request.clock))
     _require(recording, preset)
     return recording if resample is None else resampled(recording, resample)
@@ -131,6 +131,8 @@ def find(path: _Address) -> list[Path]:
         return [place]
     found: list[Path] = []
     for inside in sorted(place.iterdir()) if place.is_dir() else ():
+        if inside.is_symlink() and inside.is_dir():
+            continue  # it may lead back here
         if inside.is_dir() and not inside.name.startswith("."):
             found += find(inside)
         elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
@@ -175,7 +177,9 @@ def _timed(source: Source, request: Request) -> Iterator[Block]:
     for block in source.blocks():
         if request.rate is not None and not block.clocks:
             length = len(block.readings)
-            numbers = np.zeros(length, np.int64) if block.episodes is None else block.episodes
+            numbers = block.episodes
+            if numbers is None or source.continuous:
+                numbers = np.zeros(length, np.int64)
             index = np.arange(count, count + length)
             for begin in np.flatnonzero(np.diff(numbers, prepend=numbers[0] if last is None else last)):
                 index[begin:] = np.arange(length - begin)
@@ -184,15 +188,16 @@ def _timed(source: Source, request: Request) -> Iterator[Block]:
         yield block
 
 
-def _joined(blocks: Iterator[Block]) -> Block:
+def _joined(blocks: Iterator[Block], address: str) -> Block:
     """All blocks as one; raises RecordingError where there are none."""
     parts = list(blocks)
     if not parts:
-        raise RecordingError("the recording holds no readings")
+        raise RecordingError(f"{address} holds no readings")
     if len(parts) == 1:
         return parts[0]
     if len({part.readings.shape[1:] for part in parts}) > 1:
-        raise RecordingError(f"readings are ragged: they have {sorted({p.readings.shape[1:] for p in parts})} values")
+        shapes = sorted({part.readings.shape[1:] for part in parts})
+        raise RecordingError(f"{address}: readings are ragged: they have {shapes} values")
 
     def whole(name: str) -> dict[str, Any]:
         columns = [getattr(part, name) for part in parts]
@@ -203,7 +208,7 @@ def _joined(blocks: Iterator[Block]) -> Block:
 
 
 def _recording(block: Block, source: Source, clock: str | None) -> Recording:
-    readings, times, episodes, report = assemble(block, clock, source.names, source.marks)
+    readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
     return Recording(source.address, source.topic, source.field(), readings, times, episodes, report)
 

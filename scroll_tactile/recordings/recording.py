@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import ChannelCountError, InputError
-from scroll_tactile.recordings.blocks import Block
+from scroll_tactile.recordings.blocks import Block, Source
 from scroll_tactile.recordings.clocks import lost
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
@@ -115,10 +115,7 @@ class Recording:
 
 
 def assemble(
-    block: Block,
-    clock: str | None,
-    names: dict[int, str],
-    marks: list[tuple[float, str]],
+    block: Block, clock: str | None, source: Source
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], tuple[Episode, ...], Report]:
     """Readings, times by this clock, episodes and the report, from one block."""
     order = _order(block)
@@ -126,10 +123,9 @@ def assemble(
     clocks = {name: times if order is None else times[order] for name, times in block.clocks.items()}
     counters = {name: counts if order is None else counts[order] for name, counts in block.counters.items()}
     numbers = block.episodes if order is None or block.episodes is None else block.episodes[order]
-    episodes = _spans(clocks["log"], marks) if marks else _runs(numbers, names)
-    borders = (
-        np.array([episode.begin for episode in episodes if episode.begin], np.int64) if not marks else np.empty(0, int)
-    )
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _runs(numbers, source.names)
+    begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
+    borders = np.array(begins, np.int64)
     times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
     return readings, times, episodes, _report(times, clock, counters, borders, unset)

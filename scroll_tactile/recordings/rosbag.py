@@ -80,16 +80,14 @@ class RosBag(Source):
             for entry in entries[key]
         ]
         found.sort(key=lambda entry: not presets.is_known(entry.kind))
-        return Contents(
-            self.address,
-            tuple(found),
-            f"in its first {total} messages, among others perhaps" if total == _LOOKED else "",
-        )
+        looked = f"in its first {total} messages, among others perhaps" if total == _LOOKED else ""
+        return Contents(self.address, tuple(found), looked)
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
         request = self.request
-        self.topic, text = topic, _ = self._choose()
+        topic, text = self._choose()
+        self.topic = topic
         path = FieldPath(text)
         stamps = Stamps(request.clock, text)
         rows: list[npt.NDArray[Any]] = []
@@ -154,17 +152,18 @@ class RosBag(Source):
     def _having(self, path: FieldPath) -> list[str]:
         """The topics in whose first message a path leads to numbers."""
         topics: dict[str, bool] = {}
-        for message in itertools.islice(self._messages(lambda name: name not in topics), _LOOKED):
-            topics[message.channel.topic] = False
-            with suppress(RecordingError):
-                topics[message.channel.topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
+        for message in itertools.islice(self._messages(lambda name: True), _LOOKED):
+            topic = message.channel.topic
+            if topic not in topics:
+                topics[topic] = False
+                with suppress(RecordingError):
+                    topics[topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
         return [topic for topic, has in topics.items() if has]
 
     def _absent(self, topic: str | None) -> NoReturn:
         problems = self.notes
-        topics = {
-            message.channel.topic: None for message in itertools.islice(self._messages(lambda name: True), _LOOKED)
-        }
+        messages = itertools.islice(self._messages(lambda name: True), _LOOKED)
+        topics = dict.fromkeys(message.channel.topic for message in messages)
         if not topics:
             raise RecordingError(
                 f"{self.address} holds no message" + (f": {'; '.join(self.notes)}" if self.notes else "")

@@ -89,6 +89,7 @@ def test_columns_are_named_by_lists_ranges_and_patterns(tmp_path):
     assert recording.times.tolist() == [1, 2, 3, 4]
     assert [(e.begin, e.end, e.name) for e in recording.episodes] == [(0, 2, "felt"), (2, 3, None), (3, 4, "cork")]
     assert read(path, labels="material").readings.shape == (4, 5)
+    assert read(path, labels="material", rate=10).times.tolist() == [0, 0.1, 0.2, 0.3]
     with pytest.raises(FieldError, match="no column 'e9'; nearest is 'e"):
         read(path, field="e9")
     with pytest.raises(RecordingError, match="the column of labels by labels="):

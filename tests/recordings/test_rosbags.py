@@ -16,6 +16,8 @@ from rosbags.highlevel import AnyReader
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, find, iterate, read, resampled
+from scroll_tactile.sensors import BIOTAC
+from scroll_tactile.signals.stream import validate
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
 RNG = np.random.default_rng(7)
@@ -140,6 +142,43 @@ def test_papillarray_counts_microseconds_and_ros_2_writes_in_lower_case(tmp_path
     np.testing.assert_array_equal(recording.times, np.arange(30) * 2000 / 1e6)
     assert read(path, preset="papillarray", clock="header").times[0] == bags.START
     assert "dX" in str(describe(path)) or "fX" in str(describe(path))
+
+
+def test_other_drivers_messages(tmp_path, store1):
+    types = store1.types
+    patches = [RNG.standard_normal((20, 12)).astype(np.float32), RNG.standard_normal((20, 16)).astype(np.float32)]
+    channel = types["sensor_msgs/msg/ChannelFloat32"]
+    states = [
+        types["tactile_msgs/msg/TactileState"](
+            header=bags.header(store1, bags.START + i / 100, i),
+            sensors=[channel(name=f"p{k}", values=patch[i]) for k, patch in enumerate(patches)],
+        )
+        for i in range(20)
+    ]
+    pads = RNG.integers(0, 65536, (20, 2, 28)).astype(np.uint16)
+    static = [
+        types["robotiq_tsf/msg/StaticData"](taxels=[types["robotiq_tsf/msg/Taxels"](values=pad) for pad in both])
+        for both in pads
+    ]
+    topics = {
+        "/tactile": [(bags.START + i / 100, state) for i, state in enumerate(states) if i not in (5, 6, 9)],
+        "/TactileSensor/StaticData": [(bags.START + i / 60, both) for i, both in enumerate(static)],
+    }
+    path = bags.write(tmp_path / "b.bag", store1, topics, form="bag")
+    recording = read(path, field="sensors[*].values")
+    kept = [i for i in range(20) if i not in (5, 6, 9)]
+    np.testing.assert_array_equal(recording.readings, np.hstack(patches)[kept])
+    assert (recording.report.lost, recording.report.clock) == (3, "header")  # ROS 1 counts in the header
+    recording = read(path, preset="robotiq-tsf")
+    np.testing.assert_array_equal(recording.readings, pads.reshape(20, 56))
+    assert (recording.report.lost, recording.report.clock) == (None, "log")
+
+
+def test_a_reading_out_of_a_bag_is_the_stream_of_its_array(tmp_path, store1):
+    values = RNG.integers(0, 256, (400, 19)).astype(np.int16)
+    messages = [(bags.START + i / 100, bags.biotac(store1, row, bags.START + i / 100)) for i, row in enumerate(values)]
+    path = bags.write(tmp_path / "b.bag", store1, {"/rh/tactile": messages}, form="bag")
+    assert read(path, preset="biotac").stream(BIOTAC).key == validate(values, BIOTAC).key
 
 
 def test_a_header_of_zeros_and_no_header_fall_back(tmp_path, store2):

@@ -56,7 +56,7 @@ class Stamps:
             self.values.append(_stamp(self.device[1], decoded))
         if self.counter is not None:
             self.counts["message"].append(int(self.counter.values(decoded)[0]))
-        if message.sequence is not None:
+        if message.sequence is not None:  # of the topic, or of all of them: then less the others it goes on by one
             self.counts["sequence"].append(message.sequence)
             self.counts["all"].append(message.sequence - message.others)
 

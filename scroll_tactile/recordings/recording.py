@@ -189,18 +189,16 @@ def _report(
 
 
 def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int, int] | None:
-    """Lost and repeated readings by the device's counter, or else by the recorder's."""
-    by_name: dict[str, tuple[int, int]] = {}
-    for name, counts in counters.items():
-        steps = np.diff(counts)
-        if len(steps) and np.count_nonzero(steps == 1) * 2 >= len(steps):
-            parts = np.split(counts, borders)
-            found = [lost(part) for part in parts]
-            by_name[name] = sum(gone for gone, _ in found), sum(again for _, again in found)
-    if "message" in by_name:
-        return by_name["message"]
-    # A recorder counts the messages of a topic or of all topics: what is missing under one of them only is not lost.
-    return min(by_name.values(), default=None)
+    """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
+    single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
+    for name in ("message", "sequence"):
+        if name not in counters or len(counters[name]) < 2 or 2 * single[name] < len(counters[name]) - 1:
+            continue  # what seldom goes on by one is no counter
+        if name == "sequence" and single["all"] > single[name]:
+            continue  # it counts all topics, so that nobody knows whose messages are lost
+        found = [lost(part) for part in np.split(counters[name], borders)]
+        return sum(gone for gone, _ in found), sum(again for _, again in found)
+    return None
 
 
 def resampled(recording: Recording, rate: float) -> Recording:

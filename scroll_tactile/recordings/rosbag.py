@@ -254,12 +254,15 @@ class _Types:
             raise missing("rosbags", "ros", "a ROS recording") from error
         store = get_typestore(Stores.EMPTY)
         text = self.given.get(channel.type) or channel.definition
-        if text:
-            try:
-                types = get_types_from_idl(text) if channel.idl else get_types_from_msg(text, channel.type)
-                store.register(types)
-            except Exception as error:
-                raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
+        try:
+            if text and channel.idl:
+                # A definition that needs others holds them all, each below a line of = and one with its name.
+                for part in text.split("=" * 80 + "\n"):
+                    store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)) if part else {})
+            elif text:
+                store.register(get_types_from_msg(text, channel.type))
+        except Exception as error:
+            raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
         if not text or channel.type not in store.fielddefs:
             store = get_typestore(Stores.LATEST)
         if channel.type not in store.fielddefs:

@@ -401,27 +401,60 @@ def test_recordings_are_found_in_folders(tmp_path, store2):
         find(tmp_path / "none")
 
 
+def record(kind, data):
+    return struct.pack("<BQ", kind, len(data)) + data
+
+
+def text(value):
+    return struct.pack("<I", len(value)) + value
+
+
+def mcap(path, channels, messages):
+    """An MCAP without chunks, of (topic, encoding, type, form, definition) and (channel, count, data)."""
+    body = record(1, text(b"") + text(b""))
+    for i, (topic, encoding, kind, form, definition) in enumerate(channels, 1):
+        body += record(3, struct.pack("<H", i) + text(kind) + text(form) + text(definition))
+        body += record(4, struct.pack("<HH", i, i) + text(topic) + text(encoding) + text(b""))
+    for n, (i, count, data) in enumerate(messages):
+        body += record(5, struct.pack("<HIQQ", i, count, 10**9 + n * 10**7, 10**9 + n * 10**7) + data)
+    path.write_bytes(b"\x89MCAP0\r\n" + body + record(15, b"\0\0\0\0"))
+    return path
+
+
+def test_definitions_in_idl(tmp_path):
+    line = b"=" * 80 + b"\n"
+    inner = b"IDL: pkg/msg/V\nmodule pkg { module msg { struct V { float x; double y; }; }; };\n"
+    outer = b"IDL: pkg/msg/Skin\nmodule pkg { module msg { struct Skin { pkg::msg::V v; float e[3]; }; }; };\n"
+    data = struct.pack("<BBHf4xd3f", 0, 1, 0, 0.5, 0.25, 1, 2, 3)
+    for definition in (line + inner + line + outer, line + outer + line + inner):
+        channels = [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition)]
+        path = mcap(tmp_path / "m.mcap", channels, [(1, i, data) for i in range(3)])
+        assert read(path, topic="/skin", field="{v.{x,y},e}").readings.tolist() == [[0.5, 0.25, 1, 2, 3]] * 3
+
+
+@pytest.mark.parametrize(
+    ("counts", "lost"),
+    [
+        ([(1, 0), (1, 1), (2, 0), (1, 4), (1, 5), (2, 1), (1, 6)], 2),  # each topic alone
+        ([(1, 0), (1, 1), (2, 2), (1, 3), (1, 4), (2, 5), (1, 6)], None),  # all topics together
+        ([(1, 0), (1, 0), (1, 0)], None),  # nobody counts
+        ([(1, 2**32 - 2), (1, 2**32 - 1), (1, 1), (1, 2)], 1),
+    ],
+)
+def test_a_recorders_counter_is_believed_where_it_counts_a_topic(tmp_path, counts, lost):
+    channels = [(topic, b"json", b"Skin", b"", b"") for topic in (b"/a", b"/b")]
+    path = mcap(tmp_path / "m.mcap", channels, [(i, count, b'{"v": [1, 2]}') for i, count in counts])
+    report = read(path, topic="/a", field="v").report
+    assert (report.lost, report.cut_off) == (lost, False)
+
+
 def test_messages_in_json_and_of_ros_1_in_mcap(tmp_path, store1):
-    def record(kind, data):
-        return struct.pack("<BQ", kind, len(data)) + data
-
-    def text(value):
-        return struct.pack("<I", len(value)) + value
-
     def file(encoding, kind, definition, payloads):
-        body = record(1, text(b"") + text(b"")) + record(
-            3, struct.pack("<H", 1) + text(kind) + text(b"") + text(definition)
-        )
-        body += record(4, struct.pack("<HH", 1, 1) + text(b"/skin") + text(encoding) + text(b""))
-        for i, payload in enumerate(payloads):
-            body += record(5, struct.pack("<HIQQ", 1, i, 10**9 * (i + 1), 10**9 * (i + 1)) + payload)
-        path = tmp_path / "m.mcap"
-        path.write_bytes(b"\x89MCAP0\r\n" + body)
-        return path
+        channels = [(b"/skin", encoding, kind, b"", definition)]
+        return mcap(tmp_path / "m.mcap", channels, [(1, i, payload) for i, payload in enumerate(payloads)])
 
     path = file(b"json", b"Skin", b"", [b'{"skin": [{"v": [1, 2]}, {"v": [3.5, 4]}], "name": "a"}'] * 2)
     assert read(path, topic="/skin", field="skin[*].v").readings.tolist() == [[1, 2, 3.5, 4]] * 2
-    assert read(path, topic="/skin", field="skin[*].v").report.cut_off
     with pytest.raises(FieldError, match="leads to text"):
         read(path, field="name", topic="/skin")
     message = bags.array(store1, np.arange(3))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
-from store.exceptions import DamageError, reported
+from store.encoding import decode_payload
+from store.exceptions import DamageError, VersionError, reported
 from store.files import store_folder
 from store.generations import numbers
 from store.groups import PARTIAL, GroupReader, folder_name, read_own_description
@@ -175,7 +176,7 @@ class Survey:
         payload, readable = self.salvage.payload(row[0])
         if payload is None:
             return Fault.NO_ARRAYS if readable else Fault.UNREADABLE_ARRAYS
-        return None if payload_digest(payload) == head[1] else Fault.DAMAGED_ARRAYS
+        return None if payload_digest(payload) == head[1] and _is_readable(payload) else Fault.DAMAGED_ARRAYS
 
     def _note(self, first: int, last: int, fault: Fault) -> None:
         if self.faults and self.faults[-1][1] == first - 1 and self.faults[-1][2] is fault:
@@ -329,3 +330,13 @@ def _identity(parent: Path, meta: dict[str, str], there: list[int]) -> dict[str,
         except DamageError:
             continue
     return None
+
+
+def _is_readable(payload: bytes) -> bool:
+    """Whether a payload is what `encode_payload` makes: anyone can make its digest; one of a newer release counts."""
+    with suppress(VersionError):
+        try:
+            decode_payload(payload)
+        except ValueError:
+            return False
+    return True

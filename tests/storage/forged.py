@@ -11,7 +11,7 @@ from contextlib import closing
 
 from store.content import ArrayContent
 from store.encoding import array_digest
-from store.records import checksum, payload_digest
+from store.records import checksum
 
 
 def payload(arrays, version=1, after=b""):
@@ -23,18 +23,6 @@ def payload(arrays, version=1, after=b""):
         head += struct.pack(f"<B{len(shape)}Q", len(shape), *shape) + struct.pack("<BQQ", codec, size, len(buffer))
         buffers += buffer
     return head + buffers + after
-
-
-def put_row(path, content, *, kind="a", label="forged", key=b"key", time=1.0, attributes="{}"):
-    """Put a row with this payload behind the last of the store in `path`; return its sequence."""
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
-        ((sequence,),) = connection.execute("SELECT coalesce(max(sequence), 0) + 1 FROM record").fetchall()
-        digest = payload_digest(content)
-        fields = (sequence, kind, label, key, time, attributes, len(content), digest)
-        stored = checksum("record", *(part.encode() if isinstance(part, str) else part for part in fields))
-        connection.execute("INSERT INTO record VALUES (?,?,?,?,?,?,?,?,?)", (*fields, stored))
-        connection.execute("INSERT INTO payload VALUES (?,?)", (sequence, content))
-    return sequence
 
 
 def put_generation(path, number, content, *, upto=1, base=0, time=1.0, attributes="{}"):

@@ -10,7 +10,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from forged import describe_again, in_a_process, put_generation, put_row, write_first_format
+from forged import describe_again, in_a_process, put_generation, write_first_format
+from forging import put_row
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from store_builds import flip
@@ -18,7 +19,6 @@ from store_builds import flip
 from store import DamageError, RecordError, Store, StoreError, VersionError, check_store
 from store import chunks as store_chunks
 from store import records as store_records
-from store.encoding import encode_payload
 from store.groups import GroupReader
 
 ARRAYS = {
@@ -281,7 +281,7 @@ def test_attributes_that_were_never_written_are_damage(path, attributes):
     with Store.open(path, mode="read") as opened:
         (row,) = opened._journal.generations()
     put_generation(path, 1, row.content.decode(), attributes=attributes)
-    put_row(path, encode_payload({}), attributes=attributes)
+    put_row(path, attributes=attributes)
     with Store.open(path, mode="read") as opened:
         assert opened.latest() is None
         with pytest.raises(DamageError) as refused:

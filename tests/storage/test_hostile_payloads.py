@@ -5,12 +5,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from forged import in_a_process, payload, put_row
+from forged import in_a_process, payload
+from forging import put_row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import blosc, zstd
 
-from store import DamageError, RecordError, Store, VersionError
+from store import DamageError, RecordError, Store, VersionError, check_store
 from store.encoding import decode_payload, encode_payload
 
 HEADER = struct.Struct("<BBBBIII")
@@ -27,7 +28,7 @@ READ = """
 
 @pytest.mark.parametrize("frame", [BEHIND, COPIED], ids=["a block far behind the end", "bytes that are not there"])
 def test_a_crafted_frame_is_damage_and_nothing_else(plain, frame):
-    number = put_row(plain, payload([("codes", "|u1", (65536,), 1, 65536, frame)]))
+    number = put_row(plain, payload=payload([("codes", "|u1", (65536,), 1, 65536, frame)]))
     read = in_a_process(READ, plain)
     assert (read.returncode, read.stdout) == (0, f"damage at {number}\n"), read.stderr
 
@@ -35,8 +36,8 @@ def test_a_crafted_frame_is_damage_and_nothing_else(plain, frame):
 def test_arrays_that_together_are_larger_than_any_that_are_written_are_damage(plain):
     large = 256 * 2**20
     frame = blosc.compress(np.zeros(large, np.uint8), b"zstd", 1, blosc.BITSHUFFLE)
-    put_row(plain, payload([(f"x{i}", "|u1", (large,), 1, large, frame) for i in range(60)]))
-    number = put_row(plain, payload([("x", "<f8", (2**37,), 0, 2**40, b"")]))
+    put_row(plain, payload=payload([(f"x{i}", "|u1", (large,), 1, large, frame) for i in range(60)]))
+    number = put_row(plain, payload=payload([("x", "<f8", (2**37,), 0, 2**40, b"")]))
     read = in_a_process(READ, plain, memory=200 * 2**20)
     assert (read.returncode, read.stdout) == (0, f"damage at {number - 1}\n"), read.stderr
 
@@ -75,7 +76,7 @@ FORGED = {
 
 @pytest.mark.parametrize("content", FORGED.values(), ids=FORGED)
 def test_a_payload_that_was_never_written_is_damage_at_its_row(plain, content):
-    number = put_row(plain, content)
+    number = put_row(plain, payload=content)
     with Store.open(plain, mode="read") as opened:
         found = opened.records()
         tracemalloc.start()
@@ -87,6 +88,9 @@ def test_a_payload_that_was_never_written_is_damage_at_its_row(plain, content):
         finally:
             tracemalloc.stop()
     assert refused.value.sequence == number
+    (problem,) = check_store(plain)
+    assert problem.kind == "lost"
+    assert f"row {number}" in problem.what
 
 
 ARRAYS = {

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from scroll_tactile import Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.errors import NotFiniteError, StreamTooShortError
+from scroll_tactile.errors import NotFiniteError, StreamError, StreamTooShortError
 
 LOW, HIGH = (0.0, -10.0, 0.0, 100.0, 0.0), (255.0, 10.0, 1.0, 900.0, 4095.0)
 PLAIN = Sensor(name="pad", channels=5, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.5)
@@ -189,3 +189,12 @@ def test_anything_of_the_right_shape_is_answered_or_refused(learner, data):
     else:
         with pytest.raises((NotFiniteError, StreamTooShortError)):
             learner.predict(readings)
+
+
+def test_a_touch_of_hours_is_refused_before_it_is_kept(tmp_path, monkeypatch):
+    pad = Sensor(name="pad", channels=1, rate=100.0, low=0.0, high=1.0, unit="", duration=1.0)
+    monkeypatch.setattr("scroll_tactile.memory.ledger.MOST_BYTES", 4 * 200)
+    with TactileLearner.open(tmp_path / "m", sensor=pad) as learner:
+        with pytest.raises(StreamError, match="at most 200 readings of sensor 'pad', 256 MiB; came 201"):
+            learner.observe("felt", np.zeros((201, 1)))
+        assert learner.observe("felt", np.zeros((200, 1))).sequence == 1

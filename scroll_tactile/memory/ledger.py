@@ -11,7 +11,7 @@ from typing import Any, Literal, cast
 
 import numpy.typing as npt
 
-from scroll_tactile.errors import FineTuneError, InputError
+from scroll_tactile.errors import FineTuneError, InputError, StreamError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
@@ -19,6 +19,7 @@ from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
 from scroll_tactile.memory.rows import (
     DESCRIBE,
+    MOST_BYTES,
     OBSERVE,
     RETRACT,
     Added,
@@ -143,6 +144,11 @@ class Ledger:
 
     def observe(self, material: str, stream: Stream, columns: int, codes: Codes) -> Receipt:
         """Append an observation to the journal, then add it to the memory."""
+        if stream.readings.nbytes > MOST_BYTES:
+            raise StreamError(
+                f"expected a touch of at most {MOST_BYTES // (4 * stream.sensor.channels)} readings of sensor "
+                f"{stream.sensor.name!r}, 256 MiB; came {len(stream)}. Cut it into touches"
+            )
         with self.lock:
             self.require_open()
             # Before the journal has it: every row there must fit at the next opening.

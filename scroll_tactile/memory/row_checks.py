@@ -17,6 +17,7 @@ from scroll_tactile.memory.rows import (
     DESCRIBE,
     LARGEST,
     MEMBER,
+    MOST_BYTES,
     OBSERVE,
     REST,
     RETRACT,
@@ -35,7 +36,6 @@ from store import Head, Record
 __all__ = ["RowChecks", "check_description", "check_readings"]
 
 ITEM = np.dtype(np.float32).itemsize
-MOST_BYTES = 2**30  # of readings: what a row of 256 MiB holds of whole numbers of a byte each
 SMALLEST = -149  # the exponent of the smallest float32
 POWER = re.compile(rf"{WHOLE}(-?[0-9]{{1,3}})")
 WINDOWS = re.compile(r"(stages|codes|values|places)-([0-9]{1,9})")

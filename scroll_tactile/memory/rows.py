@@ -17,6 +17,7 @@ __all__ = [
     "KINDS",
     "MEMBER",
     "MERGE",
+    "MOST_BYTES",
     "OBSERVE",
     "RETRACT",
     "Added",
@@ -51,6 +52,7 @@ Encode = Callable[[Readings], Codes]
 Added = tuple[str, Codes, int]
 """A material, the rows of codes of a touch of it by scale, and 1 where they came or −1 where they were retracted."""
 
+MOST_BYTES = 2**28  # of the readings of a touch as float32: a row is read into memory whole
 CODES = "stages-"  # and a scale
 WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
 SHAPE, ZERO, REST = "readings-shape", "readings-zero", "readings-rest"

@@ -15,7 +15,7 @@ import store
 PACKAGES = [
     scroll_tactile,
     store,
-    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "testing")),
+    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "recordings", "testing")),
 ]
 
 

@@ -40,7 +40,8 @@ def read(
     """All readings of a file, or of a folder that is one recording.
 
     path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v3; robomimic's HDF5; a
-        Zarr replay buffer; `.npy`; `.csv`. On this machine, or an address that fsspec knows.
+        Zarr replay buffer; `.npy`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
+        split. On this machine, or an address that fsspec knows.
     topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
         tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
@@ -122,12 +123,17 @@ def find(path: _Address) -> list[Path]:
     """The recordings in a local folder and the folders inside it, in the order of their names.
 
     A file is a recording by its suffix (`.txt` and `.dat` only where they are named themselves), and so is a folder
-    that is one recording. Raises RecordingError for a path where nothing is.
+    that says it is one, as a ROS 2 bag does by its metadata.yaml. Bags beside each other are recordings of their own,
+    however they are numbered; `read` takes their folder as one that was split. Raises RecordingError for a path where
+    nothing is.
     """
+    from scroll_tactile.recordings import rosbag
+
     place = Path(path)
     if not place.exists():
         raise RecordingError(f"expected recordings in {place}; it is not there")
-    if _kind(place) is not None:
+    bags_alone = place.is_dir() and not (place / "metadata.yaml").exists() and rosbag.is_rosbag(place)
+    if _kind(place) is not None and not bags_alone:
         return [place]
     found: list[Path] = []
     for inside in sorted(place.iterdir()) if place.is_dir() else ():

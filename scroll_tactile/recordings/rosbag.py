@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import re
@@ -134,20 +135,18 @@ class RosBag(Source):
         topic, text = self.request.topic, self.request.field
         if topic is not None and text is not None:
             return topic, text
-        contents = self.contents()
-        if not contents.entries:
-            self._absent(topic)
-        if text is None:
-            fields = [e for e in contents.entries if topic is None or e.topic == topic]
-            if not fields:
-                self._absent(topic)
-            raise FieldError(f"expected a topic and a field to read\n{Contents(contents.source, tuple(fields))}")
-        topics = self._having(FieldPath(text))
+        topics = self._having(FieldPath(text)) if text is not None else []
         if len(topics) > 1 and self.request.likely in topics:
             topics = [self.request.likely]
-        if len(topics) != 1:
+        if len(topics) == 1 and text is not None:
+            return topics[0], text
+        contents = self.contents()
+        if text is not None and contents.entries:
             raise FieldError(f"{'several topics have' if topics else 'no topic has'} a field {text!r}\n{contents}")
-        return topics[0], text
+        entries = tuple(entry for entry in contents.entries if topic in (None, entry.topic))
+        if not entries:
+            self._absent(topic)
+        raise FieldError(f"expected a topic and a field to read\n{Contents(contents.source, entries)}")
 
     def _having(self, path: FieldPath) -> list[str]:
         """The topics in whose first message a path leads to numbers."""
@@ -176,20 +175,24 @@ class RosBag(Source):
         self.notes, self.cut_off, self.marks = [], False, []
         for path in self.files:
             scan = Scan(wanted)
-            with tempfile.TemporaryDirectory() as folder:
-                file = inflated(path, Path(folder)) if path.suffix.lower() == ".zstd" else path
-                name = file.name.lower().removesuffix(".active")
-                if name.endswith(".bag"):
-                    yield from scan_bag(file, scan)
-                elif name.endswith(".mcap"):
-                    yield from scan_mcap(file, scan)
-                else:
-                    yield from scan_db3(file, scan, compressed=self.compressed)
+            if path.suffix.lower() != ".zstd":
+                yield from self._scanned(path, scan)
+            else:
+                with tempfile.TemporaryDirectory() as folder:
+                    yield from self._scanned(inflated(path, Path(folder)), scan)
             if scan.cut_off is not None:
                 self.cut_off = True
                 self.notes.append(f"{path.name} was cut off: {scan.cut_off}; what comes before was read")
             if scan.damaged:
                 self.notes.append(f"{path.name} has {scan.damaged} damaged chunks, which were left out")
+
+    def _scanned(self, file: Path, scan: Scan) -> Iterator[Message]:
+        name = file.name.lower().removesuffix(".active")
+        if name.endswith(".bag"):
+            return scan_bag(file, scan)
+        if name.endswith(".mcap"):
+            return scan_mcap(file, scan)
+        return scan_db3(file, scan, compressed=self.compressed)
 
 
 def _files(path: Path) -> tuple[list[Path], bool]:
@@ -230,7 +233,7 @@ class _Types:
         """Raises RecordingError for a type that is not defined, and for bytes that do not fit it."""
         reader = self.readers.get(channel)
         if reader is None:
-            reader = self.readers[channel] = self._reader(channel)
+            reader = self.readers[channel] = _reader(channel, self.given.get(channel.type, ""))
         try:
             return reader(data)
         except RecordingError:
@@ -241,38 +244,40 @@ class _Types:
                 f"{type(error).__name__}: {error}"
             ) from error
 
-    def _reader(self, channel: Channel) -> Callable[[bytes], object]:
-        if channel.encoding == "json":
-            return json.loads
-        if channel.encoding not in ("cdr", "ros1"):
-            raise RecordingError(
-                f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
-            )
-        try:
-            from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-        except ImportError as error:
-            raise missing("rosbags", "ros", "a ROS recording") from error
-        store = get_typestore(Stores.EMPTY)
-        text = self.given.get(channel.type) or channel.definition
-        try:
-            if text and channel.idl:
-                # A definition that needs others holds them all, each below a line of = and one with its name.
-                for part in text.split("=" * 80 + "\n"):
-                    store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)) if part else {})
-            elif text:
-                store.register(get_types_from_msg(text, channel.type))
-        except Exception as error:
-            raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
-        if not text or channel.type not in store.fielddefs:
-            store = get_typestore(Stores.LATEST)
-        if channel.type not in store.fielddefs:
-            raise RecordingError(
-                f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
-                f"pass definitions={{{channel.type!r}: text of its .msg file}}"
-            )
-        if channel.encoding == "ros1":
-            return lambda data: store.deserialize_ros1(data, channel.type)
-        return lambda data: store.deserialize_cdr(data, channel.type)
+
+@functools.lru_cache(256)  # as many bags as touches have the same messages
+def _reader(channel: Channel, given: str) -> Callable[[bytes], object]:
+    if channel.encoding == "json":
+        return json.loads
+    if channel.encoding not in ("cdr", "ros1"):
+        raise RecordingError(
+            f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
+        )
+    try:
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise missing("rosbags", "ros", "a ROS recording") from error
+    store = get_typestore(Stores.EMPTY)
+    text = given or channel.definition
+    try:
+        if text and channel.idl:
+            # A definition that needs others holds them all, each below a line of = and one with its name.
+            for part in text.split("=" * 80 + "\n"):
+                store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)) if part else {})
+        elif text:
+            store.register(get_types_from_msg(text, channel.type))
+    except Exception as error:
+        raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
+    if not text or channel.type not in store.fielddefs:
+        store = get_typestore(Stores.LATEST)
+    if channel.type not in store.fielddefs:
+        raise RecordingError(
+            f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
+            f"pass definitions={{{channel.type!r}: text of its .msg file}}"
+        )
+    if channel.encoding == "ros1":
+        return lambda data: store.deserialize_ros1(data, channel.type)
+    return lambda data: store.deserialize_cdr(data, channel.type)
 
 
 def _rate(logs: list[int]) -> float | None:

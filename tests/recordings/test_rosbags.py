@@ -394,6 +394,11 @@ def test_recordings_are_found_in_folders(tmp_path, store2):
         shutil.copy(next((tmp_path / "felt/a").glob("*.mcap")), tmp_path / "cork" / name)
     found = [path.relative_to(tmp_path).as_posix() for path in find(tmp_path)]
     assert found == ["cork/labels.csv", "cork/other.mcap", "cork/take.mcap", "felt/a", "felt/b"]
+    (tmp_path / "wool").mkdir()
+    for name in ("1.mcap", "2.mcap"):  # may be two touches as well as a split recording
+        shutil.copy(tmp_path / "cork/take.mcap", tmp_path / "wool" / name)
+    assert [path.name for path in find(tmp_path / "wool")] == ["1.mcap", "2.mcap"]
+    assert len(read(tmp_path / "wool", topic="/skin", field="data")) == 6
     assert find(tmp_path / "felt" / "a") == [tmp_path / "felt" / "a"]
     with pytest.raises(RecordingError, match="a folder that is none of these"):  # two takes are no split recording
         read(tmp_path / "cork", topic="/skin", field="data")

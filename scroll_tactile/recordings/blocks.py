@@ -106,9 +106,10 @@ class Source(ABC):
     names: what each episode is called, by its number.
     marks: what a topic of labels said when: seconds by the clock "log", and a text.
     continuous: whether time goes on from one episode to the next, and does not begin anew.
+    topics, labels: whether the format has topics, and something that labels.
     """
 
-    continuous = False
+    continuous = topics = labels = False
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request

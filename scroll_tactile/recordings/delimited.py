@@ -53,7 +53,7 @@ class Delimited(Source):
     (or called "index") that counts rows is left out. A column called time, timestamp, t … holds the times.
     """
 
-    continuous = True
+    continuous = labels = True
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)

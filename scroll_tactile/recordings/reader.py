@@ -155,7 +155,11 @@ def _open(path: Path, address: str, request: Request) -> Source:
             "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
             f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
-    return kind(path, address, request)
+    source = kind(path, address, request)
+    for name, value, takes in (("topic", request.topic, source.topics), ("labels", request.labels, source.labels)):
+        if value is not None and not takes:
+            raise InputError(f"{address} has no {name}; came {name}={value!r}: give field= alone")
+    return source
 
 
 def _kind(path: Path) -> Callable[[Path, str, Request], Source] | None:

@@ -52,6 +52,8 @@ def _is_file(path: Path) -> bool:
 class RosBag(Source):
     """A ROS 1 or ROS 2 recording: one file, or a folder of the parts that it was split into; see `Source`."""
 
+    topics = labels = True
+
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
         self.files, self.compressed = _files(path)
@@ -86,27 +88,12 @@ class RosBag(Source):
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
-        request = self.request
         topic, text = self._choose()
         self.topic = topic
-        path = FieldPath(text)
-        stamps = Stamps(request.clock, text)
+        path, stamps = FieldPath(text), Stamps(self.request.clock, text)
         rows: list[npt.NDArray[Any]] = []
-        width, most, unfit = -1, 1, 0
-        labels = request.labels
-        for i, message in enumerate(self._messages(lambda name: name in (topic, labels))):
-            channel = message.channel
-            try:
-                decoded = self.types.decode(channel, message.data)
-            except RecordingError:
-                if width < 0:
-                    raise
-                unfit += 1
-                continue
-            if channel.topic == labels:
-                self.marks.append((message.log / 1e9, _text_in(decoded, channel)))
-                if labels != topic:
-                    continue
+        width, most = -1, 1
+        for i, (message, decoded) in enumerate(self._decoded(topic)):
             row = _picture(decoded) if path.text == "data" else None
             row = path.reading(decoded) if row is None else row
             if width < 0:
@@ -123,12 +110,31 @@ class RosBag(Source):
             if len(rows) >= most:
                 yield Block(floats(np.stack(rows)), *stamps.take())
                 rows = []
-        if unfit:
-            self.notes.append(f"{unfit} messages do not fit their type, and were left out")
         if rows:
             yield Block(floats(np.stack(rows)), *stamps.take())
-        elif width < 0:
+        if width < 0:
             self._absent(topic)
+        if self.request.labels is not None and not self.marks:
+            self._absent(self.request.labels)
+
+    def _decoded(self, topic: str) -> Iterator[tuple[Message, Any]]:
+        """The messages of a topic as objects; those of the topic that labels go to `marks`."""
+        labels = self.request.labels
+        decoded, unfit = None, 0
+        for message in self._messages(lambda name: name in (topic, labels)):
+            try:
+                decoded = self.types.decode(message.channel, message.data)
+            except RecordingError:
+                if decoded is None:
+                    raise
+                unfit += 1
+                continue
+            if message.channel.topic == labels:
+                self.marks.append((message.log / 1e9, _text_in(decoded, message.channel)))
+            if message.channel.topic == topic:
+                yield message, decoded
+        if unfit:
+            self.notes.append(f"{unfit} messages do not fit their type, and were left out")
 
     def _choose(self) -> tuple[str, str]:
         """The topic and the field, where the request or a preset names them, or where there is only one."""

@@ -212,6 +212,8 @@ def test_labels_of_a_topic_become_episodes(tmp_path, store2):
     path = bags.write(tmp_path / "b", store2, {"/skin": messages, "/material": labels}, form="mcap")
     recording = read(path, topic="/skin", field="data", labels="/material")
     assert [(e.begin, e.end, e.name) for e in recording.episodes] == [(10, 30, "felt"), (40, 50, "cork")]
+    with pytest.raises(FieldError, match="no message of topic '/materials'; nearest is '/material'"):
+        read(path, topic="/skin", field="data", labels="/materials")
     np.testing.assert_array_equal(recording.readings, values)
 
 

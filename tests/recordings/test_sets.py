@@ -214,6 +214,9 @@ def test_npy_of_any_shape(tmp_path):
     np.save(path, TIP)
     assert read(path, field="[2:4]").readings.tobytes() == np.ascontiguousarray(TIP[:, 2:4]).tobytes()
     assert str(describe(path)).endswith(f"read({str(path)!r})")
+    for options in ({"topic": "/skin"}, {"labels": "/material"}):
+        with pytest.raises(InputError, match=f"has no {next(iter(options))}"):
+            read(path, **options)
     assert read(path).stream(BIOTAC).readings.shape == (30, 19)
     with pytest.raises(ChannelCountError, match="another sensor's recording"):
         read(path).stream(CONTACTILE)
@@ -266,7 +269,7 @@ sys.modules[{library!r}] = None
 from scroll_tactile.recordings import read
 from scroll_tactile.errors import RecordingError
 try:
-    read({str(tmp_path / name)!r}, topic='/s', field='data')
+    read({str(tmp_path / name)!r}, field='data')
 except RecordingError as error:
     assert "pip install 'scroll-tactile[{extra}]'" in str(error), error
 else:

@@ -30,7 +30,7 @@ from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
-from scroll_tactile.prediction.current import CurrentModel
+from scroll_tactile.prediction.current import CurrentModel, Snapshot
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.model import Draft, Model, enough_memory
 from scroll_tactile.prediction.recalling import judged
@@ -45,6 +45,7 @@ from scroll_tactile.statistics.moments import one_thread
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
+    from scroll_tactile.live.session import LiveSession
 
 __all__ = ["TactileLearner"]
 
@@ -423,6 +424,38 @@ class TactileLearner:
             return version, lambda: self._answer(model, candidates, encoded, logits)
 
         return self._of_one_state(evaluate)
+
+    def live(
+        self,
+        *,
+        risk: float = 0.05,
+        contact: Literal["auto", "manual"] = "auto",
+        false_contacts: float = 1.0,
+        scene: Sequence[str] | None = None,
+    ) -> LiveSession:
+        """Begin to take readings as they come; see `LiveSession.push`.
+
+        risk: the share of wrong answers among those that are decided. contact: "auto" finds touches by the sensor's own
+        noise at rest, which it learns first: for a second nothing may touch it. "manual" leaves that to
+        `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene: as for `predict`.
+
+        Each touch is predicted by the memory as it was when it began.
+
+        Raises InputError for values that cannot be, and for "auto" with frames that have no resting image;
+        UnknownMaterialError for a scene that names a material never observed.
+        """
+        from scroll_tactile.live.session import LiveSession, Memory
+
+        def snapshot() -> Snapshot:
+            with self._ledger.lock, enough_memory():
+                return self._current.snapshot(self._ledger)
+
+        def answer(model: Model, candidates: Sequence[str], encoded: Encoded) -> Prediction:
+            with self._ledger.lock, enough_memory():
+                return self._answer(model, candidates, encoded, None)
+
+        memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answer)
+        return LiveSession(memory, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
 
     def _of_one_state(self, evaluate: Callable[[], tuple[int, Callable[[], Answer]]]) -> Answer:
         """An answer that rests on one state of the memory, though others may change it while a touch is embedded.

@@ -42,6 +42,7 @@ _Floats = npt.NDArray[np.float64]
 _PAD = 14.0  # mm across
 _SPEED, _FORCE = 40.0, 1.0  # mm/s and N of a usual touch
 _WAVES = 4
+_NOISE = 0.006  # of the range: white noise, and a touch's own offset
 # First word of every seed: a texture, a pad and a touch must never draw the same numbers.
 _TEXTURE, _PADS, _TOUCH = 1, 2, 3
 
@@ -105,6 +106,20 @@ class Scene:
     def materials(self) -> tuple[str, ...]:
         """The names of the scene's materials."""
         return MATERIALS
+
+    @property
+    def rest(self) -> _Floats:
+        """The channels' readings at rest, as shares of the range, (n,)."""
+        return _pad(self.seed, self.sensor).rest
+
+    @property
+    def step(self) -> _Floats:
+        """Of the sensor's converter, in its unit: one for all channels, or one for each."""
+        return _step(self.sensor)
+
+    def noise(self, random: np.random.Generator, count: int) -> _Floats:
+        """Noise of so many readings, as shares of the range, (count, n)."""
+        return _NOISE * random.standard_normal((count, self.sensor.channels))
 
     def touch(
         self,
@@ -204,7 +219,7 @@ def _slide(
     press = -np.expm1(-times / texture.onset)
     drift = 1 + random.normal(0, 0.02) * times
     load = (press * drift * math.sqrt(force))[:, None]
-    noise = random.normal(0, 0.006) + 0.006 * random.standard_normal(place.shape)
+    noise = random.normal(0, _NOISE) + _NOISE * random.standard_normal(place.shape)
     shares: _Floats = pad.rest + noise + contact * load * (texture.firmness + height)
     return shares
 
@@ -224,8 +239,12 @@ def _height(texture: _Texture, place: _Floats, random: np.random.Generator) -> _
 def _quantise(shares: _Floats, sensor: Sensor) -> _Floats:
     """In the sensor's unit, within its range, at the resolution of its converter."""
     low, high = np.asarray(sensor.low), np.asarray(sensor.high)
-    span = high - low
-    counts = (np.asarray(sensor.unit) == "counts") & (span >= 100)  # whole counts; a unit of rescaled counts is none
-    step = np.where(counts, 1.0, span / 4095)
-    readings: _Floats = np.clip(low + np.round(shares * span / step) * step, low, high)
+    step = _step(sensor)
+    readings: _Floats = np.clip(low + np.round(shares * (high - low) / step) * step, low, high)
     return readings
+
+
+def _step(sensor: Sensor) -> _Floats:
+    span = np.asarray(sensor.high) - np.asarray(sensor.low)
+    counts = (np.asarray(sensor.unit) == "counts") & (span >= 100)  # whole counts; a unit of rescaled counts is none
+    return np.where(counts, 1.0, span / 4095)

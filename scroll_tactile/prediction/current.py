@@ -13,6 +13,8 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from copy import deepcopy
+from weakref import ReferenceType, ref
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.ledger import Ledger
@@ -22,12 +24,22 @@ from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.model import Draft, Model
 from scroll_tactile.settings import Settings
 
-__all__ = ["CurrentModel"]
+__all__ = ["CurrentModel", "Snapshot"]
 
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
 FEW = 64  # touches: of a memory with no more the calibration is worth waiting for
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
+
+
+class Snapshot:
+    """A model that stays as it is, whatever is observed meanwhile: the memory's own until that changes, then a copy.
+
+    Of more than 1024 materials, those that few touches resembled are read from the memory as it is.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
 
 
 class CurrentModel:
@@ -44,6 +56,22 @@ class CurrentModel:
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
+        self._lent: ReferenceType[Snapshot] | None = None
+
+    def snapshot(self, ledger: Ledger) -> Snapshot:
+        """The present model, for as long as the snapshot is held."""
+        model, lent = self.present(ledger), None if self._lent is None else self._lent()
+        if lent is None or lent.model is not model:
+            lent = Snapshot(model)
+            self._lent = ref(lent)
+        return lent
+
+    def _leave_lent(self, model: Model, memory: Memory) -> None:
+        """Give who holds a model a copy of it, before it changes."""
+        lent = None if self._lent is None else self._lent()
+        if lent is not None and lent.model is model:
+            lent.model = deepcopy(model, {id(memory.statistics): memory.statistics})
+        self._lent = None
 
     def present(self, ledger: Ledger) -> Model:
         """The model that predictions are made with."""
@@ -55,6 +83,7 @@ class CurrentModel:
             model = None
         if model is not None and behind:
             self._exact = False
+            self._leave_lent(model, memory)
             if not model.follow(memory, behind):
                 model = None
         # The last one is let go first, and its memory given back: each is some tens of MB.

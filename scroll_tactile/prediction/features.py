@@ -21,7 +21,7 @@ from scroll_tactile.signals.windows import SHAPE, WHOLE, Extent, Scale, WindowPl
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
-__all__ = ["Encoded", "FeatureExtractor", "Readings"]
+__all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache"]
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
@@ -44,6 +44,47 @@ class Encoded:
     def columns(self) -> int:
         """T, the columns of the image."""
         return int(self.image.shape[1])
+
+
+class WindowCache:
+    """Features of the finished windows of one touch that is still growing, so that none is embedded twice.
+
+    A row is given again where the columns that it was made of are, to the bit, those of the last image.
+    """
+
+    def __init__(self) -> None:
+        self._image: Image = np.empty((0, 0), np.float32)
+        self._rows: dict[tuple[int, int], npt.NDArray[np.floating]] = {}
+
+    def turn(self, image: Image) -> None:
+        """Keep the rows that hold for an image (C, T)."""
+        columns, same = min(self._image.shape[1], image.shape[1]), 0
+        if columns and len(self._image) == len(image):
+            changed = (self._image[:, :columns] != image[:, :columns]).any(axis=0)
+            same = int(changed.argmax()) if changed.any() else columns
+        self._rows = {(width, start): row for (width, start), row in self._rows.items() if start + width <= same}
+        self._image = image
+
+    def missing(self, windows: Extent) -> Extent:
+        """Of windows, width → first columns, those without a row; no width without any."""
+        absent = {
+            width: [start for start in starts if (width, start) not in self._rows] for width, starts in windows.items()
+        }
+        return {width: starts for width, starts in absent.items() if starts}
+
+    def joined(
+        self, windows: Extent, absent: Extent, embedded: Mapping[int, npt.NDArray[np.floating]]
+    ) -> dict[int, npt.NDArray[np.floating]]:
+        """Width → features (windows, d): those embedded, at the `absent`, with the rows that were kept."""
+        columns = self._image.shape[1]
+        fresh = {
+            (width, start): row
+            for width, starts in absent.items()
+            for start, row in zip(starts, embedded[width], strict=True)
+        }
+        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= columns}
+        every = self._rows | fresh
+        return {width: np.stack([every[width, start] for start in starts]) for width, starts in windows.items()}
 
 
 class FeatureExtractor:
@@ -96,25 +137,32 @@ class FeatureExtractor:
         ]
         return stage_rows(groups, codes)
 
-    def encode(self, stream: Stream, longest: int, needed: Callable[[int], Sequence[Scale]]) -> Encoded:
+    def encode(
+        self,
+        stream: Stream,
+        longest: int,
+        needed: Callable[[int], Sequence[Scale]],
+        cache: WindowCache | None = None,
+    ) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
-        longest: its columns. needed: the scales to be read of a touch of so many columns.
+        longest: its columns. needed: the scales to be read of a touch of so many columns. cache: of the same touch when
+        it was shorter.
         """
         within = self._within(stream, longest)
         image = self.image(within)
         whole = image if len(within) == len(stream) else self.image(stream)
-        return Encoded(stream, image, self.means(image, needed(image.shape[1]), whole), within.seconds)
+        return Encoded(stream, image, self.means(image, needed(image.shape[1]), whole, cache), within.seconds)
 
     def means(
-        self, image: Image, scales: Sequence[Scale], whole: Image | None = None
+        self, image: Image, scales: Sequence[Scale], whole: Image | None = None, cache: WindowCache | None = None
     ) -> dict[Scale, npt.NDArray[np.float64]]:
         """A touch's mean features in the codes' unit, (d,) by scale. whole: what is viewed, `image` unless given."""
         places = self._plan.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error here.
         return {
             scale: in_units(rows, self._embedding.bound).mean(axis=0)
-            for scale, rows in self.features(image, scales, whole, places).items()
+            for scale, rows in self.features(image, scales, whole, places, cache).items()
         }
 
     def features(
@@ -123,11 +171,12 @@ class FeatureExtractor:
         scales: Sequence[Scale] | None = None,
         whole: Image | None = None,
         places: Mapping[Scale, Sequence[int]] | None = None,
+        cache: WindowCache | None = None,
     ) -> dict[Scale, npt.NDArray[np.floating]]:
         """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
 
         places: of the windows of each scale, those that are embedded; all unless given. Of the many with which a touch
-        begins, half are never scored.
+        begins, half are never scored. cache: of the image when it had fewer columns.
         """
         wanted = self._plan.scales if scales is None else scales
         extent = self._plan.extent(image.shape[1])
@@ -136,7 +185,10 @@ class FeatureExtractor:
             windows = {scale: [starts[place] for place in places[scale]] for scale, starts in windows.items()}
         views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
         width = self._plan.whole
-        if WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:
+        if cache is not None:
+            cache.turn(image)
+            embedded, found = self._completed(image, {int(scale): starts for scale, starts in windows.items()}, cache), {}
+        elif WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:
             # A touch of the usual length is convolved once for its windows and for itself.
             embedded = self._embedded(image, {**{int(scale): starts for scale, starts in windows.items()}, width: [0]})
             found = {WHOLE: embedded.pop(width)}
@@ -147,6 +199,16 @@ class FeatureExtractor:
             if view not in found:
                 found[view] = self._embedded(picture, {width: [0]})[width]
         return {Scale("window", width): rows for width, rows in embedded.items()} | dict(sorted(found.items()))
+
+    def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
+        """The features of windows, of which only those are embedded that have no row; of the columns that they need."""
+        absent = cache.missing(windows)
+        if not absent:
+            return cache.joined(windows, absent, {})
+        first = min(min(starts) for starts in absent.values())
+        part = np.ascontiguousarray(image[:, first:])
+        shifted = {width: [start - first for start in starts] for width, starts in absent.items()}
+        return cache.joined(windows, absent, self._embedded(part, shifted))
 
     def _views(self, image: Image) -> dict[Scale, Image]:
         """The pictures of a whole touch by view; of a touch of the usual length the first is the image itself."""

@@ -27,7 +27,7 @@ from scroll_tactile.signals.interpolation import interpolate
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Stream", "fewest_readings", "validate"]
+__all__ = ["Stream", "as_rows", "fewest_readings", "validate"]
 
 _Array = npt.NDArray[Any]
 
@@ -160,6 +160,24 @@ def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor:
     _require_shape(array.shape, sensor)
     _require_length(len(array), sensor)
     return _sound(array, sensor)
+
+
+def as_rows(readings: npt.ArrayLike | Iterable[npt.ArrayLike], sensor: Sensor) -> _Array:
+    """One reading, or a block of them, as an array of real numbers of shape (k, n), or (k, height, width, 3); k may be 0.
+
+    For readings that come a few at a time: nothing is copied without need, nor clipped.
+
+    Raises ChannelCountError, ReadingsTypeError, and NotFiniteError where the sensor refuses such values.
+    """
+    array = _real(_as_array(readings, "readings", sensor))
+    if array.shape == sensor.shape:
+        array = array[None]
+    elif array.size == 0 and (array.ndim == 1 or array.shape[1:] == sensor.shape):
+        return np.empty((0, *sensor.shape))
+    _require_shape(array.shape, sensor)
+    if sensor.non_finite == "refused" and not np.isfinite(array).all():
+        _refuse(array, ~np.isfinite(array), sensor)
+    return array
 
 
 def fewest_readings(sensor: Sensor) -> int:

@@ -1,0 +1,83 @@
+"""What a live session gives back: its state after a push, the touches that ended, and a report of the stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from scroll_tactile.results import Prediction
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["End", "LiveReport", "LiveState", "LiveTouch"]
+
+End = Literal["released", "end", "gap", "time went back", "still", "closed"]
+
+
+@dataclass(frozen=True)
+class LiveTouch:
+    """A touch that ended.
+
+    stream: its readings, as a file would hold them, for `learner.observe`. prediction: that of all of it, equal to
+    `learner.predict(stream)` of the memory as it was when the touch began. decided: whether it was safe to act on
+    before the touch ended, or is now; False says that it stayed undecided. at: when it began, by the readings' times;
+    without any, in seconds since the session began. end: why it ended: "released", by `end()`, by a "gap" in time,
+    as "time went back", as nothing moved for long ("still"), or because the session was "closed".
+    """
+
+    stream: Stream
+    prediction: Prediction
+    decided: bool
+    at: float
+    end: End
+
+
+class LiveState(NamedTuple):
+    """Where a live session stands after a push.
+
+    contact: whether something is touched. seconds: since the touch began. prediction: that of the touch's beginning,
+    made at the last of the moments at which it may change; None before the first. decided: whether it is safe to act
+    on; within a touch it stays so. ended: whether a touch ended in this push. touches: all that ended in it, in order;
+    a block of readings can hold several.
+
+    Where a touch ended and none began after it in the same push, seconds, prediction and decided are those of the touch
+    that ended. At rest they are 0, None and False.
+    """
+
+    contact: bool = False
+    seconds: float = 0.0
+    prediction: Prediction | None = None
+    decided: bool = False
+    ended: bool = False
+    touches: tuple[LiveTouch, ...] = ()
+
+
+@dataclass
+class LiveReport:
+    """What a live session met, counted from its beginning.
+
+    readings: that came. ticks: at the sensor's rate, which they became. lost: ticks of which no reading came, filled by
+    the line between their neighbours. repeated: readings that came twice, left out. late: that came behind a later one,
+    left out. surplus: more than the sensor's rate has room for, left out. untimed: whose stamp stood still, taken as
+    they came. gaps, steps_back: in time; each ends a touch. missing: values that were NaN or infinite.
+    touches: that ended. undecided: of them. truncated: that went on beyond what is kept of a touch. brief: contacts too
+    short for a touch. relearned: how often the sensor turned out to be much quieter than what was learned as its rest:
+    it was touched from the first reading on, and that touch was not found. learning: whether rest is still being
+    learned; nothing is found until then.
+    """
+
+    readings: int = 0
+    ticks: int = 0
+    lost: int = 0
+    repeated: int = 0
+    late: int = 0
+    surplus: int = 0
+    untimed: int = 0
+    gaps: int = 0
+    steps_back: int = 0
+    missing: int = 0
+    touches: int = 0
+    undecided: int = 0
+    truncated: int = 0
+    brief: int = 0
+    relearned: int = 0
+    learning: bool = False

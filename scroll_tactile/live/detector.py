@@ -1,0 +1,166 @@
+"""Where contact begins and ends, learned from the sensor's own noise at rest; see `rest` for its distance d².
+
+At rest, a contact begins where S, the sum of d² − κ that never falls below 0, passes the alarm. No reading adds more
+than a third of the alarm, so that a glitch of one or two is none. The contact began with the first reading since S was
+last 0.
+
+In contact, it ended where the last 0.15 s lie about their own mean as the sensor does at rest, and that mean lies where
+the rest is, or so near it that a hundredth of the contact's mean d² is more: a sensor does not come back to the unit.
+These readings are rest, and its level goes on from them.
+
+Two things end what is no contact: a level that moved, where for a second nothing but noise was seen in a contact longer
+than any touch (reported as "still"); and a sensor that turns out eight times as quiet as what was learned as its rest:
+something touched it from the first reading on. Then rest is learned anew.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.live.rest import Rest
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["ContactDetector", "Event"]
+
+DEBOUNCE = 3  # readings
+QUIET = 0.15  # seconds
+FEWEST_QUIET = 4  # readings
+RESIDUAL = 0.01  # of the contact's mean d²: a tenth of its amplitude
+STILL = 4  # blocks of noise alone, a second
+LONG = 10.0  # seconds, or four usual touches: then a level may have moved
+QUIETER = 8.0
+
+
+@dataclass(frozen=True)
+class Event:
+    """What happened at a reading.
+
+    kind: contact "began" with the last `readings`, this one included; it "ended", or was "still", before the last
+    `readings`; or rest was "relearned", and there was no contact.
+    """
+
+    kind: Literal["began", "released", "still", "relearned"]
+    readings: int = 0
+
+
+class ContactDetector:
+    """Finds contacts in readings at the sensor's rate. false_contacts: an hour that may be at rest."""
+
+    prefix: npt.NDArray[np.float64] | None = None  # what stands before a touch's readings
+
+    def __init__(self, sensor: Sensor, false_contacts: float) -> None:
+        self._rest = Rest(sensor, false_contacts)
+        self._long = round(max(LONG, 4 * sensor.duration) * sensor.rate)
+        self._block = np.empty((self._rest.block, sensor.channels))
+        self._aways = np.empty_like(self._block)
+        quiet = max(FEWEST_QUIET, round(QUIET * sensor.rate))
+        self._last = np.empty((quiet, sensor.channels))  # readings of a contact, in a ring
+        self._last_aways, self._last_distances = np.empty_like(self._last), [0.0] * quiet
+        self._learned: list[npt.NDArray[np.float64]] = []
+        self._count = 0  # readings that are being learned
+        self.learning, self.contact = True, False
+        self._anew()
+
+    def _anew(self) -> None:
+        """Readings that come do not follow those that came."""
+        self._sum, self._run = 0.0, 0  # S, and the readings since it was 0
+        self._distances: list[float] = []  # of the block that is being filled
+        self._pending: tuple[npt.NDArray[np.float64], list[float]] | None = None  # taken as rest if the next one is
+        self._recent: deque[npt.NDArray[np.float64]] = deque(maxlen=self._rest.needed // self._rest.block)
+        self._still = self._quieter = self._length = 0
+        self._energy = 0.0
+
+    def interrupt(self) -> None:
+        """Time begins anew: a contact is over, rest stays as it was learned."""
+        self.contact = False
+        self._anew()
+
+    def feed(self, rows: npt.NDArray[np.float64]) -> tuple[int, Event | None]:
+        """Take readings (k, n) up to the first at which something happens; how many, and what."""
+        numbers = self._rest.whole(rows)
+        if self.learning:
+            return self._learn(numbers), None
+        taken = 0
+        while taken < len(numbers):
+            part = numbers[taken : taken + self._rest.block - len(self._distances)]
+            aways, distances = self._rest.distances(part)
+            used, event = self._contact(part, aways, distances) if self.contact else self._quiet(distances)
+            first = len(self._distances)
+            self._block[first : first + used], self._aways[first : first + used] = part[:used], aways[:used]
+            self._distances += distances[:used]
+            taken += used
+            if event is None and len(self._distances) == self._rest.block:
+                event = self._full()
+            if event is not None:
+                self.contact = event.kind == "began"
+                self._anew()
+                return taken, event
+        return taken, None
+
+    def _learn(self, numbers: npt.NDArray[np.float64]) -> int:
+        used = min(len(numbers), self._rest.needed - self._count)
+        self._learned.append(numbers[:used])
+        self._count += used
+        if self._count == self._rest.needed:
+            self._rest.learn(np.concatenate(self._learned))
+            self._learned, self._count, self.learning = [], 0, False
+        return used
+
+    def _quiet(self, distances: list[float]) -> tuple[int, Event | None]:
+        kappa, alarm = self._rest.kappa, self._rest.alarm
+        most, total, run = alarm / DEBOUNCE * (1 + 1e-9), self._sum, self._run
+        for i, distance in enumerate(distances):
+            total += min(distance - kappa, most)
+            run += 1
+            if total <= 0:
+                total, run = 0.0, 0
+            elif total > alarm:
+                return i + 1, Event("began", run)
+        self._sum, self._run = total, run
+        return len(distances), None
+
+    def _contact(
+        self, numbers: npt.NDArray[np.float64], aways: npt.NDArray[np.float64], distances: list[float]
+    ) -> tuple[int, Event | None]:
+        ring = len(self._last)
+        for i, distance in enumerate(distances):
+            place = self._length % ring
+            self._last[place], self._last_aways[place], self._last_distances[place] = numbers[i], aways[i], distance
+            self._length += 1
+            self._energy += distance
+            near = max(self._rest.kappa, RESIDUAL * self._energy / self._length)
+            if self._length >= ring and sum(self._last_distances) <= ring * (self._rest.inner + near):
+                far, own = self._rest.apart(self._last_aways, self._last_distances)
+                if far <= near and own <= self._rest.inner:
+                    self._rest.resume(self._last)
+                    return i + 1, Event("released", ring)
+        return len(distances), None
+
+    def _full(self) -> Event | None:
+        """A block is full: of rest, or of contact."""
+        block, distances = self._block.copy(), self._distances
+        _, own = self._rest.apart(self._aways, distances)
+        self._distances = []
+        self._still = self._still + 1 if own <= self._rest.inner else 0
+        quieter = 0 < own * QUIETER < self._rest.mean and self._rest.mean > self._rest.channels / 2
+        self._quieter = self._quieter + 1 if quieter else 0
+        self._recent.append(block)
+        if self._quieter * self._rest.block >= self._rest.needed:
+            self._rest.learn(np.concatenate(self._recent))
+            return Event("relearned")
+        if self.contact:
+            if self._still >= STILL and self._length > self._long:
+                self._rest.resume(block)
+                return Event("still")
+        elif self._sum > 0:
+            self._pending = None
+        else:
+            if self._pending is not None:
+                self._rest.follow(*self._pending)
+            self._pending = block, distances
+        return None

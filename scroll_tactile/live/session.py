@@ -1,0 +1,328 @@
+"""A live session: readings go in as they come, and out come contacts, predictions and touches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
+from scroll_tactile.errors import InputError, StreamError
+from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
+from scroll_tactile.live.clock import Clock
+from scroll_tactile.live.decision import DecisionRule, decision_rule
+from scroll_tactile.live.detector import ContactDetector, Event
+from scroll_tactile.live.pressing import PressDetector
+from scroll_tactile.live.readings import Recent, Rows
+from scroll_tactile.prediction.current import Snapshot
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
+from scroll_tactile.prediction.model import Model
+from scroll_tactile.results import Prediction
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.settings import candidates_of
+from scroll_tactile.signals.contact import MOST_FRAMES
+from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
+
+__all__ = ["LiveSession", "Memory"]
+
+Array = npt.NDArray[Any]
+
+REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have begun
+KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a session needs of a learner.
+
+    snapshot: its model, which stays as it is while it is held. answer: what a model says, of candidates, of a touch.
+    """
+
+    sensor: Sensor
+    embedding: Embedding
+    extractor: FeatureExtractor
+    snapshot: Callable[[], Snapshot]
+    answer: Callable[[Model, Sequence[str], Encoded], Prediction]
+
+
+@dataclass
+class _Touch:
+    """The touch under way. rows: its readings, of a camera behind the resting image. at: when it began."""
+
+    rows: Rows
+    at: float
+    snapshot: Snapshot
+    rule: DecisionRule
+    cache: WindowCache
+    moments: list[int]  # that are to come, in readings; the next is the last of them
+    before: int  # readings that are no part of it: a camera's resting image
+    prediction: Prediction | None = None
+    decided: bool = False
+
+
+class LiveSession:
+    """Readings as they come, and an answer as soon as it is safe to act on; made by `TactileLearner.live`.
+
+    touch: the last touch that ended, None before. report: what the session met. Not for several threads at once; of
+    one learner there may be any number of sessions.
+    """
+
+    def __init__(
+        self,
+        memory: Memory,
+        *,
+        risk: float,
+        contact: Literal["auto", "manual"],
+        false_contacts: float,
+        scene: Sequence[str] | None,
+    ) -> None:
+        if contact not in ("auto", "manual"):
+            raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
+        if not 0 < false_contacts < math.inf:
+            raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
+        if not 0 < risk < 1:
+            raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
+        self._memory, self._risk = memory, risk
+        self.sensor = sensor = memory.sensor
+        model = memory.snapshot().model
+        candidates_of(scene, model.names, model.known)
+        self._scene = scene
+        self._rule: tuple[Model, DecisionRule] | None = None
+        self._manual = contact == "manual"
+        self._detector: ContactDetector | PressDetector | None = None
+        if not self._manual:
+            rest = capabilities_of(memory.embedding).rest
+            found = PressDetector(sensor, rest) if sensor.camera else ContactDetector(sensor, false_contacts)
+            self._detector = found
+        self.report = LiveReport(learning=not self._manual and not sensor.camera)
+        self._clock = Clock(sensor.rate, self.report)
+        self._dtype = np.dtype(np.float32 if sensor.camera else np.float64)
+        count = 4 if sensor.camera else max(8, round(REMEMBERED * sensor.rate))
+        self._recent = Recent(count if not self._manual else 1, sensor.shape, self._dtype)
+        self._now = 0.0  # the time of the next reading
+        self._under_way: _Touch | None = None
+        self._ended: list[LiveTouch] = []
+        self._closed = False
+        self.touch: Stream | None = None
+
+    def push(self, reading: npt.ArrayLike, time: Any = None) -> LiveState:
+        """Take a reading (n,) or a block (k, n), k of 0 or more, and say where the session stands after it.
+
+        time: in seconds since any moment, one for each reading: of shape (k,) for a block. Left out, the readings come
+        at the sensor's rate. With times they are put in their places at that rate, see `live.clock`; a gap and a step
+        back end a touch.
+
+        Nothing that happened within a block is lost: `LiveState.touches` holds every touch that ended in it, with its
+        prediction and whether it was decided, and `ended` says whether there are any.
+
+        Raises StreamError for readings that are not this sensor's, or not finite where it refuses them; InputError for
+        times that are no seconds, and after `close`. Nothing was taken then, and the session goes on.
+        """
+        self._require_open()
+        rows = self._rows(reading)
+        stamps = None if time is None else self._clock.checked(time, len(rows))
+        self._ended = []
+        self.report.readings += len(rows)
+        if stamps is None:
+            self._advance(rows)
+        else:
+            for part in self._clock.places(rows, stamps):
+                if part.breaks:
+                    self._break(part.breaks)
+                else:
+                    self._now = part.time
+                    self._advance(part.rows)
+        return self._state()
+
+    def begin(self) -> LiveState:
+        """Say that a touch begins with the next reading; of a session with contact="manual".
+
+        A touch that is under way ends. Raises InputError in a session that finds contacts itself.
+        """
+        self._require_manual("begin")
+        self._ended = []
+        self._end("end")
+        self._begin(np.empty((0, *self.sensor.shape), self._dtype))
+        return self._state()
+
+    def end(self) -> LiveState:
+        """Say that the touch is over; of a session with contact="manual". Nothing happens where there is none.
+
+        Raises InputError in a session that finds contacts itself.
+        """
+        self._require_manual("end")
+        self._ended = []
+        self._end("end")
+        return self._state()
+
+    def close(self) -> None:
+        """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(StreamError):
+            self._end("closed")
+        self._detector = None
+        self._recent = Recent(1, self.sensor.shape, self._dtype)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise InputError("the live session is closed: begin another with learner.live()")
+
+    def _require_manual(self, what: str) -> None:
+        self._require_open()
+        if not self._manual:
+            raise InputError(f'the session finds contacts itself: for {what}() take learner.live(contact="manual")')
+
+    def _rows(self, reading: npt.ArrayLike) -> Array:
+        """The readings (k, …) that came, in the type they are kept in."""
+        if isinstance(reading, np.ndarray) and reading.dtype == np.float64 and reading.shape == self.sensor.shape:
+            rows: Array = reading[None]
+            if not math.isfinite(rows.sum()):
+                rows = as_rows(reading, self.sensor)
+        else:
+            rows = as_rows(reading, self.sensor)
+        if self.sensor.non_finite == "missing":
+            self.report.missing += int(rows.size - np.count_nonzero(np.isfinite(rows)))
+        return rows.astype(self._dtype, copy=False)
+
+    def _advance(self, rows: Array) -> None:
+        """Take readings that follow each other at the sensor's rate."""
+        self.report.ticks += len(rows)
+        taken = 0
+        while taken < len(rows):
+            touch, part = self._under_way, rows[taken:]
+            if touch is not None and touch.moments:
+                part = part[: max(1, touch.moments[-1] - touch.rows.came)]
+            used, event = (len(part), None) if self._detector is None else self._detector.feed(part)
+            self._take(part[:used], event)
+            taken += used
+
+    def _take(self, rows: Array, event: Event | None) -> None:
+        """Take readings at whose last something may have happened."""
+        touch = self._under_way
+        self._now += len(rows) / self.sensor.rate
+        if self._detector is not None:
+            self.report.learning = self._detector.learning
+        if touch is None:
+            self._recent.add(rows)
+            if event is not None and event.kind == "began":
+                self._begin(self._recent.last(event.readings))
+        else:
+            touch.rows.add(rows)
+            if event is None:
+                self._predict_in_time(touch)
+            elif event.kind != "relearned":
+                touch.rows.drop(event.readings)
+                self._end("still" if event.kind == "still" else "released")
+        if event is not None and event.kind == "relearned":
+            self.report.relearned += 1
+            self._under_way = None
+            self._recent.clear()
+
+    def _begin(self, rows: Array) -> None:
+        """A touch began with these readings."""
+        self._recent.clear()
+        snapshot = self._memory.snapshot()
+        model = snapshot.model
+        if self._rule is None or self._rule[0] is not model:
+            self._rule = model, decision_rule(model, self._risk)
+        prefix = None if self._detector is None else self._detector.prefix
+        before, frame = 0, 1
+        if self.sensor.camera:
+            frame = model.plan.widths[0]
+            before = int(isinstance(capabilities_of(self._memory.embedding).rest, str))
+        if prefix is not None:
+            rows = np.concatenate([prefix, rows]).astype(self._dtype)
+        limit = MOST_FRAMES + before if self.sensor.camera else self._limit(model)
+        moments = sorted({-(-moment // frame) + before for moment in self._rule[1].moments}, reverse=True)
+        at = self._now - max(0, len(rows) - before) / self.sensor.rate
+        self._under_way = _Touch(
+            Rows(rows, limit), at, snapshot, self._rule[1], WindowCache(), moments, before
+        )
+        self._predict_in_time(self._under_way)
+
+    def _limit(self, model: Model) -> int:
+        return max(round(KEPT * self.sensor.rate), 4 * model.longest)
+
+    def _predict_in_time(self, touch: _Touch) -> None:
+        """Predict at the last moment that the touch has come to, if any is new."""
+        moment = 0
+        while touch.moments and touch.moments[-1] <= touch.rows.came:
+            moment = touch.moments.pop()
+        if moment:
+            with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
+                self._predict(touch, self._stream(touch, moment))
+
+    def _stream(self, touch: _Touch, count: int) -> Stream:
+        """The stream of the first readings of a touch. Raises StreamError where they make none."""
+        return self._memory.extractor.stream(touch.rows.first(count))
+
+    def _predict(self, touch: _Touch, stream: Stream) -> Prediction:
+        """The prediction for the beginning of a touch, as `learner.predict` gives it."""
+        model = touch.snapshot.model
+        candidates = model.names
+        if self._scene is not None:
+            candidates = sorted({name for name in self._scene if name in model.known})
+        if not candidates:
+            touch.prediction = Prediction(None, 0.0, (), float("inf"), False, stream.seconds)
+            return touch.prediction
+        encoded = self._memory.extractor.encode(
+            stream, model.longest, lambda columns: model.needed(candidates, columns), touch.cache
+        )
+        touch.prediction = self._memory.answer(model, candidates, encoded)
+        touch.decided = touch.decided or touch.rule.decided(touch.prediction, encoded.columns)
+        return touch.prediction
+
+    def _end(self, end: End) -> None:
+        """The touch under way, if any, is over."""
+        touch, self._under_way = self._under_way, None
+        if touch is None:
+            return
+        try:
+            if touch.rows.kept - touch.before < fewest_readings(self.sensor):
+                raise StreamError
+            stream = self._stream(touch, touch.rows.kept)
+        except StreamError:  # nothing that could be observed
+            self.report.brief += 1
+            return
+        prediction = self._predict(touch, stream)
+        self.touch = stream
+        self.report.touches += 1
+        self.report.undecided += not touch.decided
+        self.report.truncated += touch.rows.came > touch.rows.kept
+        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end))
+
+    def _break(self, why: str) -> None:
+        """Time begins anew."""
+        self._end("gap" if why == "gap" else "time went back")
+        self._recent.clear()
+        if self._detector is not None:
+            self._detector.interrupt()
+
+    def _state(self) -> LiveState:
+        touch, ended = self._under_way, tuple(self._ended)
+        if touch is not None:
+            seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
+            return LiveState(True, seconds, touch.prediction, touch.decided, bool(ended), ended)
+        if not ended:
+            return _AT_REST
+        last = ended[-1]
+        return LiveState(False, last.stream.seconds, last.prediction, last.decided, True, ended)
+
+
+_AT_REST = LiveState()

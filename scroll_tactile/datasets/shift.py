@@ -24,6 +24,7 @@ Floats = npt.NDArray[np.float64]
 Noise = Callable[[np.random.Generator, int], Floats]
 
 SMOOTH = 9  # readings, over which quiet parts are levelled
+TOGETHER = 5  # readings of noise that stay as they were
 QUIETEST = 0.02  # of all parts of half a second, those that noise is taken from
 
 
@@ -128,7 +129,8 @@ def resting_level(streams: Sequence[Stream], share: float = 0.02) -> Floats:
 def quiet_noise(streams: Sequence[Stream]) -> Noise:
     """Noise of a sensor, from the quietest half-seconds of recorded touches, as it was over channels and time.
 
-    What is left of them beside their mean over 9 readings, in random order.
+    What is left of them beside their mean over 9 readings, five at a time in random order: no half-second's pattern of
+    quiet and noisy channels is the sensor's.
     """
     rate = streams[0].sensor.rate
     length = max(SMOOTH + 1, round(0.5 * rate))
@@ -140,10 +142,11 @@ def quiet_noise(streams: Sequence[Stream]) -> Noise:
         parts += [rest[first : first + length] for first in range(0, len(rest) - length + 1, length)]
     parts.sort(key=lambda part: float(np.square(part).sum()))
     # A mean over 9 takes a ninth of white noise's variance with it.
-    quiet = np.stack(parts[: max(10, round(QUIETEST * len(parts)))]) * np.sqrt(SMOOTH / (SMOOTH - 1))
+    kept = np.stack(parts[: max(10, round(QUIETEST * len(parts)))]) * np.sqrt(SMOOTH / (SMOOTH - 1))
+    quiet = kept[:, : length // TOGETHER * TOGETHER].reshape(-1, TOGETHER, kept.shape[2])
 
     def noise(random: np.random.Generator, count: int) -> Floats:
-        chosen = random.integers(len(quiet), size=-(-count // length))
+        chosen = random.integers(len(quiet), size=-(-count // TOGETHER))
         return np.asarray(quiet[chosen].reshape(-1, quiet.shape[2])[:count])
 
     return noise

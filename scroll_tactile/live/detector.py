@@ -4,13 +4,14 @@ At rest, a contact begins where S, the sum of d² − κ that never falls below 
 than a third of the alarm, so that a glitch of one or two is none. The contact began with the first reading since S was
 last 0.
 
-In contact, it ended where the last 0.15 s lie about their own mean as the sensor does at rest, and that mean lies where
-the rest is, or so near it that a hundredth of the contact's mean d² is more: a sensor does not come back to the unit.
-These readings are rest, and its level goes on from them.
+In contact, it ended where the last 0.2 s lie about their own mean as the sensor does at rest, and that mean lies where
+the rest is, or so near it that 7 % of the contact's amplitude is more: a sensor does not come back to the unit. There
+the level of rest goes on.
 
 Two things end what is no contact: a level that moved, where for a second nothing but noise was seen in a contact longer
-than any touch (reported as "still"); and a sensor that turns out eight times as quiet as what was learned as its rest:
-something touched it from the first reading on. Then rest is learned anew.
+than any touch (reported as "still"); and a rest that was none. Where the sensor turns out eight times as quiet as it,
+something touched it from the first reading on; where a contact outlasts any touch before ten seconds of rest were seen,
+its noise was not yet known. Then rest is learned anew.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ from scroll_tactile.sensors import Sensor
 __all__ = ["ContactDetector", "Event"]
 
 DEBOUNCE = 3  # readings
-QUIET = 0.15  # seconds
+QUIET = 0.2  # seconds
 FEWEST_QUIET = 4  # readings
-RESIDUAL = 0.01  # of the contact's mean d²: a tenth of its amplitude
+RESIDUAL = 0.005  # of the contact's mean d²: seven hundredths of its amplitude
 STILL = 4  # blocks of noise alone, a second
 LONG = 10.0  # seconds, or four usual touches: then a level may have moved
 QUIETER = 8.0
+YOUNG = 40  # blocks of rest, ten seconds: its noise may not be known yet
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,12 @@ class ContactDetector:
             self._last[place], self._last_aways[place], self._last_distances[place] = numbers[i], aways[i], distance
             self._length += 1
             self._energy += distance
-            near = max(self._rest.kappa, RESIDUAL * self._energy / self._length)
+            near = max(self._rest.near, RESIDUAL * self._energy / self._length)
             if self._length >= ring and sum(self._last_distances) <= ring * (self._rest.inner + near):
                 far, own = self._rest.apart(self._last_aways, self._last_distances)
                 if far <= near and own <= self._rest.inner:
-                    self._rest.resume(self._last)
+                    if far > self._rest.near:
+                        self._rest.resume(self._last)
                     return i + 1, Event("released", ring)
         return len(distances), None
 
@@ -150,7 +153,8 @@ class ContactDetector:
         quieter = 0 < own * QUIETER < self._rest.mean and self._rest.mean > self._rest.channels / 2
         self._quieter = self._quieter + 1 if quieter else 0
         self._recent.append(block)
-        if self._quieter * self._rest.block >= self._rest.needed:
+        young = self.contact and self._length > self._long and self._rest.measured < YOUNG
+        if young or self._quieter * self._rest.block >= self._rest.needed:
             self._rest.learn(np.concatenate(self._recent))
             return Event("relearned")
         if self.contact:

@@ -5,8 +5,8 @@ so that nothing depends on how the readings were dealt out to calls. A reading x
 
     d² = |(x − m) V|²,    V Vᵀ = Σ⁻¹,
 
-from the level m, Σ the mean scatter within blocks of a quarter of a second, pulled to its diagonal as far as there are
-channels for its readings, and no smaller than half a step of the sensor. V is rounded, so that d² is an exact sum, too.
+from the level m, Σ the mean scatter within blocks of a quarter of a second, pulled to that of a usual channel as far as
+there are channels for its readings, and a usual step of each channel beside it. V is rounded, so that d² is an exact sum, too.
 
 Noise is not normal, nor are readings independent: d² is taken to be c χ²_ν, with its mean as it was measured at rest
 and its variance from that of sums over blocks. A sum of max(0, d² − κ) is then beyond h at a rate of exp(−θ h) readings,
@@ -33,10 +33,12 @@ FINE = 2.0**20  # of an entry of V
 FARTHEST = 2.0**22  # units of one channel: 60 squares of it are exact
 BLOCK = 0.25  # seconds
 FEWEST = 8  # readings in a block
-LEARNED = 1.0  # seconds, and no fewer readings than channels
+LEARNED = 2.0  # seconds, and no fewer readings than twice the channels
 FOLLOWED = 8  # blocks whose mean is the level
 UNMEASURED = 8  # blocks that the noise as it should be counts for, beside what is measured
 MOST_BLOCKS = 2**11  # then all sums are halved: noise changes in days
+WIDER = 4.0  # times the variance of normal noise's d², that is assumed of it
+MOST = 2.0  # times the mean d², that a block counts for
 APART = 3.0  # standard deviations of d² that κ lies beyond its mean
 
 
@@ -49,15 +51,15 @@ class Rest:
         self._log_run = math.log(max(2.0, sensor.rate * 3600 / false_contacts))
         self.channels = sensor.channels
         self.block = max(FEWEST, round(BLOCK * sensor.rate))
-        self.needed = -(-max(round(LEARNED * sensor.rate), sensor.channels) // self.block) * self.block
+        self.needed = -(-max(round(LEARNED * sensor.rate), 2 * sensor.channels) // self.block) * self.block
         self.level: Whole = np.zeros(sensor.channels)
         self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
         self._scatter: npt.NDArray[np.int64] = np.zeros((sensor.channels, sensor.channels), np.int64)
         self._floor: Whole = np.ones(sensor.channels)
         self._whiten: Whole = np.empty((0, 0))
-        self._blocks = self._due = 0
-        self._sum = self._squares = 0.0  # of d² over blocks
-        self.mean = self.kappa = self.alarm = self.inner = math.inf
+        self._blocks = self._due = self.measured = 0
+        self._sum = self._squares = self._fourths = 0.0  # of d² over blocks, of its square over them and one by one
+        self.mean = self.kappa = self.alarm = self.inner = self.near = math.inf
 
     def whole(self, rows: npt.NDArray[np.float64]) -> Whole:
         """Readings (k, n) as whole numbers within the range; what is missing is where the level is."""
@@ -85,30 +87,36 @@ class Rest:
     def learn(self, numbers: Whole) -> None:
         """Begin with readings at rest, a whole number of blocks of them: what was learned before is gone."""
         steps = np.abs(np.diff(numbers, axis=0))
-        step = np.where(steps > 0, steps, np.inf).min(axis=0)
-        moving = step[np.isfinite(step)]
-        step[~np.isfinite(step)] = np.median(moving) if len(moving) else LEVELS / 1024
-        self._floor = np.maximum(np.square(step / 2), 1.0)
+        moving = [column[column > 0] for column in steps.T]
+        step = [float(np.median(column)) for column in moving if len(column)]
+        usual = float(np.median(step)) if step else LEVELS / 1024
+        usual_steps = np.array([np.median(column) if len(column) else usual for column in moving])
+        self._floor = np.maximum(np.square(usual_steps), 1.0)
         self._scatter[:] = 0
         self._levels.clear()
-        self._blocks, self._sum, self._squares = 0, 0.0, 0.0
-        for first in range(0, len(numbers), self.block):
-            self._take(numbers[first : first + self.block])
-            self._blocks += 1
-        self._solve(measured=0)
+        self._blocks = self.measured = 0
+        self._sum = self._squares = self._fourths = 0.0
+        blocks = [numbers[first : first + self.block] for first in range(0, len(numbers), self.block)]
+        half = -(-len(blocks) // 2)
+        for block in blocks[:half]:
+            self._take(block)
+        self._solve()
+        for block in blocks[half:]:  # by what the others say of it, and so as it will be measured
+            self._measure(self.distances(block)[1])
+            self._take(block)
+        self._solve()
         self._due = 2 * self._blocks
 
     def follow(self, numbers: Whole, distances: list[float]) -> None:
         """Take in one more block of readings at rest, with their d²."""
         self._take(numbers)
-        total = math.fsum(distances)
-        self._blocks, self._sum, self._squares = self._blocks + 1, self._sum + total, self._squares + total**2
+        self._measure(distances)
         if self._blocks >= self._due:
-            measured = self._blocks - self.needed // self.block
-            self._solve(measured)
+            self._solve()
             if self._blocks >= MOST_BLOCKS:
                 self._scatter //= 2
-                self._blocks, self._sum, self._squares = self._blocks // 2, self._sum / 2, self._squares / 2
+                self._blocks, self.measured = self._blocks // 2, self.measured // 2
+                self._sum, self._squares, self._fourths = self._sum / 2, self._squares / 2, self._fourths / 2
             self._due = max(self._blocks + 4, self._blocks * 5 // 4)
 
     def resume(self, numbers: Whole) -> None:
@@ -124,32 +132,42 @@ class Rest:
         self._scatter += (len(numbers) * (away.T @ away) - np.outer(total, total)).astype(np.int64)
         self._levels.append((numbers.sum(axis=0), len(numbers)))
         self._relevel()
+        self._blocks += 1
+
+    def _measure(self, distances: list[float]) -> None:
+        """Note the d² of a block. A touch too light to be noticed must not make the next one harder to notice."""
+        total = min(math.fsum(distances), MOST * self.mean * self.block)
+        self.measured += 1
+        self._sum, self._squares = self._sum + total, self._squares + total**2
+        self._fourths += math.fsum(min(distance, self.alarm) ** 2 for distance in distances)
 
     def _relevel(self) -> None:
         count = sum(count for _, count in self._levels)
         self.level = np.floor(sum(total for total, _ in self._levels) / count + 0.5)
 
-    def _solve(self, measured: int) -> None:
-        """Whiten by the scatter as it is now, and set the thresholds by the d² of so many blocks."""
+    def _solve(self) -> None:
+        """Whiten by the scatter as it is now, and set the thresholds by the d² that were measured."""
         block, channels = self.block, self.channels
         free = self._blocks * (block - 1)
         covariance = self._scatter / (free * block)
-        variance = np.diagonal(covariance) + self._floor
-        pulled = covariance * (free / (free + channels))
-        pulled[np.diag_indices(channels)] = variance
+        own = np.diagonal(covariance)
+        part = channels / (free + channels)
+        pulled = covariance * (1 - part)
+        pulled[np.diag_indices(channels)] = own * (1 - part) + own.mean() * part + self._floor
         factor = np.linalg.cholesky(pulled)
         self._whiten = np.rint(np.linalg.inv(factor).T * FINE)
-        usual, spread = float(channels), 2.0 * channels * block  # of d², and of its sum over a block
-        count = measured + UNMEASURED
-        self.mean = mean = (self._sum / block + UNMEASURED * usual) / count if measured else usual
-        if measured:
-            own = self._sum / measured
-            among = max(self._squares / measured - own**2, 0.0)
-            spread = (measured * among + UNMEASURED * 2 * spread) / count
-        variance_of_one = max(spread / block, 1e-3 * mean**2)
-        self.kappa = mean + APART * math.sqrt(variance_of_one)
-        self.alarm = self._log_run / _rate(mean, variance_of_one, self.kappa)
-        self.inner = mean + 5 * math.sqrt(variance_of_one / block)
+        mean, spread = float(channels), 2.0 * channels  # of d², where noise is normal
+        if self.measured:
+            count = self.measured + UNMEASURED
+            of_block = self._sum / self.measured
+            among = (self._squares / self.measured - of_block**2) / block
+            alone = self._fourths / (self.measured * block) - (of_block / block) ** 2
+            mean = (self._sum / block + UNMEASURED * mean) / count
+            spread = (self.measured * max(among, alone) + UNMEASURED * WIDER * spread) / count
+        spread = max(spread, 1e-3 * mean**2)
+        self.mean, self.kappa = mean, mean + APART * math.sqrt(spread)
+        self.alarm = self._log_run / _rate(mean, spread, self.kappa)
+        self.inner, self.near = mean + 3 * math.sqrt(spread / block), mean / 2
 
 
 def _rate(mean: float, variance: float, kappa: float) -> float:

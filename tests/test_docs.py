@@ -39,6 +39,7 @@ SHOWN = {
     "own_sensor": "right: 3 of 3",
     "own_embedding": "right: 5 of 5",
     "camera": "refused: expected frames",
+    "live": "10 of 10 touches found",
     "two_robots": "a slip retracted, the same bytes: True",
 }
 

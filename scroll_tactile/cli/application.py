@@ -7,6 +7,7 @@ import typer
 from scroll_tactile.cli.demonstration import demo
 from scroll_tactile.cli.everyday import inspect, observe, predict
 from scroll_tactile.cli.makeup import compose, describe
+from scroll_tactile.cli.replay import live
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
 
@@ -20,6 +21,6 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, predict, inspect, describe, compose):
+for command in (demo, observe, predict, live, inspect, describe, compose):
     app.command()(command)
 app.add_typer(memory, name="memory")

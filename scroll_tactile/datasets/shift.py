@@ -118,7 +118,9 @@ def simulated_shift(scene: Scene, materials: Sequence[str], *, seconds: float, s
     def noise(random: np.random.Generator, count: int) -> Floats:
         return scene.noise(random, count) * (high - low)
 
-    return shift_of(touches(), sensor, low + scene.rest * (high - low), noise, seconds=seconds, step=scene.step, seed=seed)
+    return shift_of(
+        touches(), sensor, low + scene.rest * (high - low), noise, seconds=seconds, step=scene.step, seed=seed
+    )
 
 
 def resting_level(streams: Sequence[Stream], share: float = 0.02) -> Floats:

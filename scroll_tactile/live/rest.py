@@ -6,7 +6,7 @@ so that nothing depends on how the readings were dealt out to calls. A reading x
     d² = |(x − m) V|²,    V Vᵀ = Σ⁻¹,
 
 from the level m, Σ the mean scatter within blocks of a quarter of a second, pulled to that of a usual channel as far as
-there are channels for its readings, and a usual step of each channel beside it. V is rounded, so that d² is an exact sum, too.
+there are channels for its readings, and beside it what a usual channel changes by from one reading to the next. V is rounded, so that d² is an exact sum, too.
 
 Noise is not normal, nor are readings independent: d² is taken to be c χ²_ν, with its mean as it was measured at rest
 and its variance from that of sums over blocks. A sum of max(0, d² − κ) is then beyond h at a rate of exp(−θ h) readings,
@@ -55,7 +55,7 @@ class Rest:
         self.level: Whole = np.zeros(sensor.channels)
         self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
         self._scatter: npt.NDArray[np.int64] = np.zeros((sensor.channels, sensor.channels), np.int64)
-        self._floor: Whole = np.ones(sensor.channels)
+        self._floor = 1.0
         self._whiten: Whole = np.empty((0, 0))
         self._blocks = self._due = self.measured = 0
         self._sum = self._squares = self._fourths = 0.0  # of d² over blocks, of its square over them and one by one
@@ -87,11 +87,9 @@ class Rest:
     def learn(self, numbers: Whole) -> None:
         """Begin with readings at rest, a whole number of blocks of them: what was learned before is gone."""
         steps = np.abs(np.diff(numbers, axis=0))
-        moving = [column[column > 0] for column in steps.T]
-        step = [float(np.median(column)) for column in moving if len(column)]
-        usual = float(np.median(step)) if step else LEVELS / 1024
-        usual_steps = np.array([np.median(column) if len(column) else usual for column in moving])
-        self._floor = np.maximum(np.square(usual_steps), 1.0)
+        moving = [float(np.median(column[column > 0])) for column in steps.T if column.any()]
+        # Of the channels, not of each: one that hardly ever moves at rest is not known for it.
+        self._floor = max(float(np.median(moving)) if moving else LEVELS / 1024, 1.0) ** 2
         self._scatter[:] = 0
         self._levels.clear()
         self._blocks = self.measured = 0

@@ -105,7 +105,7 @@ class LiveSession:
         self._dtype = np.dtype(np.float32 if sensor.camera else np.float64)
         count = 4 if sensor.camera else max(8, round(REMEMBERED * sensor.rate))
         self._recent = Recent(count if not self._manual else 1, sensor.shape, self._dtype)
-        self._now = 0.0  # the time of the next reading
+        self._since, self._came = 0.0, 0  # a time, and the readings that came from then on
         self._under_way: _Touch | None = None
         self._ended: list[LiveTouch] = []
         self._closed = False
@@ -136,7 +136,7 @@ class LiveSession:
                 if part.breaks:
                     self._break(part.breaks)
                 else:
-                    self._now = part.time
+                    self._since, self._came = part.time, 0
                     self._advance(part.rows)
         return self._state()
 
@@ -215,7 +215,7 @@ class LiveSession:
     def _take(self, rows: Array, event: Event | None) -> None:
         """Take readings at whose last something may have happened."""
         touch = self._under_way
-        self._now += len(rows) / self.sensor.rate
+        self._came += len(rows)
         if self._detector is not None:
             self.report.learning = self._detector.learning
         if touch is None:
@@ -250,10 +250,8 @@ class LiveSession:
             rows = np.concatenate([prefix, rows]).astype(self._dtype)
         limit = MOST_FRAMES + before if self.sensor.camera else self._limit(model)
         moments = sorted({-(-moment // frame) + before for moment in self._rule[1].moments}, reverse=True)
-        at = self._now - max(0, len(rows) - before) / self.sensor.rate
-        self._under_way = _Touch(
-            Rows(rows, limit), at, snapshot, self._rule[1], WindowCache(), moments, before
-        )
+        at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
+        self._under_way = _Touch(Rows(rows, limit), at, snapshot, self._rule[1], WindowCache(), moments, before)
         self._predict_in_time(self._under_way)
 
     def _limit(self, model: Model) -> int:

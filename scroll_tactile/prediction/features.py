@@ -187,7 +187,10 @@ class FeatureExtractor:
         width = self._plan.whole
         if cache is not None:
             cache.turn(image)
-            embedded, found = self._completed(image, {int(scale): starts for scale, starts in windows.items()}, cache), {}
+            embedded, found = (
+                self._completed(image, {int(scale): starts for scale, starts in windows.items()}, cache),
+                {},
+            )
         elif WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:
             # A touch of the usual length is convolved once for its windows and for itself.
             embedded = self._embedded(image, {**{int(scale): starts for scale, starts in windows.items()}, width: [0]})

@@ -1,0 +1,163 @@
+"""`scroll-tactile live`: readings from a file or another program, and the answer as it grows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from scroll_tactile.cli.everyday import MemoryFolder
+from scroll_tactile.cli.terminal import console, opened, percent, say, verdict
+from scroll_tactile.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from scroll_tactile.live.answers import LiveReport, LiveState
+
+__all__ = ["live"]
+
+SHOWN = 5  # materials
+BAR = 30  # characters of a probability of one
+
+
+def live(
+    memory: MemoryFolder,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A .npy or .csv file of readings, a row each; or - for lines of comma-separated numbers on the "
+            "standard input, as they come.",
+            show_default=False,
+        ),
+    ],
+    risk: Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")] = 0.05,
+    timed: Annotated[bool, typer.Option("--timed", help="The first column is each reading's time in seconds.")] = False,
+    touch: Annotated[
+        bool, typer.Option("--touch", help="All of it is one touch; otherwise touches are found, after 2 s at rest.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
+) -> None:
+    """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
+    screen = console()
+    with opened(memory, mode="read") as learner:
+        shape = learner.sensor.shape
+        session = learner.live(risk=risk, contact="manual" if touch else "auto")
+        growing = Live(console=screen, auto_refresh=False, transient=True)
+        with session, growing if screen.is_terminal and not as_json else nullcontext():
+            if touch:
+                session.begin()
+            before: LiveState | None = None
+            count = 0
+            for row in _rows(file):
+                count += 1
+                reading, time = (row[1:], float(row[0])) if timed else (row, None)
+                now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
+                before = _shown(before, now, count / learner.sensor.rate, as_json, growing)
+            if touch:
+                _shown(before, session.end(), count / learner.sensor.rate, as_json, growing)
+        _summed_up(session.report, as_json)
+
+
+def _rows(file: Path) -> Iterator[npt.NDArray[np.float64]]:
+    import numpy as np
+
+    from scroll_tactile.recordings.arrays import read_stream
+
+    if str(file) != "-":
+        yield from read_stream(file)
+        return
+    for number, line in enumerate(sys.stdin, start=1):
+        if not line.strip():
+            continue
+        try:
+            yield np.array([float(cell) for cell in line.split(",")])
+        except ValueError:
+            raise InputError(
+                f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
+            ) from None
+
+
+def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:
+    """Show what is new after a reading."""
+    for ended in now.touches:
+        if as_json:
+            _line(
+                "ended",
+                ended.at,
+                seconds=ended.stream.seconds,
+                decided=ended.decided,
+                end=ended.end,
+                **_answer(ended.prediction),
+            )
+        else:
+            safe = "decided" if ended.decided else "[yellow]undecided[/]"
+            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {verdict(ended.prediction)}, {safe}")
+            growing.update("", refresh=growing.is_started)
+    old = before if before is not None and before.contact else None
+    if not now.contact:
+        return now
+    if as_json:
+        if old is None:
+            _line("began", at - now.seconds)
+        if now.prediction is not None and (old is None or now.prediction is not old.prediction):
+            _line("prediction", at, seconds=now.seconds, decided=now.decided, **_answer(now.prediction))
+        return now
+    if growing.is_started:
+        growing.update(_table(now), refresh=True)
+    elif now.decided and (old is None or not old.decided) and now.prediction is not None:
+        say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
+    return now
+
+
+def _table(now: LiveState) -> Table:
+    """The likeliest materials of a touch under way."""
+    said = "decided" if now.decided else "not yet decided"
+    table = Table(title=f"touched for {now.seconds:.2f} s, {said}")
+    for heading in ("material", "probability", ""):
+        table.add_column(heading)
+    if now.prediction is not None:
+        for name, probability in now.prediction.ranking[:SHOWN]:
+            table.add_row(escape(name), percent(probability), "█" * round(BAR * probability))
+    return table
+
+
+def _answer(prediction: Any) -> dict[str, Any]:
+    infinite = prediction.novelty == float("inf")  # JSON has no infinity
+    return {
+        "material": prediction.material,
+        "probability": prediction.probability,
+        "known": prediction.known,
+        "novelty": None if infinite else prediction.novelty,
+    }
+
+
+def _line(event: str, at: float, **more: Any) -> None:
+    typer.echo(json.dumps({"event": event, "at": round(at, 6), **more}, ensure_ascii=False))
+    sys.stdout.flush()
+
+
+def _summed_up(report: LiveReport, as_json: bool) -> None:
+    counted = {name: count for name, count in vars(report).items() if count}
+    if as_json:
+        typer.echo(json.dumps({"event": "report", **counted}))
+        return
+    if report.learning:
+        say("[yellow]all of it went into learning the sensor at rest[/]: for one touch from end to end take --touch")
+    say(f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided")
+    strange = [
+        name
+        for name in ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
+        if counted.get(name)
+    ]
+    if strange:
+        say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in strange))

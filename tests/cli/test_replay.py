@@ -1,0 +1,79 @@
+"""`scroll-tactile live`, as it is typed."""
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from commands import refused, run
+from rich.console import Console
+
+from scroll_tactile import Kernels, TactileLearner, sensors
+from scroll_tactile.cli import replay
+from scroll_tactile.datasets.shift import simulated_shift
+from scroll_tactile.datasets.simulator import Scene
+
+SCENE = Scene(sensors.ROBOSKIN)
+SHIFT = simulated_shift(SCENE, ["silk", "wool"], seconds=22)
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("live")
+    with TactileLearner.open(folder / "memory", sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64)) as learner:
+        for repetition in range(3):
+            for name in ("silk", "wool", "oak"):
+                learner.observe(name, SCENE.touch(name, repetition))
+    np.save(folder / "timed.npy", np.column_stack([SHIFT.times, SHIFT.readings]))
+    np.save(folder / "silk.npy", SCENE.touch("silk", 9).readings)
+    return folder
+
+
+def test_a_recording_is_replayed_with_its_touches(memory):
+    result = run("live", memory / "memory", memory / "timed.npy", "--timed")
+    assert result.exit_code == 0, result.output
+    assert f"touches: {len(SHIFT.touches)}," in result.output
+    assert result.output.count("touched for") == len(SHIFT.touches)
+
+
+def test_each_thing_that_happens_is_a_line_of_json(memory):
+    result = run("live", memory / "memory", memory / "timed.npy", "--timed", "--json")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    ended = [line for line in lines if line["event"] == "ended"]
+    assert [line["material"] for line in ended] == [touch.material for touch in SHIFT.touches]
+    for line, touch in zip(ended, SHIFT.touches, strict=True):
+        assert abs(line["at"] - touch.begin) < 0.05
+    assert sum(line["event"] == "began" for line in lines) == len(SHIFT.touches)
+    assert sum(line["event"] == "prediction" for line in lines) > len(SHIFT.touches)
+    assert lines[-1]["event"] == "report" and lines[-1]["touches"] == len(SHIFT.touches)
+
+
+def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
+    text = "\n".join(",".join(map(str, row)) for row in SCENE.touch("silk", 9).readings)
+    monkeypatch.setattr(sys, "stdin", io.StringIO(text + "\n\n"))
+    with TactileLearner.open(memory / "memory", mode="read") as learner:
+        expected = learner.predict(SCENE.touch("silk", 9))
+    lines = []
+    monkeypatch.setattr(replay.typer, "echo", lines.append)
+    replay.live(memory / "memory", replay.Path("-"), 0.05, False, True, True)
+    answer = json.loads(lines[-2])
+    assert (answer["event"], answer["material"]) == ("ended", expected.material)
+    assert answer["probability"] == expected.probability
+
+
+def test_on_a_terminal_the_answer_grows(memory, monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=80)
+    monkeypatch.setattr(replay, "console", lambda: screen)
+    replay.live(memory / "memory", memory / "silk.npy", 0.05, False, True, False)
+    shown = screen.file.getvalue()
+    assert "touched for 0.30 s" in shown and "touched for 1.50 s" in shown and "█" in shown
+
+
+def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
+    assert "it is not there" in refused("live", memory / "memory", memory / "nothing.npy")
+    np.save(memory / "narrow.npy", np.zeros((5, 3)))
+    assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
+    monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
+    with pytest.raises(replay.InputError, match="line 2"):
+        list(replay._rows(replay.Path("-")))

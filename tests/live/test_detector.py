@@ -1,0 +1,152 @@
+"""Contact by the sensor's own noise at rest."""
+
+import numpy as np
+import pytest
+from live_touches import learner, rest, shift, slide
+from touches import PAD
+
+from scroll_tactile import Sensor, TactileLearner, sensors
+from scroll_tactile.datasets.shift import quiet_noise, resting_level, shift_of, simulated_shift
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+from scroll_tactile.live.detector import ContactDetector
+
+
+def found(sensor, rows, false_contacts=1.0, size=10_000):
+    """The contacts of a stream: (first, last) readings, and the detector."""
+    detector, first, contacts, begun = ContactDetector(sensor, false_contacts), 0, [], 0
+    while first < len(rows):
+        used, event = detector.feed(rows[first : first + size])
+        first += used
+        if event is not None and event.kind == "began":
+            begun = first - event.readings
+        elif event is not None and event.kind != "relearned":
+            contacts.append((begun, first - event.readings))
+    return contacts, detector
+
+
+def wide(channels, unit="N", **fields):
+    return Sensor(
+        **{"name": "wide", "channels": channels, "rate": 100.0, "low": -5.0, "high": 5.0, "unit": unit, "duration": 2.0}
+        | fields
+    )
+
+
+@pytest.mark.parametrize("noise", ["white", "slow", "common", "counts", "heavy"])
+def test_noise_alone_is_no_contact(noise):
+    random = np.random.default_rng(3)
+    rows = random.standard_normal((60_000, 12))
+    if noise == "slow":
+        for i in range(1, len(rows)):
+            rows[i] = 0.9 * rows[i - 1] + 0.44 * rows[i]
+    elif noise == "common":
+        rows += 5 * random.standard_normal((len(rows), 1))
+    elif noise == "counts":
+        rows = np.rint(0.4 * rows) * 2.5
+    elif noise == "heavy":
+        rows = random.standard_t(4, rows.shape)
+    contacts, _ = found(wide(12), 0.02 * rows)
+    assert len(contacts) <= 1  # ten minutes, of which an hour may have one
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_units_do_not_matter(scale):
+    random = np.random.default_rng(4)
+    rows = 0.02 * random.standard_normal((3000, 12))
+    rows[1000:1400] += 0.3
+    rows[2000:2300, 3:5] -= 0.4
+    sensor = wide(12, low=-5.0 * scale, high=5.0 * scale)
+    contacts, _ = found(sensor, scale * rows)
+    assert np.abs(np.array(contacts) - [(1000, 1400), (2000, 2300)]).max() <= 2
+
+
+def test_a_glitch_is_no_contact():
+    random = np.random.default_rng(5)
+    rows = 0.02 * random.standard_normal((5000, 12))
+    rows[1000::300] = 5.0
+    rows[1001::900] = -5.0
+    assert found(wide(12), rows)[0] == []
+
+
+def test_drift_is_followed_and_a_touch_on_it_is_found():
+    random = np.random.default_rng(6)
+    rows = 0.02 * random.standard_normal((30_000, 12)) + np.linspace(0, 3, 30_000)[:, None]
+    rows[20_000:20_300] += 0.5
+    contacts, _ = found(wide(12), rows)
+    assert len(contacts) == 1 and abs(contacts[0][0] - 20_000) <= 2
+
+
+def test_a_level_that_does_not_come_back_ends_the_touch_all_the_same():
+    random = np.random.default_rng(7)
+    rows = 0.02 * random.standard_normal((4000, 12))
+    rows[1000:1400] += 1 + 0.3 * np.sin(np.arange(400))[:, None]
+    rows[1400:] += 0.03
+    contacts, detector = found(wide(12), rows)
+    assert len(contacts) == 1 and abs(contacts[0][1] - 1400) <= 3
+    assert not detector.contact
+
+
+def test_a_level_that_moved_for_good_is_rest_in_the_end():
+    random = np.random.default_rng(8)
+    rows = 0.02 * random.standard_normal((9000, 12))
+    rows[3000:] += 1.0
+    rows[7000:7200] += 1.0
+    with TactileLearner(sensor=wide(12)).live() as live:
+        ended = live.push(rows).touches
+    assert [touch.end for touch in ended] == ["still", "released"]
+    assert abs(round(ended[1].at * 100) - 7000) <= 2
+
+
+def test_contact_from_the_first_reading_on_is_found_out_and_reported():
+    random = np.random.default_rng(9)
+    rows = np.concatenate([slide("a", 200, random), shift("ab", 2)[0]])
+    with learner().live() as live:
+        assert live.push(rows[:20]) == live.push([]) and live.report.learning
+        ended = live.push(rows[20:]).touches
+        assert not live.report.learning
+    assert live.report.relearned == 1
+    begins = [round(touch.at * PAD.rate) - 200 for touch in ended]
+    assert all(abs(begin - place) <= 2 for begin, place in zip(begins[-1:], [290], strict=True))
+
+
+def test_rest_is_whole_numbers_whatever_the_blocks():
+    rows, _ = shift("abcab", 8)
+    kept = []
+    for size in (1, 7, 64, 10_000):
+        contacts, detector = found(PAD, rows, size=size)
+        rest_ = detector._rest
+        kept.append((contacts, rest_.level.tobytes(), rest_._scatter.tobytes(), rest_.alarm, rest_.kappa))
+    assert all(other == kept[0] for other in kept)
+
+
+def test_fewer_false_contacts_an_hour_ask_for_more():
+    random = np.random.default_rng(10)
+    rows = 0.02 * random.standard_normal((2000, 12))
+    alarms = [found(wide(12), rows, hour)[1]._rest.alarm for hour in (0.01, 1.0, 100.0)]
+    assert alarms == sorted(alarms, reverse=True) and alarms[0] > 1.5 * alarms[2] > 0
+
+
+@pytest.mark.parametrize("sensor", [sensors.BIOTAC, sensors.ROBOSKIN], ids=lambda sensor: sensor.name)
+def test_a_simulated_shift_s_touches_are_found(sensor):
+    scene = Scene(sensor=sensor)
+    shift_ = simulated_shift(scene, scene.materials[:5], seconds=120)
+    with TactileLearner(sensor=sensor).live() as live:
+        touches = live.push(shift_.readings, time=shift_.times).touches
+    assert len(touches) == len(shift_.touches)
+    off = [touch.at - truth.begin for touch, truth in zip(touches, shift_.touches, strict=True)]
+    assert np.median(np.abs(off)) <= 0.03
+    assert live.report.gaps == 5 and live.report.lost > 0
+
+
+def test_a_shift_of_anybody_s_touches(tmp_path):
+    scene = Scene(sensor=sensors.ROBOSKIN)
+    streams = [scene.touch("oak", repetition) for repetition in range(8)]
+    noise, level = quiet_noise(streams), resting_level(streams)
+    touches = [("oak", stream.readings) for stream in streams]
+    made = shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=30, lost=0, gaps=1, jitter=0.0, drift=0.0)
+    assert len(made.readings) == len(made.times) == 1500
+    first = int(np.searchsorted(made.times, made.touches[0].begin))
+    assert np.array_equal(made.readings[first : first + 75], streams[0].readings)
+    assert (np.diff(made.times) > 0.2).sum() == 1
+    with pytest.raises(InputError, match="hold"):
+        shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=1)

@@ -27,10 +27,10 @@ with learner.live(risk=0.05) as live:
         if now.ended:
             acted = False
             touch, real = now.touches[0], next(truth)
-            right += now.prediction.material == real.material and now.decided
-            if not now.prediction.known:
+            right += touch.prediction.material == real.material and touch.decided
+            if not touch.prediction.known:
                 told += 1
-                learner.observe(real.material, live.touch)  # told afterwards, as people do
+                learner.observe(real.material, touch.stream)  # told afterwards, as people do
     print(f"{live.report.touches} of {len(robot.touches)} touches found, {right} decided and right")
     print(f"decided after {sum(early) / len(early):.2f} s of touches of 4 s")
     print(f"never felt before, and told what it was: {told}")

@@ -92,7 +92,6 @@ def shift_of(
         values = low + np.rint((values - low) / step) * step
     values = np.clip(values, low, high)
     times = np.arange(count) / sensor.rate
-    begins = times[[begin for _, begin, _ in places]]
     chosen = random.choice(len(places), size=min(gaps, len(places)), replace=False)
     for place in sorted(chosen.tolist()):
         times[places[place][1] - round(rests[0] * sensor.rate / 2) :] += random.uniform(0.2, 3.0)
@@ -116,16 +115,15 @@ def simulated_shift(scene: Scene, materials: Sequence[str], *, seconds: float, s
             yield name, scene.touch(name, 10_000 + repetition).readings
 
     def noise(random: np.random.Generator, count: int) -> Floats:
-        return scene.noise(random, count) * (high - low)
+        return np.asarray(scene.noise(random, count) * (high - low))
 
-    return shift_of(
-        touches(), sensor, low + scene.rest * (high - low), noise, seconds=seconds, step=scene.step, seed=seed
-    )
+    level = low + scene.rest * (high - low)
+    return shift_of(touches(), sensor, level, noise, seconds=seconds, step=scene.step, seed=seed)
 
 
 def resting_level(streams: Sequence[Stream], share: float = 0.02) -> Floats:
     """Of each channel what only this share of recorded readings lie below: where a touch presses least, (n,)."""
-    return np.quantile(np.concatenate([stream.readings for stream in streams]), share, axis=0)
+    return np.asarray(np.quantile(np.concatenate([stream.readings for stream in streams]), share, axis=0))
 
 
 def quiet_noise(streams: Sequence[Stream]) -> Noise:

@@ -80,7 +80,7 @@ class Clock:
                 "A block (k, n) has times (k,)"
             )
         if not all(map(math.isfinite, seconds)):
-            raise InputError(f"expected finite times; came {[s for s in seconds if not math.isfinite(s)][0]}")
+            raise InputError(f"expected finite times; came {next(s for s in seconds if not math.isfinite(s))}")
         self._require_seconds(seconds)
         return seconds
 
@@ -126,29 +126,33 @@ class Clock:
 
     def _place(self, stamp: float, row: Rows) -> tuple[int, str]:
         """How many places after the last reading this one belongs, 0 for nowhere, and whether time begins anew."""
-        report, last, off = self._report, self._last, (stamp - self._expected) * self._rate
-        if stamp == last:
+        if stamp == self._last:
             return self._standing(row), ""
+        off = (stamp - self._expected) * self._rate
         resumed, self._still = self._still > self._gap, 0
         if math.isnan(off) or resumed:
             return self._anew(stamp), ""
-        if stamp < last:
-            if (last - stamp) * self._rate <= self._gap:
-                report.late += 1
-                return 0, ""
-            report.steps_back += 1
+        if stamp < self._last and (self._last - stamp) * self._rate > self._gap:
+            self._report.steps_back += 1
             return self._anew(stamp), "time went back"
         if off > self._gap:
-            report.gaps += 1
+            self._report.gaps += 1
             return self._anew(stamp), "gap"
+        return self._next(stamp, off), ""
+
+    def _next(self, stamp: float, off: float) -> int:
+        """Where a reading belongs whose stamp lies so many periods off from where the next is expected."""
+        if stamp < self._last:
+            self._report.late += 1
+            return 0
         self._last = stamp
         if off < -WITHIN:
-            report.surplus += 1
-            return 0, ""
-        lost = max(0, round(off)) if off > WITHIN else 0
-        report.lost += lost
+            self._report.surplus += 1
+            return 0
+        lost = round(off) if off > WITHIN else 0
+        self._report.lost += lost
         self._expected += (1 + lost + FOLLOWED * (off - lost)) / self._rate
-        return 1 + lost, ""
+        return 1 + lost
 
     def _anew(self, stamp: float) -> int:
         self._last, self._expected = stamp, stamp + 1 / self._rate

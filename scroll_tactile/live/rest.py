@@ -6,11 +6,13 @@ so that nothing depends on how the readings were dealt out to calls. A reading x
     d² = |(x − m) V|²,    V Vᵀ = Σ⁻¹,
 
 from the level m, Σ the mean scatter within blocks of a quarter of a second, pulled to that of a usual channel as far as
-there are channels for its readings, and beside it what a usual channel changes by from one reading to the next. V is rounded, so that d² is an exact sum, too.
+there are channels for its readings, and beside it what a usual channel changes by from one reading to the next. V is
+rounded, so that d² is an exact sum, too.
 
-Noise is not normal, nor are readings independent: d² is taken to be c χ²_ν, with its mean as it was measured at rest
-and its variance from that of sums over blocks. A sum of max(0, d² − κ) is then beyond h at a rate of exp(−θ h) readings,
-where E exp(θ (d² − κ)) = 1 (Lorden 1971; Page's CUSUM), so that h follows from how many false contacts an hour may have.
+Noise is not normal, nor are readings independent: d² is taken to be c χ²_ν, with its mean as it was measured at rest,
+and the larger of its variance and that of its sums over blocks. A sum of d² − κ that never falls below 0 passes h at a
+rate of exp(−θ h) a reading, where E exp(θ (d² − κ)) = 1 (Page's CUSUM; Lorden 1971), so that h follows from how many
+false contacts an hour may have.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def validate(readings: npt.ArrayLike | Iterable[npt.ArrayLike] | Stream, sensor:
 
 
 def as_rows(readings: npt.ArrayLike | Iterable[npt.ArrayLike], sensor: Sensor) -> _Array:
-    """One reading, or a block of them, as an array of real numbers of shape (k, n), or (k, height, width, 3); k may be 0.
+    """One reading, or a block of k ≥ 0, as an array of real numbers of shape (k, n), or (k, height, width, 3).
 
     For readings that come a few at a time: nothing is copied without need, nor clipped.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from live_touches import learner, rest, shift, slide
+from live_touches import learner, shift, slide
 from touches import PAD
 
 from scroll_tactile import Sensor, TactileLearner, sensors

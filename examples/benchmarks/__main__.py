@@ -14,6 +14,7 @@ from rich.table import Table
 
 from examples.benchmarks.buffers import run_buffers
 from examples.benchmarks.interleaved import run_interleaved
+from examples.benchmarks.live_shift import run_shifts, show_shifts
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
@@ -84,6 +85,25 @@ def speed(
         result = run_speed(seed=seed, data=data, before=before, sizes=sizes, note=lambda what: progress(what, 0, 1))
     show_speed(result)
     _written(context, json, result)
+
+
+@app.command()
+def live(
+    context: typer.Context,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in: also shifts of its touches."),
+    ] = None,
+    hours: Annotated[float, typer.Option(min=0.01, help="How long each shift is.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the shifts, and of BioTac's folds.")] = 0,
+    json: Json = None,
+) -> None:
+    """Send shifts of simulated and of recorded touches through a live session, reading by reading."""
+    require_folders(json)
+    with progress_bar() as progress:
+        records = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
+    show_shifts(records)
+    _written(context, json, {"shifts": records})
 
 
 @app.command()

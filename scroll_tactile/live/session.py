@@ -8,11 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal, Self
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
+from scroll_tactile.embeddings.protocol import Embedding, canary, capabilities_of
 from scroll_tactile.errors import InputError, StreamError
 from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
@@ -93,7 +94,6 @@ class LiveSession:
         model = memory.snapshot().model
         candidates_of(scene, model.names, model.known)
         self._scene = scene
-        self._rule: tuple[Model, DecisionRule] | None = None
         self._manual = contact == "manual"
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
@@ -110,6 +110,7 @@ class LiveSession:
         self._ended: list[LiveTouch] = []
         self._closed = False
         self.touch: Stream | None = None
+        self._rule(model)
 
     def push(self, reading: npt.ArrayLike, time: Any = None) -> LiveState:
         """Take a reading (n,) or a block (k, n), k of 0 or more, and say where the session stands after it.
@@ -239,8 +240,7 @@ class LiveSession:
         self._recent.clear()
         snapshot = self._memory.snapshot()
         model = snapshot.model
-        if self._rule is None or self._rule[0] is not model:
-            self._rule = model, decision_rule(model, self._risk)
+        rule = self._rule(model)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame = 0, 1
         if self.sensor.camera:
@@ -249,10 +249,30 @@ class LiveSession:
         if prefix is not None:
             rows = np.concatenate([prefix, rows]).astype(self._dtype)
         limit = MOST_FRAMES + before if self.sensor.camera else self._limit(model)
-        moments = sorted({-(-moment // frame) + before for moment in self._rule[1].moments}, reverse=True)
+        moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
-        self._under_way = _Touch(Rows(rows, limit), at, snapshot, self._rule[1], WindowCache(), moments, before)
+        self._under_way = _Touch(Rows(rows, limit), at, snapshot, rule, WindowCache(), moments, before)
         self._predict_in_time(self._under_way)
+
+    def _rule(self, model: Model) -> DecisionRule:
+        """When predictions are made with a model, and when they are decided; once for each model."""
+        known = _RULES.setdefault(model, {})
+        if self._risk not in known:
+            known[self._risk] = rule = decision_rule(model, self._risk)
+            if not self.sensor.camera and model.names:
+                self._warm_up(model, rule)
+        return known[self._risk]
+
+    def _warm_up(self, model: Model, rule: DecisionRule) -> None:
+        """Predict a made-up touch as a real one will be: the first time takes ten times as long."""
+        low, high = self.sensor.limits
+        image, cache = canary(self.sensor.channels, max(2, *rule.moments, model.longest)), WindowCache()
+        for moment in [*rule.moments, image.shape[1]]:
+            stream = self._memory.extractor.stream(low + (high - low) * (image[:, : max(2, moment)].T + 1) / 2)
+            encoded = self._memory.extractor.encode(
+                stream, model.longest, lambda columns: model.needed(model.names, columns), cache
+            )
+            self._memory.answer(model, model.names, encoded)
 
     def _limit(self, model: Model) -> int:
         return max(round(KEPT * self.sensor.rate), 4 * model.longest)
@@ -265,6 +285,8 @@ class LiveSession:
         if moment:
             with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
                 self._predict(touch, self._stream(touch, moment))
+        if touch.decided:
+            touch.moments.clear()
 
     def _stream(self, touch: _Touch, count: int) -> Stream:
         """The stream of the first readings of a touch. Raises StreamError where they make none."""
@@ -324,3 +346,4 @@ class LiveSession:
 
 
 _AT_REST = LiveState()
+_RULES: WeakKeyDictionary[Model, dict[float, DecisionRule]] = WeakKeyDictionary()  # by risk

@@ -209,7 +209,7 @@ def test_before_anything_was_observed_nothing_is_known():
 
 def test_a_thousand_sessions_opened_and_left_are_gone():
     made = learner()
-    rows = shift("a")[0][:150]
+    rows = rest(110, RANDOM)
     threads = threading.active_count()
 
     def opened():

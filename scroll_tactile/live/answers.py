@@ -36,9 +36,8 @@ class LiveState(NamedTuple):
 
     contact: whether something is touched. seconds: since the touch began. prediction: that of the touch's beginning,
     made at the last of the moments at which it may change; None before the first. decided: whether it is safe to act
-    on: then both stay until the touch ends. ended: whether a touch ended in this push. touches: all that ended in it, in
-    order;
-    a block of readings can hold several.
+    on: then both stay until the touch ends. ended: whether a touch ended in this push. touches: all that ended in it,
+    in order; a block of readings can hold several.
 
     Where a touch ended and none began after it in the same push, seconds, prediction and decided are those of the touch
     that ended. At rest they are 0, None and False.

@@ -39,7 +39,7 @@ def require_prefixes(made, shown, touch):
 def test_predictions_are_those_of_the_touch_s_beginnings(embedding, seed, length, data):
     made, touch = learner(embedding), slide("abc"[seed % 3], length, np.random.default_rng(seed))
     sizes = data.draw(st.lists(st.integers(0, 20), max_size=12))
-    with made.live(contact="manual") as live:
+    with made.live(contact="manual", risk=1e-12) as live:
         live.begin()
         shown, _ = predictions(live, touch, sizes)
         now = live.end()
@@ -51,7 +51,7 @@ def test_predictions_are_those_of_the_touch_s_beginnings(embedding, seed, length
 
 def test_each_prediction_shows_when_readings_come_one_by_one():
     made, touch = learner(), slide("b", 50, RANDOM)
-    with made.live(contact="manual") as live:
+    with made.live(contact="manual", risk=1e-12) as live:
         live.begin()
         shown, _ = predictions(live, touch, [1] * 50)
     assert len(shown) > 3
@@ -123,7 +123,7 @@ def test_what_stays_undecided_says_so():
 @pytest.mark.parametrize("count", [1, 3, 5, 30])
 def test_frames_are_found_behind_the_gel_at_rest(count):
     made, rows = gel_learner(), frames(GEL.materials[1], 7, count)
-    with made.live() as live:
+    with made.live(risk=1e-12) as live:
         shown, ended = predictions(live, rows, [1] * len(rows))
     touching = np.flatnonzero(in_contact(validate(rows, GEL.sensor), "first"))
     if count == 1:  # one frame is none yet
@@ -154,7 +154,7 @@ def test_the_snapshot_is_the_memory_as_it_was_when_the_touch_began():
     made.settle()
     touch = slide("c", 50, RANDOM)
     before = [made.predict(touch[:count]) for count in range(2, 51)]
-    with made.live(contact="manual") as live:
+    with made.live(contact="manual", risk=1e-12) as live:
         live.begin()
         shown, _ = predictions(live, touch[:20], [1] * 20)
         for repetition in range(5):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Prediction
 
@@ -24,7 +25,7 @@ class DecisionRule:
         return prediction.known and prediction.probability >= 1 - self.risk
 
 
-def decision_rule(model: Model, risk: float) -> DecisionRule:
+def decision_rule(model: Model, extractor: FeatureExtractor, risk: float) -> DecisionRule:
     """The rule of a model."""
     first, last = model.plan.widths[0] // 3, max(model.longest, 3)
     return DecisionRule(tuple(np.unique(np.geomspace(max(first, 2), last, 7).astype(int)).tolist()), risk)

@@ -258,7 +258,7 @@ class LiveSession:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
-            known[self._risk] = rule = decision_rule(model, self._risk)
+            known[self._risk] = rule = decision_rule(model, self._memory.extractor, self._risk)
             if not self.sensor.camera and model.names:
                 self._warm_up(model, rule)
         return known[self._risk]

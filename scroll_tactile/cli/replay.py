@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 
 from scroll_tactile.cli.everyday import MemoryFolder
-from scroll_tactile.cli.terminal import console, opened, percent, say, verdict
+from scroll_tactile.cli.terminal import console, opened, percent, say, shown, verdict
 from scroll_tactile.errors import InputError
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ def _table(now: LiveState) -> Table:
         table.add_column(heading)
     if now.prediction is not None:
         for name, probability in now.prediction.ranking[:SHOWN]:
-            table.add_row(escape(name), percent(probability), "█" * round(BAR * probability))
+            table.add_row(shown(name), percent(probability), "█" * round(BAR * probability))
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,10 +31,10 @@ from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
+from scroll_tactile.prediction.answer import Touch, answer
 from scroll_tactile.prediction.current import CurrentModel, Snapshot
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.model import Draft, Model, enough_memory
-from scroll_tactile.prediction.recalling import judged
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -41,7 +42,6 @@ from scroll_tactile.settings import Settings, candidates_of, names_of, require_n
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.moments import one_thread
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
@@ -397,18 +397,22 @@ class TactileLearner:
         """
         return self._ledger.refresh()
 
-    def predict(self, stream: Readings, *, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
+    def predict(self, *streams: Readings, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
         """Classify a stream among the materials observed; the memory stays as it is, and the answer is of one state.
 
-        stream: as for `observe`. scene: the materials that can be here; None: all that were observed.
+        streams: one, as for `observe`, or several touches of one thing: what they say adds up, as far as touches of one
+        material do not say the same anyway. Their order makes no difference, and one that comes twice counts once.
+        scene: the materials that can be here; None: all that were observed.
         tuned: let f* answer (see `fine_tune`), if one was kept, knows all candidates, and the touch is long enough for
-        it; f answers otherwise. `Prediction.tuned` says which of them did.
+        it; f answers otherwise. `Prediction.tuned` says which of them did: of several touches, whether f* did of all.
 
         Raises StreamError, UnknownMaterialError for a scene that names a material never observed, InputError for an
-        empty one. Before anything was observed the answer is material None, known False.
+        empty one, and for no stream. Before anything was observed the answer is material None, known False.
         """
         wanted = names_of("scene", scene)
-        touch = self._extractor.stream(stream)
+        if not streams:
+            raise InputError("expected a stream to predict, or several of one thing; came none")
+        touches = [self._extractor.stream(stream) for stream in streams]
 
         def evaluate() -> tuple[int, Callable[[], Prediction]]:
             with self._ledger.lock:
@@ -416,14 +420,20 @@ class TactileLearner:
                 version, reader = self._ledger.version, self._reader() if tuned else None
                 candidates = candidates_of(wanted, model.names, model.known)
             if not candidates:
-                return version, lambda: Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
-            encoded = self._extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
-            logits = None
-            if reader is not None and model.is_last(encoded.columns):
-                logits = reader.logits_of(encoded.image, candidates)
-            return version, lambda: self._answer(model, candidates, encoded, logits)
+                seconds = math.fsum({touch.key: touch.seconds for touch in touches}.values())
+                return version, lambda: Prediction(None, 0.0, (), float("inf"), False, seconds)
+            encoded = [self._encoded(model, candidates, touch, reader) for touch in touches]
+            return version, lambda: self._answer(model, candidates, encoded)
 
         return self._of_one_state(evaluate)
+
+    def _encoded(
+        self, model: Model, candidates: Sequence[str], touch: Stream, reader: TunedReader | None
+    ) -> tuple[Encoded, Mapping[str, float] | None]:
+        """A touch, and the logits of f* where it answers."""
+        encoded = self._extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
+        answers = reader is not None and model.is_last(encoded.columns)
+        return encoded, reader.logits_of(encoded.image, candidates) if reader is not None and answers else None
 
     def live(
         self,
@@ -504,12 +514,12 @@ class TactileLearner:
 
             encoded = self._extractor.encode(touch, model.longest, needed)
 
-            def answer() -> Composition:
-                prediction = self._answer(model, model.names, encoded, None)
+            def composed() -> Composition:
+                prediction = self._answer(model, model.names, [(encoded, None)])
                 made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
                 return Composition(made_of, new, prediction)
 
-            return version, answer
+            return version, composed
 
         return self._of_one_state(evaluate)
 
@@ -536,20 +546,8 @@ class TactileLearner:
             self._unverified = None
         return self._extractor
 
-    def _answer(
-        self, model: Model, candidates: Sequence[str], encoded: Encoded, logits: Mapping[str, float] | None
-    ) -> Prediction:
-        with one_thread():
-            if logits is None:
-                judgement = judged(model, self._extractor, candidates, encoded)
-            else:
-                judgement = model.judge(candidates, encoded.means, encoded.columns, logits)
-        order = np.argsort(-judgement.probability, kind="stable")  # candidates come in alphabetical order
-        names = [candidates[place] for place in order.tolist()]
-        ranking = tuple(zip(names, judgement.probability[order].tolist(), strict=True))
-        known = bool(judgement.novelty <= judgement.calibration.threshold(self._settings.false_alarms))
-        tuned = logits is not None
-        return Prediction(*ranking[0], ranking, judgement.novelty, known, encoded.seconds, tuned=tuned)
+    def _answer(self, model: Model, candidates: Sequence[str], touches: Sequence[Touch]) -> Prediction:
+        return answer(model, self._extractor, candidates, touches, self._settings.false_alarms)
 
     def settle(self) -> None:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.

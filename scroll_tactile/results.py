@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from scroll_tactile.errors import InputError
+
 __all__ = ["Compacted", "Composition", "Constituent", "Merged", "Observation", "Prediction", "Receipt"]
 
 
@@ -69,7 +71,7 @@ class Compacted:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a stream feels like.
+    """What a stream feels like, or several of one thing.
 
     material: the likeliest of the materials that were candidates; None where nothing was ever observed.
     probability: that of `material`, given that it is one of the candidates; calibrated on touches held out.
@@ -79,8 +81,10 @@ class Prediction:
     known: whether novelty stays below the threshold of the false-alarm rate. False means "never felt this", and
         `material` is then only the nearest.
     seconds: how much touch the answer rests on: the stream's length, at most that of the longest touch learned. Of a
-        camera's stream only the frames in contact count, and the one at rest.
+        camera's stream only the frames in contact count, and the one at rest. Of several streams it is the sum.
     tuned: whether f*, the fine-tuned model, gave the probabilities, and not f. Novelty is always f's.
+    typicality: of each material in the ranking the share of touches of it, this one among them, that are as strange as
+        this one, by the touches that are kept; 1 where nothing is. See `candidates`.
     """
 
     material: str | None
@@ -90,6 +94,27 @@ class Prediction:
     known: bool
     seconds: float
     tuned: bool = False
+    typicality: tuple[float, ...] = field(default=(), repr=False)
+
+    def candidates(self, error: float = 0.05) -> tuple[str, ...]:
+        """The materials that it may be, likeliest first: all but those of which it would be an odd touch.
+
+        error: of the touches of any one material that was observed, this share or less lack their own (see
+        `readouts.conformal`); of several streams of one thing, for each such group. It holds whatever the sensor and
+        the embedding are worth: a poor one makes the sets large. Nothing is left of a touch like none that was kept:
+        an empty set means unknown.
+
+        A material of which fewer than 1 / error − 1 touches are kept cannot be excluded: 19 of them at 0.05 unless
+        given. Where the memory keeps none, as of a camera, all are candidates. What holds of touches made as those that
+        were observed does not hold of noise, dead channels or another speed.
+
+        Raises InputError for an error that is no share between 0 and 1.
+        """
+        if not 0 < error < 1:
+            raise InputError(f"expected error as a share between 0 and 1; came {error!r}")
+        names = [material for material, _ in self.ranking]
+        typical = self.typicality or (1.0,) * len(names)
+        return tuple(name for name, share in zip(names, typical, strict=True) if share > error)
 
 
 @dataclass(frozen=True)

@@ -1,31 +1,103 @@
-"""When a prediction is made, and when it is safe to act on."""
+"""When a prediction is made within a touch, and when it is safe to act on.
+
+A touch is decided at the first moment at which its prediction is known and as probable as `sure`, or as strange as
+`strange`. Both are set by touches left out, run through all moments (see `prediction.beginnings`): the novelty that
+none of them comes near, and the least probability above which, with every higher one, so few of the n decided are
+wrong that
+
+    (W + M) / 2 n + √(risk (1 − risk) / N) ≤ risk,
+
+W those that are wrong, M how many it should be by their probabilities. These are calibrated at each moment, and a
+posterior keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as
+coarse as 1 / n. N touches left out are not all there are: hence one standard error.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from scroll_tactile.errors import InputError
+from scroll_tactile.prediction.beginnings import rehearsal
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.readouts.calibration import UNMEASURED
 from scroll_tactile.results import Prediction
 
 __all__ = ["DecisionRule", "decision_rule"]
 
+FloatArray = npt.NDArray[np.float64]
+
+MOST = 0.999  # of `sure`
+STEP = 0.005
+KNOWN = 0.95  # of touches left out: what is stranger is not acted on
+BEYOND = 2.0  # times the most novelty of touches left out
+
 
 @dataclass(frozen=True)
 class DecisionRule:
-    """A stand-in, to be replaced: fixed moments, and the probability as it is."""
+    """When to predict, and when to act.
+
+    moments: at which a prediction is made, in columns, ascending; after the last only at the touch's end. risk: the
+    share of wrong answers among those decided. sure: the probability at which a known touch is decided. strange: the
+    novelty at which a touch is decided to be of nothing that was observed.
+    """
 
     moments: tuple[int, ...]
     risk: float
+    sure: float
+    strange: float
 
     def decided(self, prediction: Prediction, columns: int) -> bool:
-        """Whether it is safe to act on a prediction."""
-        return prediction.known and prediction.probability >= 1 - self.risk
+        """Whether it is safe to act on the prediction for the first `columns` of a touch, or for all of it.
+
+        On `prediction.material` where it is known, and on its being new where it is not.
+        """
+        if columns < self.moments[0]:
+            return False
+        if prediction.known:
+            return prediction.probability >= self.sure
+        return prediction.novelty >= self.strange
 
 
 def decision_rule(model: Model, extractor: FeatureExtractor, risk: float) -> DecisionRule:
-    """The rule of a model."""
-    first, last = model.plan.widths[0] // 3, max(model.longest, 3)
-    return DecisionRule(tuple(np.unique(np.geomspace(max(first, 2), last, 7).astype(int)).tolist()), risk)
+    """The rule of a model at a risk: a function of what was observed, measured on touches left out.
+
+    Of a memory that keeps no touches, or too few, the probabilities are taken as they are, of whole touches alone.
+    Raises InputError for a risk that is no share between 0 and 1.
+    """
+    if not 0 < risk < 1:
+        raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
+    least = max(1, min(model.least, model.longest))
+    rehearsed = rehearsal(model, extractor)
+    if rehearsed is None:
+        return DecisionRule((least,), risk, 1 - risk, 2 * UNMEASURED)
+    moments, said = rehearsed
+    known = said.novelty <= np.array([np.quantile(moment.novelties, KNOWN) for moment in moments])
+    sure = least_sure(
+        np.where(known, said.chances.max(axis=2), np.nan), said.chances.argmax(axis=2) == said.targets[:, None], risk
+    )
+    strange = BEYOND * float(np.nanmax(said.novelty))
+    return DecisionRule((*(moment.columns for moment in moments), least), risk, sure, max(strange, UNMEASURED))
+
+
+def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -> float:
+    """The least probability at which touches can be decided, from how sure each is at each moment.
+
+    chances: of the likeliest material, (touches, moments), NaN where it is not to be acted on. right: whether it is the
+    true one.
+    """
+    allowed = risk - float(np.sqrt(risk * (1 - risk) / len(chances)))
+    sure = MOST
+    for bound in np.arange(MOST, 0.0, -STEP):
+        reached = np.nan_to_num(chances) >= bound
+        decided = reached.any(axis=1)
+        first = reached.argmax(axis=1)[decided]
+        wrong = float((~right[decided, first]).sum())
+        doubt = float((1 - chances[decided, first]).sum())
+        if decided.any() and (wrong + doubt) / 2 > allowed * int(decided.sum()):
+            break
+        sure = float(bound)
+    return sure

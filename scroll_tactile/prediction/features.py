@@ -101,6 +101,11 @@ class FeatureExtractor:
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
 
+    @property
+    def sensor(self) -> Sensor:
+        """Whose touches it reads."""
+        return self._sensor
+
     def stream(self, readings: Readings) -> Stream:
         """The sound stream of some readings; of a camera's, the frames in contact.
 

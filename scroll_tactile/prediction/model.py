@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -13,7 +13,10 @@ from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage, common_names, judged_touches
+from scroll_tactile.readouts.conformal import Conformal
+from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.deviation import recall_of
+from scroll_tactile.readouts.early import Early
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
 from scroll_tactile.readouts.pooled import Apart, Pooled, pool
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
@@ -114,21 +117,19 @@ class Draft:
             asked = [[*stage, *self.memory.plan.views] for stage in self.stages]
             apart = {scale: left_out(readouts[scale], self.sample, asked, self.kind) for scale in readouts}
             calibrations = calibrate(self.sample, self.stages, readouts, apart, self.kind)
-            whole = None
+            whole, pooled, told, last = None, None, dict[bytes, Apart](), len(calibrations) - 1
             if calibrations and self.views:
-                last = len(calibrations) - 1
                 scales = [(readouts[scale], apart[scale]) for scale in [*self.stages[last], *self.views]]
                 materials = [material for material, *_ in self.sample]
                 whole = calibrate_stage(last, materials, scales, self.kind, viewed=True)
-            pooled = None
+            if calibrations:
+                told = self._left_out(apart, last, calibrations[last] if whole is None else whole)
             if whole is not None and self.kept:
-                pooled = pool(recall_of(self.kept), self._left_out(readouts, apart, len(calibrations) - 1, whole))
+                pooled = pool(recall_of(self.kept), told)
         give_back_scratch()
-        return Model(self, readouts, calibrations, apart, whole, pooled)
+        return Model(self, readouts, calibrations, apart, whole, pooled, dependence_of(told))
 
-    def _left_out(
-        self, readouts: Mapping[Scale, Readout], apart: Mapping[Scale, LeftOut], last: int, whole: Calibration
-    ) -> dict[bytes, Apart]:
+    def _left_out(self, apart: Mapping[Scale, LeftOut], last: int, whole: Calibration) -> dict[bytes, Apart]:
         """What the readouts say of sampled touches that they never observed, by key, at the last stage."""
         scales = [*self.stages[last], *self.views]
         said = [apart[scale] for scale in scales]
@@ -144,7 +145,14 @@ class Draft:
                 for weight, left, row, own in zip(weights, said, rows, places, strict=True)
             )
             relative = float(whole.relative(strange).min())
-            found[key] = Apart(material, dict(zip(names, np.asarray(logits).tolist(), strict=True)), relative)
+            novelty = float(
+                whole.novelty(
+                    np.array(
+                        [left.distances[row][own].min() for left, row, own in zip(said, rows, places, strict=True)]
+                    )
+                )
+            )
+            found[key] = Apart(material, dict(zip(names, np.asarray(logits).tolist(), strict=True)), relative, novelty)
         return found
 
 
@@ -153,10 +161,11 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
     views: the views that judge beside them; whole: the calibration of both, for whole touches at the last stage.
-    pooled: the kept touches beside it, if any. least: the columns of all but the shortest touches that were learned.
-    readouts: scale → its readout. calibrations: of the stages, as far as any touch reached them. apart: scale → the
-    sampled touches left out. longest: the columns of the longest touch that was learned. fitted_to: the touches that it
-    was fitted to.
+    pooled: the kept touches beside it, if any; conformal: how typical others are of them. least: the columns of all but
+    the shortest touches that were learned. readouts: scale → its readout. calibrations: of the stages, as far as any
+    touch reached them. apart: scale → the sampled touches left out; sample: these. dependence: how far touches of one
+    thing say the same. longest: the columns of the longest touch that was learned. fitted_to: the touches that it was
+    fitted to.
     """
 
     def __init__(
@@ -167,6 +176,7 @@ class Model:
         apart: dict[Scale, LeftOut],
         whole: Calibration | None,
         pooled: Pooled | None,
+        dependence: Dependence,
     ) -> None:
         self.kind: ReadoutName = draft.kind
         self.plan: WindowPlan = draft.memory.plan
@@ -179,7 +189,17 @@ class Model:
         self.stages = draft.stages
         self.views, self.whole = draft.views if whole else [], whole
         self.pooled = pooled
+        self.dependence = dependence
+        self.conformal = Conformal(draft.kept) if pooled else None
         self.least = draft.memory.statistics.usual_least
+        self.sample = draft.sample
+        self._early: list[Early | None] = []
+
+    def early(self, measure: Callable[[], Early | None]) -> Early | None:
+        """How beginnings are judged: by `measure` when it is first asked for, and the same from then on."""
+        if not self._early:
+            self._early.append(measure())
+        return self._early[0]
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
@@ -201,10 +221,13 @@ class Model:
 
     def _recalls(self, memory: Memory) -> bool:
         """Take in what is kept in the memory now."""
-        assert self.pooled is not None and memory.kept is not None
+        assert self.pooled is not None and self.conformal is not None and memory.kept is not None
         kept, held = {(material, key) for material, key, _ in memory.kept}, self.pooled.recall.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
-        return self.pooled.recall.follow(added, held - kept)
+        followed = self.pooled.recall.follow(added, held - kept)
+        if followed:
+            self.conformal.follow(added, held - kept)
+        return followed
 
     @property
     def crowded(self) -> bool:

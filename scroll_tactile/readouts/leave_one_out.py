@@ -28,7 +28,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["LeftOut", "Sampled", "left_out"]
+__all__ = ["LeftOut", "Sampled", "left_out", "rows_at"]
 
 FloatArray = npt.NDArray[np.float64]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
@@ -63,10 +63,7 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
     own = {name: i for i, name in enumerate(names)}
     groups: dict[int, list[tuple[int, list[int], FloatArray, float, int]]] = {}
     for number, (material, _, touch) in enumerate(sample):
-        judged = [
-            i for i, (stage, place, _) in enumerate(touch.pairs.tolist())
-            if stage < len(stages) and place < len(stages[stage]) and stages[stage][place] == readout.scale
-        ]  # fmt: skip
+        judged = rows_at(touch, stages, readout.scale)
         if not judged or material not in own:
             continue
         weight = float(max(touch.pairs[judged[0], 2], len(judged)))
@@ -87,6 +84,14 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
     strangeness = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
     return LeftOut(index, names, joined[0], joined[1], joined[2], strangeness)
+
+
+def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
+    """Which of a sampled touch's rows are of a scale. stages: the scales that judge at each, ascending."""
+    return [
+        i for i, (stage, place, _) in enumerate(touch.pairs.tolist())
+        if stage < len(stages) and place < len(stages[stage]) and stages[stage][place] == scale
+    ]  # fmt: skip
 
 
 class _Leaving:

@@ -28,11 +28,12 @@ LEAST_FAMILIAR, MOST_FAMILIAR = 0.5, 4.0  # and 1 at least in the time of those 
 
 @dataclass(frozen=True)
 class Apart:
-    """What a model says of a touch left out: logits by material, and its strangeness beside the usual."""
+    """What a model says of a touch left out: logits by material, its strangeness beside the usual, its novelty."""
 
     material: str
     logits: Mapping[str, float]
     strange: float
+    novelty: float = 0.0
 
     @property
     def margin(self) -> float:

@@ -22,6 +22,7 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -30,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.coarse import Coarse
+from scroll_tactile.readouts.derived import Derived
 from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
@@ -221,6 +223,21 @@ class Readout:
                     self._follow({material: rows - self.origin}, -1)
         return self.system.sound
 
+    def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
+        """Another readout, that never had a touch of these rows, codes (k, d); of a material that has others.
+
+        Whoever calls has BLAS on one thread.
+        """
+        other = copy.copy(self)
+        other.system = self.system.branch()
+        other.counts, other._held, other._sizes = self.counts.copy(), dict(self._held), self._sizes.copy()
+        other._room = np.stack([self._means, self._solved], axis=1)
+        other._means, other._solved = other._room[:, 0], other._room[:, 1]
+        other._derived = other._compared = other._coarse = None
+        other.held([other.places[material]])
+        other._follow({material: rows - self.origin}, -1)
+        return other
+
     def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
         absent: dict[str, list[Change]] = {}
@@ -374,30 +391,3 @@ class Readout:
             means[first : first + EAGER] = own
             sizes[first : first + EAGER] = np.einsum("hd,hd->h", own, self.system.solve(own))
         return Coarse(means, sizes)
-
-
-@dataclass(frozen=True)
-class Derived:
-    """What follows from a readout at one moment.
-
-    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: what is taken off z
-    beside its mean to bring it about the mean of the reference materials, shape (R,). size: γ μᵀ K⁻¹ μ of that mean.
-    """
-
-    gram: FloatArray
-    background: FloatArray
-    towards: FloatArray
-    size: float
-
-    @classmethod
-    def of(cls, readout: Readout) -> Derived:
-        """Derive it from a readout as it is."""
-        shares, (means, solved) = readout.shares, readout.means_solved()
-        with one_thread():
-            gram = readout.gamma * (means @ solved.T)
-            gram = (gram + gram.T) / 2
-            onto = gram @ shares
-            size = float(shares @ onto)
-            gram = gram - onto[:, None] - onto + size
-            background = np.linalg.inv(np.diag(1.0 / ((1 - readout.share) * shares)) + gram)
-        return cls(gram, (background + background.T) / 2, onto - size, size)

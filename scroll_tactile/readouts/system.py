@@ -12,6 +12,7 @@ inverted again from the integers.
 
 from __future__ import annotations
 
+import copy
 from functools import lru_cache
 from itertools import pairwise
 
@@ -76,6 +77,12 @@ class System:
     def room(self) -> int:
         """How many columns more can come."""
         return self._most - self.rank
+
+    def branch(self) -> System:
+        """Another system with the same columns: what comes to it does not come to this one."""
+        other = copy.copy(self)
+        other._white, other._e = self._white[: self.rank].copy(), self._e[: self.rank, : self.rank].copy()
+        return other
 
     def solve(self, rows: FloatArray) -> FloatArray:
         """(K + Uᵀ D U)⁻¹ times each of the rows, shape (k, d)."""

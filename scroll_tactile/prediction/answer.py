@@ -1,0 +1,80 @@
+"""The prediction for a touch, or for several of one thing, from what a model and its kept touches say of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.prediction.comparing import levels_seen
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.prediction.recalling import judged
+from scroll_tactile.results import Prediction
+from scroll_tactile.statistics.moments import one_thread
+
+__all__ = ["answer"]
+
+FloatArray = npt.NDArray[np.float64]
+Touch = tuple[Encoded, Mapping[str, float] | None]
+"""An encoded touch, and the logits of f* where it answers."""
+
+
+def answer(
+    model: Model,
+    extractor: FeatureExtractor,
+    candidates: Sequence[str],
+    touches: Sequence[Touch],
+    false_alarms: float,
+) -> Prediction:
+    """The prediction for touches of one thing, which is one of the candidates; one touch or more.
+
+    false_alarms: as in `Settings`.
+
+    What several say adds up as far as it is not the same (see `readouts.dependence`), in any order to the same bits.
+    One that comes twice counts once. Of their novelties and thresholds it is likewise; the p of their typicality is
+    twice the mean of theirs, which holds however they depend on each other (Vovk and Wang 2020).
+    """
+    once = {touch.stream.key: (touch, logits) for touch, logits in touches} if len(touches) > 1 else {b"": touches[0]}
+    own = [once[key] for key in sorted(once)]
+    with one_thread():
+        said = [_judged(model, extractor, candidates, touch, logits) for touch, logits in own]
+    if len(said) == 1:
+        probability, novelty = said[0].probability, said[0].novelty
+        threshold = said[0].calibration.threshold(false_alarms)
+    else:
+        probability = model.dependence.probability([judgement.probability for judgement in said])
+        novelty = model.dependence.standard([judgement.novelty for judgement in said])
+        threshold = math.fsum(judgement.calibration.threshold(false_alarms) for judgement in said) / len(said)
+    order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
+    names = [candidates[place] for place in order.tolist()]
+    ranking = tuple(zip(names, probability[order].tolist(), strict=True))
+    seconds = math.fsum(touch.seconds for touch, _ in own)
+    tuned = all(logits is not None for _, logits in own)
+    typical = _typicality(model, names, [touch for touch, _ in own])
+    return Prediction(*ranking[0], ranking, novelty, bool(novelty <= threshold), seconds, tuned, typical)
+
+
+def _judged(
+    model: Model,
+    extractor: FeatureExtractor,
+    candidates: Sequence[str],
+    touch: Encoded,
+    logits: Mapping[str, float] | None,
+) -> Judgement:
+    if logits is None:
+        return judged(model, extractor, candidates, touch)
+    return model.judge(candidates, touch.means, touch.columns, logits)
+
+
+def _typicality(model: Model, names: Sequence[str], touches: Sequence[Encoded]) -> tuple[float, ...]:
+    """How typical touches are of some materials; see `Prediction`."""
+    if model.conformal is None:
+        return (1.0,) * len(names)
+    found = [model.conformal.p_values(levels_seen(touch.stream)) for touch in touches]
+    shares = np.array([[values.get(name, 1.0) for name in names] for values in found])
+    if len(shares) == 1:
+        return tuple(shares[0].tolist())
+    return tuple(min(1.0, 2 * math.fsum(column) / len(shares)) for column in shares.T)

@@ -1,0 +1,162 @@
+"""Sets that hold the truth: how typical a touch is of each material, by the touches that are kept of it.
+
+A touch x is stranger to a material y the further it lies from the nearest kept touch of y, and the nearer to one of
+another material (nearest-neighbour nonconformity; Vovk, Gammerman and Shafer 2005):
+
+    α(x, y) = log(d_y(x) + 1) + 2 (log(d_y(x) + 1) − log(d_other(x) + 1)),
+
+d squared distances of the beginnings that both have. If x is of y, then x and the n touches kept of y could have come
+in any order, so the share of these n + 1 that are as strange as x,
+
+    p_y = (#{i kept of y : α(i, y) ≥ α(x, y)} + 1) / (n + 1),    each i compared with all others and with x,
+
+is at most ε in no more than ε of cases: for each material, for every n. It is the full, class-conditional conformal
+predictor. The values compared are whole numbers, and sums of their squares are exact: any order gives the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.readouts.recollection import Kept
+
+__all__ = ["Conformal"]
+
+FloatArray = npt.NDArray[np.float64]
+
+BLOCKS, EARLIER = 25, 1.5  # of a touch, in time: their edges grow with this power, for touches differ early
+MOST_VALUES = 1024  # of a touch: sums of the squares of so many steps are below 2²⁴, and exact in single precision
+STEPS, UNREAD = 63, 255  # of a block's mean, log(1 + level) over all levels; and where nothing was read
+AT_ONCE = 128  # touches: of their distances from a thousand a step takes 1 MB
+APART = 2.0  # times that a touch's being nearer to another material counts
+
+
+class Conformal:
+    """Kept touches, and how typical another is of each of their materials.
+
+    touches: of one number of channels; lengths may differ. Not for several threads at once.
+    """
+
+    def __init__(self, touches: Sequence[Kept]) -> None:
+        self._channels = len(touches[0].levels)
+        self._longest = max(touch.levels.shape[1] for touch in touches)
+        blocks = max(1, min(BLOCKS, MOST_VALUES // self._channels))
+        self._edges = np.unique(np.rint(self._longest * (np.arange(blocks + 1) / blocks) ** EARLIER).astype(np.intp))
+        self._touches: list[tuple[str, bytes]] = []
+        self._steps = np.empty((0, self._channels * (len(self._edges) - 1)), np.uint8)
+        self._lengths = np.empty(0, np.intp)
+        self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
+        self.follow(touches, set())
+
+    def follow(self, added: Sequence[Kept], removed: AbstractSet[tuple[str, bytes]]) -> None:
+        """Take in touches no longer than the longest that were kept, and let others go, by material and key."""
+        if removed:
+            staying = [i for i, touch in enumerate(self._touches) if touch not in removed]
+            self._touches = [self._touches[i] for i in staying]
+            self._steps, self._lengths = self._steps[staying], self._lengths[staying]
+            self._near = {}
+        first = len(self._touches)
+        self._touches += [(touch.material, touch.key) for touch in added]
+        steps = [
+            self._steps_of([touch.levels for touch in added[i : i + AT_ONCE]]) for i in range(0, len(added), AT_ONCE)
+        ]
+        self._steps = np.concatenate([self._steps, *steps])
+        self._lengths = np.append(self._lengths, [touch.levels.shape[1] for touch in added]).astype(np.intp)
+        self._materials = sorted({material for material, _ in self._touches})
+        place = {material: i for i, material in enumerate(self._materials)}
+        self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
+        for reach in list(self._near):
+            self._near[reach] = self._nearer(reach, *self._near[reach], first)
+
+    def p_values(self, levels: LevelArray) -> dict[str, float]:
+        """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
+        reach = int(np.searchsorted(self._edges[1:], levels.shape[1], side="right"))
+        if not reach or not self._touches:
+            return dict.fromkeys(self._materials, 1.0)
+        if reach not in self._near:
+            nothing = np.empty(0)
+            self._near[reach] = self._nearer(reach, nothing, nothing, 0)
+        own, other = self._near[reach]
+        far = self._distances(self._steps_of([levels]), reach)[0]
+        nearest = _least(far, self._places, len(self._materials))
+        strange = _strangeness(nearest, _least_of_others(nearest))
+        compared = self._lengths >= self._edges[reach]
+        stranger = compared & (_strangeness(np.minimum(own, far), other) >= strange[self._places])
+        counts = [np.bincount(self._places[some], minlength=len(self._materials)) + 1 for some in (stranger, compared)]
+        return dict(zip(self._materials, (counts[0] / counts[1]).tolist(), strict=True))
+
+    def _steps_of(self, levels: Sequence[LevelArray]) -> npt.NDArray[np.uint8]:
+        """The blocks of touches, in steps, (touches, blocks · C), block by block; UNREAD where nothing was read."""
+        whole = np.full((len(levels), self._channels, self._longest), MISSING, dtype=np.uint8)
+        for into, own in zip(whole, levels, strict=True):
+            reach = min(own.shape[1], self._longest)
+            into[:, :reach] = own[:, :reach]
+        inside = np.zeros((self._longest, len(self._edges) - 1), np.float32)
+        for block, (first, last) in enumerate(pairwise(self._edges)):
+            inside[first:last, block] = 1.0
+        read = whole != MISSING
+        counts = read.astype(np.float32) @ inside
+        means = (np.where(read, whole, 0).astype(np.float32) @ inside).astype(np.float64) / np.maximum(counts, 1)
+        steps = np.rint(np.log1p(means) * (STEPS / np.log(LEVELS)))
+        blocks: npt.NDArray[np.uint8] = np.where(counts > 0, steps, UNREAD).astype(np.uint8)
+        return blocks.transpose(0, 2, 1).reshape(len(levels), -1)
+
+    def _distances(self, steps: npt.NDArray[np.uint8], reach: int) -> FloatArray:
+        """Squared distances of touches from all that are kept, by the blocks both have of the first: (touches, kept).
+
+        Where some blocks lack they count as the others do; infinite where all lack.
+        """
+        mine, kept = (blocks[:, : reach * self._channels] for blocks in (steps, self._steps))
+        if (mine != UNREAD).all() and (kept != UNREAD).all():
+            a, b = mine.astype(np.float32), kept.astype(np.float32)
+            square = np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1)
+            return np.asarray(square - 2 * (a @ b.T), dtype=np.float64)
+        seen, known = (mine != UNREAD).astype(np.float32), (kept != UNREAD).astype(np.float32)
+        a, b = mine * seen, kept * known
+        far = (np.square(a) @ known.T + seen @ np.square(b).T - 2 * (a @ b.T)).astype(np.float64)
+        both = (seen @ known.T).astype(np.float64)
+        return np.where(both > 0, far * (mine.shape[1] / np.maximum(both, 1)), np.inf)
+
+    def _nearer(self, reach: int, own: FloatArray, other: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
+        """d_own and d_other of all that are kept, where those before the row `first` have them of each other."""
+        owns, others = [own], [other]
+        own, other = own.copy(), other.copy()
+        for start in range(first, len(self._touches), AT_ONCE):
+            rows = np.arange(start, min(start + AT_ONCE, len(self._touches)))
+            far = self._distances(self._steps[rows], reach)
+            far[np.arange(len(rows)), rows] = np.inf
+            same = self._places[rows][:, None] == self._places
+            with_same, with_other = np.where(same, far, np.inf), np.where(same, np.inf, far)
+            owns.append(with_same.min(axis=1))
+            others.append(with_other.min(axis=1))
+            if first:
+                owns[0] = np.minimum(owns[0], with_same[:, :first].min(axis=0))
+                others[0] = np.minimum(others[0], with_other[:, :first].min(axis=0))
+        return np.concatenate(owns), np.concatenate(others)
+
+
+def _least(far: FloatArray, places: npt.NDArray[np.intp], count: int) -> FloatArray:
+    """The least distance of each of so many materials, (count,)."""
+    least = np.full(count, np.inf)
+    np.minimum.at(least, places, far)
+    return least
+
+
+def _least_of_others(nearest: FloatArray) -> FloatArray:
+    """For each material the least distance of all others; infinite where there is none."""
+    first = int(nearest.argmin())
+    others = np.full(len(nearest), nearest[first])
+    others[first] = np.delete(nearest, first).min(initial=np.inf)
+    return others
+
+
+def _strangeness(own: FloatArray, other: FloatArray) -> FloatArray:
+    """α of distances from a material and from all others."""
+    apart = np.where(np.isfinite(other), other, 0.0)
+    return np.asarray((1 + APART) * np.log1p(own) - APART * np.log1p(apart))

@@ -1,0 +1,90 @@
+"""Several touches of one thing: how far they say the same, by touches of one material left out.
+
+Touches of one material err alike, so k of them are not k independent witnesses. With ρ the correlation of two, the
+evidence of k counts as that of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k novelties spreads
+by √((1 + (k − 1) ρ') / k) of what one does:
+
+    log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
+
+ρ is fitted to pairs of touches left out, by least log loss, and ρ' is their intraclass correlation. One touch is what
+it is by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.calibration import FEWEST, fit_weights
+from scroll_tactile.readouts.pooled import Apart
+
+__all__ = ["Dependence", "dependence_of"]
+
+FloatArray = npt.NDArray[np.float64]
+
+USUAL = 0.25  # ρ and ρ' where nothing is measured: about what beginnings of BioTac's touches have
+PRIOR_TOUCHES = 2.0  # pairs that ρ counts as
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """How far touches of one material say the same: the correlations ρ of evidence and ρ' of novelty, from 0 to 1."""
+
+    evidence: float = USUAL
+    novelty: float = USUAL
+
+    def probability(self, chances: Sequence[FloatArray]) -> FloatArray:
+        """The probability of the candidates, (C,), from those by each touch."""
+        # math.fsum is exact before it rounds: any order of the touches gives the same bits.
+        logs = np.log(np.maximum(np.array(chances), TINY))
+        logits = np.array([math.fsum(column) for column in logs.T]) / (1 + (len(logs) - 1) * self.evidence)
+        together = np.exp(logits - logits.max())
+        return np.asarray(together / together.sum())
+
+    def standard(self, novelties: Sequence[float]) -> float:
+        """The novelty of all together, in standard deviations of that of known materials' touches."""
+        count = len(novelties)
+        return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
+
+
+def dependence_of(apart: Mapping[bytes, Apart]) -> Dependence:
+    """Fit both to touches left out. apart: by key, what a model says of them."""
+    groups: dict[str, list[Apart]] = {}
+    for _, touch in sorted(apart.items()):
+        groups.setdefault(touch.material, []).append(touch)
+    several = {material: touches for material, touches in sorted(groups.items()) if len(touches) > 1}
+    pairs = [pair for touches in several.values() for pair in zip(touches[::2], touches[1::2], strict=False)]
+    if len(pairs) < FEWEST or len(groups) < 2:
+        return Dependence()
+    names = sorted(set.intersection(*(set(touch.logits) for touch in apart.values())))
+    scores = np.array([[_log_chances(first, names) + _log_chances(second, names)] for first, second in pairs])
+    prior = np.array([1 / (1 + USUAL)])
+    weight = float(fit_weights(scores, [names.index(pair[0].material) for pair in pairs], prior, PRIOR_TOUCHES)[0])
+    rho = float(np.clip(1 / max(weight, TINY) - 1, 0.0, 1.0))
+    return Dependence(rho, _correlation([[touch.novelty for touch in touches] for touches in several.values()]))
+
+
+def _log_chances(touch: Apart, names: Sequence[str]) -> FloatArray:
+    logits = np.array([touch.logits[name] for name in names])
+    top = logits.max()
+    return np.asarray(logits - top - np.log(np.exp(logits - top).sum()))
+
+
+def _correlation(groups: Sequence[Sequence[float]]) -> float:
+    """The intraclass correlation of groups, two values or more in each (Fisher 1925), from 0 to 1."""
+    counts = np.array([len(group) for group in groups])
+    means = np.array([np.mean(group) for group in groups])
+    total, mean = int(counts.sum()), float(np.concatenate([np.array(group) for group in groups]).mean())
+    if len(groups) < 2 or total <= len(groups):
+        return USUAL
+    within = sum(float(np.square(np.array(group) - own).sum()) for group, own in zip(groups, means, strict=True))
+    within /= total - len(groups)
+    between = float((counts * np.square(means - mean)).sum()) / (len(groups) - 1)
+    size = (total - float(np.square(counts).sum()) / total) / (len(groups) - 1)
+    share = (between - within) / (between + (size - 1) * within) if between + within > 0 else 0.0
+    return float(np.clip(share, 0.0, 1.0))

@@ -2,14 +2,15 @@
 
 A touch is decided at the first moment at which its prediction is known and as probable as `sure`, or as strange as
 `strange`. Both are set by touches left out, run through all moments (see `prediction.beginnings`): the novelty that
-none of them comes near, and the least probability above which, with every higher one, so few of the n decided are
-wrong that
+none of them comes near, and the least probability above which, with every higher one, so few of n are
+decided wrongly that
 
-    (W + M) / 2 n + √(risk (1 − risk) / N) ≤ risk,
+    (W + M) / 2 n + √(risk (1 − risk) / n) ≤ risk,
 
-W those that are wrong, M how many it should be by their probabilities. These are calibrated at each moment, and a
-posterior keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as
-coarse as 1 / n. N touches left out are not all there are: hence one standard error.
+W those that are, M how many it should be by their probabilities. These are calibrated at each moment, and a posterior
+keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as coarse as
+1 / n. Touches left out are not all there are: hence one standard error. So few cannot vouch for a risk of 0.01, and then
+most are decided as whole touches, of which a probability of 1 − risk is enough.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class DecisionRule:
         if columns < self.moments[0]:
             return False
         if prediction.known:
-            return prediction.probability >= self.sure
+            whole = columns >= self.moments[-1]
+            return prediction.probability >= (min(self.sure, 1 - self.risk) if whole else self.sure)
         return prediction.novelty >= self.strange
 
 
@@ -97,7 +99,7 @@ def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -
         first = reached.argmax(axis=1)[decided]
         wrong = float((~right[decided, first]).sum())
         doubt = float((1 - chances[decided, first]).sum())
-        if decided.any() and (wrong + doubt) / 2 > allowed * int(decided.sum()):
+        if (wrong + doubt) / 2 > allowed * len(chances):
             break
         sure = float(bound)
     return sure

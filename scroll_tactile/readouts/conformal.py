@@ -74,22 +74,35 @@ class Conformal:
         for reach in list(self._near):
             self._near[reach] = self._nearer(reach, *self._near[reach], first)
 
+    @property
+    def materials(self) -> list[str]:
+        """The materials of what is kept, in alphabetical order."""
+        return self._materials
+
     def p_values(self, levels: LevelArray) -> dict[str, float]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
+        compared, strange, own = self.scores(levels)
+        among = compared[strange >= own[compared]]
+        stranger, of_all = (np.bincount(some, minlength=len(own)) + 1 for some in (among, compared))
+        return dict(zip(self._materials, (stranger / of_all).tolist(), strict=True))
+
+    def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
+        """Of each kept touch that is as long its material's place, (n,), and α, (n,); and α(x, y) of all, (materials,).
+
+        levels: of x, (C, T). Nothing that is kept is as long as one too short to be compared.
+        """
         reach = int(np.searchsorted(self._edges[1:], levels.shape[1], side="right"))
-        if not reach or not self._touches:
-            return dict.fromkeys(self._materials, 1.0)
+        if not reach:
+            return np.empty(0, np.intp), np.empty(0), np.zeros(len(self._materials))
         if reach not in self._near:
             nothing = np.empty(0)
             self._near[reach] = self._nearer(reach, nothing, nothing, 0)
         own, other = self._near[reach]
         far = self._distances(self._steps_of([levels]), reach)[0]
         nearest = _least(far, self._places, len(self._materials))
-        strange = _strangeness(nearest, _least_of_others(nearest))
-        compared = self._lengths >= self._edges[reach]
-        stranger = compared & (_strangeness(np.minimum(own, far), other) >= strange[self._places])
-        counts = [np.bincount(self._places[some], minlength=len(self._materials)) + 1 for some in (stranger, compared)]
-        return dict(zip(self._materials, (counts[0] / counts[1]).tolist(), strict=True))
+        as_long = self._lengths >= self._edges[reach]
+        strange = _strangeness(np.minimum(own, far), other)[as_long]
+        return self._places[as_long], strange, _strangeness(nearest, _least_of_others(nearest))
 
     def _steps_of(self, levels: Sequence[LevelArray]) -> npt.NDArray[np.uint8]:
         """The blocks of touches, in steps, (touches, blocks · C), block by block; UNREAD where nothing was read."""

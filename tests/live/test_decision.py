@@ -1,0 +1,188 @@
+"""Early answers: what their probabilities are worth, when they are decided, several touches of one thing."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import InputError
+from scroll_tactile.live.decision import DecisionRule, decision_rule, least_sure
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.results import Prediction
+
+SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6)
+SCENE = Scene(sensor=SKIN, seed=1)
+NAMES = SCENE.materials[:5]
+TOUCHES = [(name, SCENE.touch(name, i)) for i in range(12) for name in NAMES]
+LATER = [(name, SCENE.touch(name, i)) for i in range(50, 56) for name in NAMES]
+
+
+def learned(touches=TOUCHES, **settings):
+    learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=128), **settings)
+    for name, touch in touches:
+        learner.observe(name, touch)
+    learner.settle()
+    return learner
+
+
+def rule_of(learner, risk):
+    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
+    return decision_rule(learner.model(), extractor, risk)
+
+
+@pytest.fixture(scope="module")
+def learner():
+    return learned()
+
+
+def decided(learner, rule, touch):
+    """The column at which a touch is decided, with the prediction; None where it stays undecided."""
+    for columns in [*(moment for moment in rule.moments if moment < len(touch)), len(touch)]:
+        prediction = learner.predict(touch.first(columns / SKIN.rate))
+        if rule.decided(prediction, columns):
+            return columns, prediction
+    return None
+
+
+def test_touches_are_decided_early_and_right(learner):
+    rule = rule_of(learner, 0.05)
+    found = [decided(learner, rule, touch) for _, touch in LATER]
+    answers = [(at, now, name) for (name, _), of in zip(LATER, found, strict=True) if of for at, now in [of]]
+    assert len(answers) >= 0.9 * len(LATER)
+    assert np.mean([now.material == name for _, now, name in answers]) >= 0.9
+    assert np.mean([at for at, *_ in answers]) < 0.5 * len(LATER[0][1])
+
+
+def test_less_risk_is_never_decided_earlier_or_less_surely(learner):
+    rules = [rule_of(learner, risk) for risk in (0.2, 0.05, 0.01)]
+    assert [rule.sure for rule in rules] == sorted(rule.sure for rule in rules)
+    for _, touch in LATER[:4]:
+        at = [of[0] if (of := decided(learner, rule, touch)) else np.inf for rule in rules]
+        assert at == sorted(at)
+
+
+def test_the_rule_is_of_the_set_of_touches_and_of_nothing_else(learner):
+    backwards = learned(TOUCHES[::-1])
+    assert rule_of(backwards, 0.05) == rule_of(learner, 0.05)
+    for _, touch in LATER[:3]:
+        beginning = touch.first(0.3)
+        assert backwards.predict(beginning) == learner.predict(beginning)
+
+
+def test_a_beginning_is_predicted_alike_whether_a_rule_was_asked_for_or_not():
+    asked, unasked = learned(), learned()
+    rule_of(asked, 0.05)
+    for _, touch in LATER[:3]:
+        assert asked.predict(touch) == unasked.predict(touch)
+        assert asked.predict(touch.first(0.2)) == unasked.predict(touch.first(0.2))
+
+
+def test_probabilities_of_beginnings_are_what_they_say(learner):
+    """Of 12 touches of each material, pooled over the beginnings: within sampling error of what is right."""
+    said = [(learner.predict(touch.first(seconds)), name) for name, touch in LATER for seconds in (0.1, 0.2, 0.4)]
+    right = np.mean([now.material == name for now, name in said])
+    assert abs(np.mean([now.probability for now, _ in said]) - right) <= 0.1
+
+
+def test_what_was_never_felt_is_not_decided_to_be_known(learner):
+    rule, strange = rule_of(learner, 0.05), []
+    for i in range(4):
+        touch = SCENE.touch(SCENE.materials[8], i)
+        noise = np.random.default_rng(i).uniform(0, 100, touch.readings.shape).astype(np.float32)
+        strange.append(learner.predict(noise))
+    assert not any(rule.decided(now, len(noise)) and now.known for now in strange)
+
+
+@pytest.mark.parametrize("touches", [TOUCHES[:1], TOUCHES[:5], [TOUCHES[0], TOUCHES[5]]])
+def test_few_touches_are_decided_at_their_end_alone(touches):
+    few = learned(touches)
+    rule = rule_of(few, 0.05)
+    assert rule.moments == (len(touches[0][1]),) and rule.sure == 0.95
+    assert few.predict(touches[0][1].first(0.2)).material in NAMES
+
+
+def test_a_memory_that_keeps_no_touches_has_a_rule():
+    rule = rule_of(learned(recall=0), 0.05)
+    assert len(rule.moments) == 1
+    assert not rule.decided(Prediction("oak", 0.99, (("oak", 0.99),), 0.0, True, 0.1), rule.moments[0] - 1)
+
+
+@pytest.mark.parametrize("risk", [0.0, 1.0, -1, float("nan")])
+def test_a_risk_is_a_share(learner, risk):
+    with pytest.raises(InputError, match="risk"):
+        rule_of(learner, risk)
+
+
+def test_a_rule_says_known_where_it_is_sure_and_new_where_it_is_strange():
+    rule = DecisionRule((5, 10), 0.05, sure=0.97, strange=6.0)
+    known = {probability: Prediction("oak", probability, (), 0.0, True, 1.0) for probability in (0.94, 0.96, 0.97)}
+    new = {novelty: Prediction("oak", 0.99, (), novelty, False, 1.0) for novelty in (5.9, 6.0)}
+    assert [rule.decided(known[p], 5) for p in known] == [False, False, True]
+    assert [rule.decided(known[p], 10) for p in known] == [False, True, True]  # of a whole touch 1 − risk is enough
+    assert [rule.decided(new[n], 5) for n in new] == [False, True]
+    assert not rule.decided(known[0.97], 4)
+
+
+def test_the_least_probability_keeps_the_risk_of_calibrated_answers():
+    """Posteriors of two hypotheses by a growing number of draws: stopping when one is sure keeps what it says."""
+    rng = np.random.default_rng(0)
+
+    def made(count):
+        truth = rng.integers(0, 2, count)
+        logit = np.cumsum(np.where(truth, 1.0, -1.0)[:, None] * 0.5 + rng.normal(size=(count, 12)), axis=1)
+        first = 1 / (1 + np.exp(-logit))
+        return np.maximum(first, 1 - first), (first > 0.5) == truth[:, None]
+
+    wrong = []
+    for _ in range(40):
+        sure = least_sure(*made(128), 0.05)
+        chances, right = made(400)
+        reached = chances >= sure
+        taken = reached.any(axis=1)
+        wrong.append(np.mean(~right[taken, reached.argmax(axis=1)[taken]]))
+    assert np.mean(wrong) <= 0.05
+    assert np.mean(wrong) >= 0.01  # it is no more careful than it has to be
+
+
+def test_several_touches_say_more_than_one_in_any_order(learner):
+    for name, i in itertools.product(NAMES[:3], (60, 63)):
+        touches = [SCENE.touch(name, i + k).first(0.1) for k in range(3)]
+        together = learner.predict(*touches)
+        assert learner.predict(*touches[::-1]) == together
+        assert learner.predict(*touches, touches[1]) == together
+        assert together.seconds == pytest.approx(0.3)
+        assert sum(share for _, share in together.ranking) == pytest.approx(1.0)
+    right = {
+        count: np.mean([learner.predict(*[SCENE.touch(name, i + k).first(0.1) for k in range(count)]).material == name
+                        for name in NAMES for i in range(60, 78, 3)])
+        for count in (1, 3)
+    }  # fmt: skip
+    assert right[3] >= right[1]
+
+
+def test_one_touch_given_twice_is_one_touch(learner):
+    touch = LATER[0][1]
+    assert learner.predict(touch, touch) == learner.predict(touch)
+
+
+def test_several_touches_of_nothing_and_of_an_empty_memory():
+    empty = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=128))
+    assert empty.predict(LATER[0][1], LATER[1][1]).material is None
+    with pytest.raises(InputError, match="none"):
+        empty.predict()
+
+
+def test_candidates_of_predictions(learner):
+    held = [name in learner.predict(touch).candidates(0.2) for name, touch in LATER]
+    assert np.mean(held) >= 0.8 - 2 * np.sqrt(0.2 * 0.8 / len(LATER))
+    prediction = learner.predict(LATER[0][1])
+    assert prediction.candidates(0.01) == tuple(name for name, _ in prediction.ranking)  # 12 touches cannot exclude
+    assert set(prediction.candidates(0.5)) <= set(prediction.candidates(0.1))
+    assert "typicality" not in repr(prediction)
+    noise = np.random.default_rng(0).uniform(0, 100, (80, 8)).astype(np.float32)
+    assert learner.predict(noise).candidates(0.1) == ()
+    for error in (0.0, 1.0, float("nan")):
+        with pytest.raises(InputError, match="error"):
+            prediction.candidates(error)

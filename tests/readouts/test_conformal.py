@@ -1,0 +1,126 @@
+"""Class-conditional conformal sets against a plain model, their coverage, and crepes on the same scores."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile.readouts.conformal import APART, Conformal
+from scroll_tactile.readouts.likelihood import MISSING
+from scroll_tactile.readouts.recollection import Kept
+
+CHANNELS, COLUMNS = 3, 40
+
+
+def touch(material, seed, columns=COLUMNS):
+    rng = np.random.default_rng([material, seed])
+    base = np.random.default_rng(material).uniform(40, 60, (CHANNELS, 4)).repeat(COLUMNS // 4, axis=1)
+    return (
+        (base + rng.normal(0, 12, (CHANNELS, 1)) + rng.normal(0, 4, base.shape))
+        .clip(0, 254)
+        .astype(np.uint8)[:, :columns]
+    )
+
+
+def kept(materials=4, of_each=25, first=0):
+    return [Kept(f"m{m}", bytes([m, i]), touch(m, first + i)) for m in range(materials) for i in range(of_each)]
+
+
+def plain(touches, conformal, asked, reach):
+    """p-values by the definition: each material in turn, each kept touch beside all others and the one asked about."""
+    steps = [conformal._steps_of([kept.levels])[0][: reach * CHANNELS].astype(float) for kept in touches]
+    new = conformal._steps_of([asked])[0][: reach * CHANNELS].astype(float)
+    labels = [kept.material for kept in touches]
+
+    def strangeness(i, bag, own):
+        far = [(np.square(bag[i][0] - other).sum(), label) for j, (other, label) in enumerate(bag) if j != i]
+        near = min((d for d, label in far if label == own), default=np.inf)
+        other = min((d for d, label in far if label != own), default=0.0)
+        return (1 + APART) * np.log1p(near) - APART * np.log1p(other)
+
+    found = {}
+    for own in sorted(set(labels)):
+        bag = [*zip(steps, labels, strict=True), (new, own)]
+        scores = [strangeness(i, bag, own) for i in range(len(bag)) if bag[i][1] == own]
+        found[own] = np.mean([score >= scores[-1] for score in scores])
+    return found
+
+
+@pytest.mark.parametrize("columns", [COLUMNS, 13])
+def test_p_values_are_those_of_the_definition(columns):
+    touches = kept(materials=3, of_each=6)
+    conformal = Conformal(touches)
+    reach = int(np.searchsorted(conformal._edges[1:], columns, side="right"))
+    for seed in range(50, 54):
+        asked = touch(seed % 3, seed, columns)
+        assert conformal.p_values(asked) == pytest.approx(plain(touches, conformal, asked, reach))
+
+
+@pytest.mark.parametrize("error", [0.05, 0.2])
+@pytest.mark.parametrize("columns", [COLUMNS, 10])
+def test_each_material_is_covered(error, columns):
+    """Over the choice of what is kept, too: of any one choice coverage is off by that of 25 touches."""
+    held = {f"m{material}": [] for material in range(4)}
+    for draw in range(30):
+        conformal = Conformal(kept(first=1000 * draw))
+        for name, found in held.items():
+            asked = (touch(int(name[1]), 1000 * draw + 500 + i, columns) for i in range(10))
+            found += [conformal.p_values(levels)[name] > error for levels in asked]
+    for found in held.values():
+        spread = np.array(found).reshape(30, 10).mean(axis=1).std() / np.sqrt(30)
+        assert np.mean(found) >= 1 - error - 3 * spread
+    assert np.mean([*held.values()]) >= 1 - error - 0.01
+
+
+def test_crepes_finds_the_same_on_the_same_scores():
+    crepes = pytest.importorskip("crepes")
+    touches, seeds = kept(), range(100, 110)
+    conformal = Conformal(touches)
+    for seed in seeds:
+        asked, own = touch(seed % 4, seed), f"m{seed % 4}"
+        ours = conformal.p_values(asked)
+        places, strange, at = conformal.scores(asked)
+        for i, name in enumerate(conformal.materials):
+            classifier = crepes.ConformalClassifier()
+            classifier.fit(strange[places == i], seed=0)
+            theirs = classifier.predict_p(np.array([[at[i]]]), all_classes=True, smoothing=False)
+            assert float(np.ravel(theirs)[0]) == pytest.approx(ours[name])
+        assert own in ours
+
+
+def test_any_order_and_any_way_to_it_gives_the_same_bytes():
+    touches = kept(of_each=8)
+    asked = touch(1, 200, 25)
+    first = Conformal(touches).p_values(asked)
+    assert Conformal(touches[::-1]).p_values(asked) == first
+    followed = Conformal([*touches[:20], touches[-1]])
+    followed.p_values(asked)  # so that it has distances to follow
+    followed.follow(touches[20:-1], set())
+    assert followed.p_values(asked) == first
+    gone = {(touch.material, touch.key) for touch in touches[3:6]}
+    followed.follow([], gone)
+    left = [touch for touch in touches if (touch.material, touch.key) not in gone]
+    assert followed.p_values(asked) == Conformal(left).p_values(asked)
+    followed.follow(touches[3:6], set())
+    assert followed.p_values(asked) == first
+
+
+def test_few_touches_exclude_nothing_and_one_material_is_always_typical():
+    assert min(Conformal(kept(of_each=18)).p_values(np.full((CHANNELS, COLUMNS), 250, np.uint8)).values()) > 0.05
+    assert min(Conformal(kept(of_each=19)).p_values(np.full((CHANNELS, COLUMNS), 250, np.uint8)).values()) <= 0.05
+    alone = Conformal(kept(materials=1, of_each=5))
+    assert 0 < alone.p_values(touch(0, 99))["m0"] <= 1
+    assert min(Conformal(kept(materials=2, of_each=1)).p_values(touch(0, 99)).values()) >= 0.5
+
+
+def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
+    touches = kept(of_each=20)
+    assert set(
+        Conformal([Kept("m", b"0", np.zeros((1, 10_000), np.uint8))]).p_values(np.zeros((1, 2), np.uint8)).values()
+    ) == {1.0}
+    conformal = Conformal(touches)
+    gap = touch(2, 300).copy()
+    gap[0, 5:30] = MISSING
+    assert conformal.p_values(gap)["m2"] > 0.05
+    gap[:] = MISSING
+    assert set(conformal.p_values(gap)) == {"m0", "m1", "m2", "m3"}
+    ragged = Conformal([*touches[:-1], Kept("m3", b"s", touch(3, 400, 15))])
+    assert ragged.p_values(touch(3, 401))["m3"] > 0.05

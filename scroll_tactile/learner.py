@@ -462,7 +462,7 @@ class TactileLearner:
 
         def answer(model: Model, candidates: Sequence[str], encoded: Encoded) -> Prediction:
             with self._ledger.lock, enough_memory():
-                return self._answer(model, candidates, encoded, None)
+                return self._answer(model, candidates, [(encoded, None)])
 
         memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answer)
         return LiveSession(memory, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)

@@ -25,6 +25,7 @@ from typing import Any
 
 from store.exceptions import SQLITE_ERRORS, DamageError, LockedError
 from store.files import file_size, require_room
+from store.header import strangers
 from store.lock import is_held
 from store.schema import LOG, SHARED, connect
 
@@ -150,6 +151,8 @@ class JournalReader:
         """Open the journal anew where it has moved, and return whether it had."""
         if not self.moved():
             return False
+        for stranger in strangers(self.path.parent):
+            raise stranger
         self._open()
         return True
 

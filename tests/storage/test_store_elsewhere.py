@@ -232,6 +232,15 @@ def test_a_link_in_a_store_is_refused_and_nothing_that_it_leads_to_changes(tmp_p
     assert everything(path) == inside
 
 
+def test_a_link_that_comes_while_a_store_is_read_is_not_followed(tmp_path):
+    path, outside = build(tmp_path / "s"), victim(tmp_path)
+    with Store.open(path, mode="read") as reader:
+        assert reader.last
+        as_link(path / f"{JOURNAL}-wal", outside / "file")
+        with pytest.raises(DamageError, match="symbolic link"):
+            list(reader.heads())
+
+
 def test_a_link_among_the_files_of_a_generation_is_not_copied(tmp_path):
     path, outside = build(tmp_path / "s"), victim(tmp_path)
     as_link(path / "generations" / "00000002" / "rows" / "c" / "0" / "0", outside / "file")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import prod
 
@@ -35,6 +35,9 @@ RAW, BLOSC, ZSTD = 0, 1, 2
 COMPRESSED = {1: BLOSC, 2: ZSTD}  # by the payload's version
 
 SMALL = 128  # bytes, of which compressing saves next to nothing
+
+# Of a small payload that stands for gigabytes nobody is to make room for these. `encode_payload` keeps to it.
+SPARE, RATIO = 64 * 2**20, 16
 
 # SQLite refuses blobs above 1e9 bytes, and a row this large stalls every append behind it.
 LARGEST_PAYLOAD = 256 * 2**20
@@ -160,9 +163,14 @@ def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")
+    payload = _packed(arrays, _compressed)
+    return payload if size <= SPARE + RATIO * len(payload) else _packed(arrays, _plain)
+
+
+def _packed(arrays: Mapping[str, np.ndarray], buffered: Callable[[np.ndarray], tuple[int, bytes]]) -> bytes:
     head, buffers = [HEADER.pack(MAGIC, PAYLOAD_VERSION, len(arrays))], []
     for name, array in arrays.items():
-        codec, buffer = _compressed(array)
+        codec, buffer = buffered(array)
         head += [_short(name), _short(array.dtype.str), struct.pack("<B", array.ndim)]
         head += [struct.pack(f"<{array.ndim}Q", *array.shape)]
         head += [LENGTHS.pack(codec, array.nbytes, len(buffer))]
@@ -178,7 +186,11 @@ def _compressed(array: np.ndarray) -> tuple[int, bytes]:
     raw = flat_bytes(array)
     if raw.size >= SMALL and len(frame := compress(raw, item_size(array.dtype))) < raw.size:
         return ZSTD, frame
-    return RAW, raw.tobytes()
+    return _plain(array)
+
+
+def _plain(array: np.ndarray) -> tuple[int, bytes]:
+    return RAW, flat_bytes(array).tobytes()
 
 
 @dataclass(frozen=True)
@@ -205,8 +217,8 @@ def decode_payload(payload: bytes) -> dict[str, np.ndarray]:
     except (struct.error, IndexError, UnicodeDecodeError) as error:
         raise ValueError(f"the payload ends in a description: {error}") from error
     size, stored = (sum(getattr(part, name) for part in described) for name in ("size", "stored"))
-    if size > LARGEST_PAYLOAD:
-        raise ValueError(f"the arrays of a payload have {size} bytes, more than {LARGEST_PAYLOAD}")
+    if size > (most := min(LARGEST_PAYLOAD, SPARE + RATIO * len(payload))):
+        raise ValueError(f"the arrays of a payload of {len(payload)} bytes have {size} bytes, more than {most}")
     if stored != len(payload) - start:
         raise ValueError(f"the buffers of a payload have {len(payload) - start} bytes, not {stored}")
     if len({part.name.casefold() for part in described}) < len(described):

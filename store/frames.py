@@ -22,6 +22,8 @@ LEVEL = 1
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
+AT_ONCE = 2**20  # bytes whose bits are put back: of large arrays there is no third copy
+
 BLOSC_HEADER = struct.Struct("<BBBBIII")
 BLOSC_VERSION = 2
 SHUFFLED, COPIED, BIT_SHUFFLED, UNSPLIT = 1, 2, 4, 16
@@ -184,9 +186,11 @@ def _shuffle_bits(raw: Bytes, item: int) -> Bytes:
 
 def _unshuffle_bits(shuffled: Bytes, target: Bytes, item: int) -> None:
     whole = target.size - target.size % (8 * item)
-    planes = shuffled[:whole].reshape(item, 8, -1)
-    squares = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<u8")
-    target[:whole].reshape(-1, item)[...] = _transposed(squares).view(np.uint8).reshape(item, -1).T
+    planes, items = shuffled[:whole].reshape(item, 8, -1), target[:whole].reshape(-1, item)
+    step = max(1, AT_ONCE // (8 * item))
+    for start in range(0, planes.shape[2], step):
+        squares = np.ascontiguousarray(planes[:, :, start : start + step].transpose(0, 2, 1)).view("<u8")
+        items[8 * start : 8 * (start + step)] = _transposed(squares).view(np.uint8).reshape(item, -1).T
     target[whole:] = shuffled[whole:]
 
 

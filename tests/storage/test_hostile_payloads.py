@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import blosc, zstd
 
-from store import DamageError, RecordError, Store, VersionError, check_store
+from store import DamageError, RecordError, Store, VersionError, check_store, encoding
 from store.encoding import decode_payload, encode_payload
 
 HEADER = struct.Struct("<BBBBIII")
@@ -40,6 +40,22 @@ def test_arrays_that_together_are_larger_than_any_that_are_written_are_damage(pl
     number = put_row(plain, payload=payload([("x", "<f8", (2**37,), 0, 2**40, b"")]))
     read = in_a_process(READ, plain, memory=200 * 2**20)
     assert (read.returncode, read.stdout) == (0, f"damage at {number - 1}\n"), read.stderr
+
+
+def test_a_small_payload_stands_for_no_large_array(plain):
+    large = 2**28
+    frame = zstd.compress(bytes(large), 1)
+    number = put_row(plain, payload=payload([("x", "|u1", (large,), 2, large, frame)], version=2))
+    read = in_a_process(READ, plain, memory=100 * 2**20)
+    assert (read.returncode, read.stdout) == (0, f"damage at {number}\n"), read.stderr
+
+
+def test_so_little_that_stands_for_so_much_is_kept_as_it_is_and_read_back(opened, monkeypatch):
+    monkeypatch.setattr(encoding, "SPARE", 2**20)
+    zeros = np.zeros(5 * 2**20, np.uint8)
+    head = opened.append("a", "zeros", b"", arrays={"zeros": zeros})
+    assert head.size > zeros.nbytes
+    assert opened.record(head.sequence).arrays["zeros"].tobytes() == zeros.tobytes()
 
 
 FOUR = b"abcd"

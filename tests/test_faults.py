@@ -18,6 +18,7 @@ COUNTS = {
     "processes": "readers",
     "latency": "disk",
     "space": "large",
+    "hostile": "cases",
 }
 
 pytestmark = pytest.mark.skipif(
@@ -53,3 +54,9 @@ def test_a_power_cut_would_be_noticed_where_the_log_was_not_synced(tmp_path):
     code, record = quick("power_cut", tmp_path, "--without", "log")
     assert code == 1
     assert len(record["failures"]) > 5
+
+
+def test_what_the_gate_keeps_out_would_be_noticed_without_it(tmp_path):
+    code, record = quick("hostile", tmp_path, "--without", "gate", "--cases", "100")
+    assert code == 1
+    assert len(record["failures"]) > 10

@@ -1,0 +1,320 @@
+"""Attacks that were found by hand, one by one, before anything withstood them: D1 to D7 and D12 of issue 17.
+
+Each is done to a copy of the memory "snapshot", which has a generation; `REFUSED` names those that nobody may take in.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from forging import (
+    Packed,
+    as_text,
+    connected,
+    generations,
+    get_identity,
+    group_of,
+    name_generation,
+    observation,
+    pack,
+    put_row,
+    raw,
+    seal,
+    set_identity,
+    set_meta,
+    unpack,
+)
+from numcodecs import zstd
+
+from faults.places import SCHEMAS, Scene, hot_journal
+from scroll_tactile.memory.rows import pack_codes
+
+Named = Callable[[Path, Scene], None]
+
+BLOSC = struct.pack("<BBBBIII", 2, 1, 0x20, 1, 65536, 65536, 2**31 - 1) + struct.pack("<i", 2**30)
+COPIED = struct.pack("<BBBBIII", 2, 1, 2, 1, 65536, 65536, 65552)  # 16 bytes that claim 65536 behind them
+
+
+def frames() -> dict[str, Named]:
+    """D1: Blosc frames that lead c-blosc out of its buffers."""
+
+    def row(frame: bytes) -> Named:
+        arrays = [Packed("codes-64", "|u1", (65536,), 1, 65536, frame)]
+        return lambda path, _: (
+            put_row(path, payload=pack(arrays), attributes={"columns": 400, "nbytes": 30400}) and None
+        )
+
+    def chunk(flags: int) -> Named:
+        def spoil(path: Path, _: Scene) -> None:
+            for file in group_of(path, generations(path)[0]).glob("*/c/**/[0-9]*"):
+                data = file.read_bytes() if file.is_file() else b""
+                if len(data) > 16:
+                    size = data[4:8]
+                    file.write_bytes(
+                        struct.pack("<BBBB", 2, 1, flags, 1) + size * 2 + struct.pack("<Ii", 2**31 - 1, 2**30)
+                    )
+
+        return spoil
+
+    return {"stream": row(BLOSC), "copied": row(COPIED), "chunk": chunk(0x20), "copied chunk": chunk(2)}
+
+
+def links() -> dict[str, Named]:
+    """D2: links out of the folder."""
+
+    def instead(name: str, to: str) -> Named:
+        def link(path: Path, scene: Scene) -> None:
+            place = path / name
+            shutil.rmtree(place, ignore_errors=True)
+            place.unlink(missing_ok=True)
+            place.symlink_to(scene.watched / to)
+
+        return link
+
+    return {
+        "generations": instead("generations", "."),
+        "holder": instead("holder.json.new", "file"),
+        "journal": instead("journal.sqlite", "memory/journal.sqlite"),
+        "log": instead("journal.sqlite-wal", "file"),
+        "generation": instead("generations/00000001", "12345"),
+        "partial": instead("generations/00000009.partial", "12345"),
+        "draft": instead("journal.sqlite.new", "file"),
+        "super-journal": lambda path, scene: hot_journal(_Fixed(), path, scene) and None,  # type: ignore[arg-type]
+    }
+
+
+class _Fixed:
+    """A random generator that is none."""
+
+    def randrange(self, first: int, _: int) -> int:
+        return first
+
+    def randbytes(self, count: int) -> bytes:
+        return bytes(count)
+
+    def choice(self, choices: Any) -> Any:
+        return choices[0]
+
+
+def sizes() -> dict[str, Named]:
+    """D3: a few bytes that ask for all memory, or all time."""
+
+    def row(**changes: Any) -> Named:
+        return lambda path, _: put_row(path, **changes) and None
+
+    def meta(shape: list[int], chunk: list[int], named: bool) -> Named:
+        def write(path: Path, _: Scene) -> None:
+            generation = generations(path)[0]
+            folder = group_of(path, generation) / "rows-15"
+            about = json.loads((folder / "zarr.json").read_text())
+            about["shape"], about["chunk_grid"]["configuration"]["chunk_shape"] = shape, chunk
+            (folder / "zarr.json").write_text(json.dumps(about))
+            shutil.rmtree(folder / "c")
+            if named:
+                content = json.loads(generation.content)
+                content["arrays"]["rows-15"]["shape"] = shape
+                seal(path, replace(generation, content=as_text(content)))
+
+        return write
+
+    def special(name: str, *, pipe: bool) -> Named:
+        def make(path: Path, _: Scene) -> None:
+            place = path / name.replace("ARRAY", str(group_of(path, generations(path)[0]) / "rows-15"))
+            place.unlink(missing_ok=True)
+            os.mkfifo(place) if pipe else place.symlink_to("/dev/zero")
+
+        return make
+
+    large = zstd.compress(bytes(2**28), 1)
+    many = [Packed(f"stages-{i}", "|u1", (2**28,), 2, 2**28, large) for i in range(60)]
+    one = [Packed("stages-15", "<i4", (2**20, 64), 2, 2**28, large)]
+    made = {
+        "one array": row(payload=pack(one, 2), attributes={"columns": 30}),
+        "spans": row(kind="retract", label="", attributes={"sequences": [[1, 10**12]]}),
+        "columns": lambda path, _: (
+            put_row(path, attributes={"columns": 10**9, "nbytes": 240}, payload=observation(path)[1]) and None
+        ),
+        "shape": meta([2**29], [2**29], named=True),
+        "shape, not named": meta([2**29], [2**29], named=False),
+        "chunks": meta([2**28], [1], named=True),
+        "60 arrays": row(payload=pack(many, 2), attributes={"columns": 30}),
+        "tebibyte": row(payload=pack([Packed("x", "|u1", (2**40,), 0, 2**40, b"", 2**40)]), attributes={"columns": 30}),
+        "lost heads": lambda path, _: set_meta(path, "repaired", '{"heads":[[1,1000000000000]]}'),
+    }
+    for name in ("ARRAY/zarr.json", "ARRAY/c/0", "journal.sqlite-wal", "holder.json"):
+        made |= {f"zeros {name}": special(name, pipe=False), f"pipe {name}": special(name, pipe=True)}
+    return made
+
+
+def poison() -> dict[str, Named]:
+    """D4: rows that a merge took in, and that broke the memory or its answers."""
+
+    def row(change: Callable[[dict[str, Any], dict[str, np.ndarray], Scene], Any], **columns: Any) -> Named:
+        def put(path: Path, scene: Scene) -> None:
+            attributes, payload = observation(path)
+            version, arrays = unpack(payload)
+            more: dict[str, np.ndarray] = {}
+            for i in range(3):
+                if change(attributes, more, scene) is not None:
+                    arrays = []
+                put_row(
+                    path,
+                    attributes=attributes,
+                    payload=pack([*arrays, *(raw(name, array) for name, array in more.items())], version),
+                    **{"key": bytes([i]) * 32} | columns,
+                )
+
+        return put
+
+    def codes(value: Any, dtype: Any = np.int32) -> Named:
+        def change(_: dict[str, Any], more: dict[str, np.ndarray], scene: Scene) -> None:
+            more |= {
+                name: np.full(array.shape, value, dtype) for name, array in pack_codes(scene.codes["touch"]).items()
+            }
+
+        return row(change)
+
+    def readings(value: np.ndarray) -> Named:
+        return row(lambda attributes, more, _: more.update(readings=value) or "alone")
+
+    def nothing(*_: Any) -> None:
+        pass
+
+    def attribute(**changed: Any) -> Named:
+        return row(lambda attributes, *_: attributes.update(changed))
+
+    return {
+        "codes of 2^31": codes(2**31 - 1),
+        "codes of NaN": codes(np.nan, np.float32),
+        "codes of 2^20 + 1": codes(2**20 + 1),
+        "three readings": readings(np.zeros(3, np.float32)),
+        "readings of text": readings(np.array(["x", "y"])),
+        "readings of NaN": readings(np.full((30, 2), np.nan, np.float32)),
+        "readings out of range": readings(np.full((30, 2), 1e30, np.float32)),
+        "key of 3 bytes": row(nothing, key=b"abc"),
+        "no number of bytes": attribute(nbytes="a"),
+        "columns below 0": attribute(columns=-1),
+        "a name with an escape": row(nothing, label="\x1b]0;pwned\x07\x1b[2J\x1b[31mevil\nline"),
+        "an empty name": row(nothing, label=""),
+        "a name of 10 MB": row(nothing, label="x" * 10_000_000),
+        "a description": lambda path, _: (
+            put_row(path, kind="describe", label="a", attributes={"constituents": {"wool": "x"}}) and None
+        ),
+    }
+
+
+def schemas() -> dict[str, Named]:
+    """D5: what SQLite would run."""
+
+    def run(statement: str) -> Named:
+        def change(path: Path, _: Scene) -> None:
+            with connected(path) as connection:
+                connection.execute(statement)
+
+        return change
+
+    return {
+        statement[:60]: run(statement)
+        for statement in SCHEMAS
+        if statement.startswith("CREATE") and "sqlite_x" not in statement and "random" not in statement
+    }
+
+
+def untyped() -> dict[str, Named]:
+    """D6: what left as KeyError, TypeError, RecursionError and the like."""
+
+    def identity(**changed: Any) -> Named:
+        return lambda path, _: set_identity(path, {**get_identity(path), **changed})
+
+    def embedding(dimension: Any) -> Named:
+        return lambda path, _: set_identity(
+            path, (about := get_identity(path)) | {"embedding": {**about["embedding"], "dimension": dimension}}
+        )
+
+    def content(text: str) -> Named:
+        return lambda path, _: name_generation(path, replace(generations(path)[0], content=text))
+
+    def row(**changes: Any) -> Named:
+        return lambda path, _: put_row(path, **changes) and None
+
+    deep = "[" * 100_000 + "]" * 100_000
+    return {
+        "no attributes": lambda path, _: put_row(path, payload=observation(path)[1]) and None,
+        "no sequences": row(kind="retract", label="", attributes={}),
+        "values of no scale": row(payload=pack([raw("values-x", np.zeros(3, np.int32))]), attributes={"columns": 30}),
+        "deep attributes": lambda path, _: put_row(path, attributes=deep, payload=observation(path)[1]) and None,
+        "deep identity": lambda path, _: set_identity(path, deep),
+        "sensor": identity(sensor="x"),
+        "embedding": identity(embedding="x"),
+        "empty embedding": identity(embedding={}),
+        "grid": identity(grid=None),
+        "exemplars": identity(exemplars="abc"),
+        "augmentation": identity(augmentation="x"),
+        "unknown augmentation": identity(augmentation={"x": 1}),
+        **{f"dimension {size}": embedding(size) for size in (0, -5, 10**9, True)},
+        "content without format": content('{"arrays":{}}'),
+        "content of format x": content('{"format":"x","arrays":{}}'),
+        "content of a list": content("[]"),
+        "deep content": content(deep),
+        "arrays of a list": content('{"format":1,"arrays":[1]}'),
+        "no attributes of a generation": lambda path, _: seal(path, replace(generations(path)[0], attributes="{}")),
+        "too many materials": lambda path, _: seal(
+            path,
+            replace(
+                generations(path)[0],
+                attributes=as_text(json.loads(generations(path)[0].attributes) | {"materials": ["a", "b", "c", "d"]}),
+            ),
+        ),
+    }
+
+
+def dates() -> dict[str, Named]:
+    """D12: a clock that was wrong by three million years."""
+
+    def row(path: Path, _: Scene) -> None:
+        attributes, payload = observation(path)
+        put_row(path, attributes=attributes, payload=payload, time=-1e14)
+
+    return {"a time": row}
+
+
+NAMED: dict[str, Named] = {
+    f"{defect}: {name}": attack
+    for defect, attacks in {
+        "D1": frames(),
+        "D2": links(),
+        "D3": sizes(),
+        "D4": poison(),
+        "D5": schemas(),
+        "D6": untyped(),
+        "D12": dates(),
+    }.items()
+    for name, attack in attacks.items()
+}
+"""By name, all of them."""
+
+# Of these nothing can be taken in. Others are to be passed over: a generation of no use, with a warning, or a link
+# in the place of what a writer removes.
+REFUSED = frozenset(
+    name
+    for name in NAMED
+    if (
+        name.startswith(("D4", "D5"))
+        or name in ("D1: stream", "D1: copied", "D3: spans", "D3: columns", "D3: tebibyte")
+    )
+    or (
+        name.startswith("D6")
+        and "content" not in name
+        and "arrays" not in name
+        and "generation" not in name
+        and "materials" not in name
+    )
+)

@@ -18,7 +18,7 @@ from examples.benchmarks.live_shift import run_shifts, show_shifts
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
-from examples.paper.commands.sets import Dataset, read, require_folders, write_result
+from examples.paper.commands.sets import Dataset, origin, read, require_folders, write_result
 from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
@@ -103,7 +103,7 @@ def live(
     with progress_bar() as progress:
         records = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
     show_shifts(records)
-    _written(context, json, {"shifts": records})
+    _written(context, json, {**origin("live", seed), "shifts": records})
 
 
 @app.command()

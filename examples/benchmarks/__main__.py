@@ -18,7 +18,7 @@ from examples.benchmarks.live_shift import run_shifts, show_shifts
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
-from examples.paper.commands.sets import Dataset, origin, read, require_folders, write_result
+from examples.paper.commands.sets import Dataset, read, require_folders, write_result
 from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
@@ -101,9 +101,9 @@ def live(
     """Send shifts of simulated and of recorded touches through a live session, reading by reading."""
     require_folders(json)
     with progress_bar() as progress:
-        records = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
-    show_shifts(records)
-    _written(context, json, {**origin("live", seed), "shifts": records})
+        result = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
+    show_shifts(result["shifts"])
+    _written(context, json, result)
 
 
 @app.command()

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
+from examples.benchmarks.timing import circumstances
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.blas import one_thread
 from scroll_tactile.cli.terminal import console
@@ -29,9 +30,9 @@ LEARNED = 6  # simulated touches of each of ten materials
 DEVIATIONS = 3.0  # of its noise, that a sensor's rest is set above the least it was pressed
 
 
-def run_shifts(data: Path | None, *, seconds: float, seed: int, note: Callable[[str], None]) -> list[Record]:
+def run_shifts(data: Path | None, *, seconds: float, seed: int, note: Callable[[str], None]) -> Record:
     """A record for each shift: simulated ones, and with `data` those of real touches of a fold that was left out."""
-    records = []
+    result, records = {"bench": "live", **circumstances(seed)}, []
     for sensor in (sensors.BIOTAC, sensors.ROBOSKIN):
         note(f"simulated {sensor.name}")
         records.append(_simulated(sensor, seconds, seed))
@@ -40,7 +41,7 @@ def run_shifts(data: Path | None, *, seconds: float, seed: int, note: Callable[[
             note(f"recorded {name}")
             recordings = load(data, "biotac" if name == "biotac" else "roboskin", seed, unmixed=name == "roboskin")
             records.append(_recorded(recordings, seconds, seed))
-    return records
+    return {**result, "shifts": records}
 
 
 def _simulated(sensor: Sensor, seconds: float, seed: int) -> Record:

@@ -110,7 +110,10 @@ class LiveSession:
         self._ended: list[LiveTouch] = []
         self._closed = False
         self.touch: Stream | None = None
-        self._rule(model)
+        first = model not in _RULES
+        rule = self._rule(model)
+        if first and model.names and not sensor.camera:
+            self._warm_up(model, rule)
 
     def push(self, reading: npt.ArrayLike, time: Any = None) -> LiveState:
         """Take a reading (n,) or a block (k, n), k of 0 or more, and say where the session stands after it.
@@ -258,9 +261,7 @@ class LiveSession:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
-            known[self._risk] = rule = decision_rule(model, self._memory.extractor, self._risk)
-            if not self.sensor.camera and model.names:
-                self._warm_up(model, rule)
+            known[self._risk] = decision_rule(model, self._memory.extractor, self._risk)
         return known[self._risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:

@@ -446,7 +446,7 @@ class TactileLearner:
         """Begin to take readings as they come; see `LiveSession.push`.
 
         risk: the share of wrong answers among those that are decided. contact: "auto" finds touches by the sensor's own
-        noise at rest, which it learns first: for a second nothing may touch it. "manual" leaves that to
+        noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
         `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene: as for `predict`.
 
         Each touch is predicted by the memory as it was when it began.
@@ -460,11 +460,11 @@ class TactileLearner:
             with self._ledger.lock, enough_memory():
                 return self._current.snapshot(self._ledger)
 
-        def answer(model: Model, candidates: Sequence[str], encoded: Encoded) -> Prediction:
+        def answered(model: Model, candidates: Sequence[str], encoded: Encoded) -> Prediction:
             with self._ledger.lock, enough_memory():
                 return self._answer(model, candidates, [(encoded, None)])
 
-        memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answer)
+        memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answered)
         return LiveSession(memory, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
 
     def _of_one_state(self, evaluate: Callable[[], tuple[int, Callable[[], Answer]]]) -> Answer:

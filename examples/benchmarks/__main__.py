@@ -14,11 +14,12 @@ from rich.table import Table
 
 from examples.benchmarks.buffers import run_buffers
 from examples.benchmarks.interleaved import run_interleaved
+from examples.benchmarks.live_decision import RECORDED, run_decisions, show_decisions
 from examples.benchmarks.live_shift import run_shifts, show_shifts
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
-from examples.paper.commands.sets import Dataset, read, require_folders, write_result
+from examples.paper.commands.sets import Dataset, parse_folds, read, require_folders, write_result
 from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
@@ -104,6 +105,32 @@ def live(
         result = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
     show_shifts(result["shifts"])
     _written(context, json, result)
+
+
+@app.command()
+def decisions(
+    context: typer.Context,
+    data: Annotated[Path, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in.")],
+    dataset: Annotated[list[Dataset] | None, typer.Option(help="One or more; all three unless given.")] = None,
+    folds: Annotated[str, typer.Option(help="Which to test, with commas, or all.")] = "all",
+    every: Annotated[int, typer.Option(min=1, help="Test one in so many of a fold's touches.")] = 1,
+    folder: Annotated[Path | None, typer.Option(help="Keep finished folds here; the same again resumes.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of BioTac's folds.")] = 0,
+    json: Json = None,
+) -> None:
+    """Measure early answers, touches of one thing together, and sets with a guarantee, on recorded sets.
+
+    A fold takes half a minute, and as long again for every fifty touches.
+    """
+    require_folders(json)
+    results = []
+    with progress_bar() as progress:
+        for name in dataset or [Dataset.BIOTAC, Dataset.ROBOSKIN, Dataset.UNMIXED]:
+            recordings = read(name, data, seed)
+            chosen = parse_folds(folds, recordings)
+            results.append(run_decisions(recordings, chosen, every=every, folder=folder, progress=progress))
+    show_decisions(results)
+    _written(context, json, {"sets": results, "recorded": RECORDED})
 
 
 @app.command()

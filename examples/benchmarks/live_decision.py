@@ -41,7 +41,7 @@ TOGETHER = (1, 2, 3)  # touches of one thing, for novelty
 ECE_AT = (0.1, 0.2, 0.3, 0.5, 1.0)  # seconds
 
 RECORDED = {
-    "aeon 1.4 TEASER, BioTac-20 fold 0": {"accuracy": 0.905, "seconds": 0.55, "harmonic": 0.883, "fit_seconds": 119},
+    "aeon: TEASER, BioTac-20 fold 0": {"accuracy": 0.905, "seconds": 0.55, "harmonic": 0.883, "fit_seconds": 119},
     "probability ≥ 0.7 twice running, before calibration, fold 0": {
         "accuracy": 0.935,
         "seconds": 0.54,

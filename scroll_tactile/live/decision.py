@@ -9,8 +9,8 @@ decided wrongly that
 
 W those that are, M how many it should be by their probabilities. These are calibrated at each moment, and a posterior
 keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as coarse as
-1 / n. Touches left out are not all there are: hence one standard error. So few cannot vouch for a risk of 0.01, and then
-most are decided as whole touches, of which a probability of 1 − risk is enough.
+1 / n. Touches left out are not all there are: hence one standard error. So few cannot vouch for a risk of 0.01, and
+then most are decided as whole touches, of which a probability of 1 − risk is enough.
 """
 
 from __future__ import annotations

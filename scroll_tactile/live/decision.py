@@ -31,7 +31,7 @@ __all__ = ["DecisionRule", "decision_rule"]
 
 FloatArray = npt.NDArray[np.float64]
 
-MOST = 0.999  # of `sure`
+LEAST, MOST = 0.5, 0.999  # of `sure`: what is more likely wrong than right is acted on by nobody
 STEP = 0.005
 KNOWN = 0.95  # of touches left out: what is stranger is not acted on
 BEYOND = 2.0  # times the most novelty of touches left out
@@ -93,7 +93,7 @@ def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -
     """
     allowed = risk - float(np.sqrt(risk * (1 - risk) / len(chances)))
     sure = MOST
-    for bound in np.arange(MOST, 0.0, -STEP):
+    for bound in np.arange(MOST, LEAST, -STEP):
         reached = np.nan_to_num(chances) >= bound
         decided = reached.any(axis=1)
         first = reached.argmax(axis=1)[decided]

@@ -56,7 +56,7 @@ class _Said:
 
 def early_answers(model: Model, extractor: FeatureExtractor) -> Early | None:
     """How a model judges beginnings; None where it keeps no touches, or too few. Measured when first asked for."""
-    return model.early(lambda: _measured(model, extractor))
+    return model.early(_Measured(extractor))
 
 
 def rehearsal(model: Model, extractor: FeatureExtractor) -> tuple[tuple[Moment, ...], Rehearsal] | None:
@@ -72,12 +72,21 @@ def rehearsal(model: Model, extractor: FeatureExtractor) -> tuple[tuple[Moment, 
     return early.moments, early.fitted.and_more(early.rehearsed(*more)) if len(more[1]) else early.fitted
 
 
-def _measured(model: Model, extractor: FeatureExtractor) -> Early | None:
-    if model.pooled is None:
-        return None
-    sensor, least = extractor.sensor, min(model.least, model.pooled.recall.longest)
-    moments = moments_of(sensor.rate, model.plan.milestones(), least, fewest_readings(sensor))
-    return early_of(*_heard(model, extractor, model.pooled, moments, second=False))
+@dataclass(frozen=True)
+class _Measured:
+    """Measures how models judge beginnings; a copy of a model shares it, and with it the embedding."""
+
+    extractor: FeatureExtractor
+
+    def __call__(self, model: Model) -> Early | None:
+        if model.pooled is None:
+            return None
+        sensor, least = self.extractor.sensor, min(model.least, model.pooled.recall.longest)
+        moments = moments_of(sensor.rate, model.plan.milestones(), least, fewest_readings(sensor))
+        return early_of(*_heard(model, self.extractor, model.pooled, moments, second=False))
+
+    def __deepcopy__(self, memo: object) -> _Measured:
+        return self
 
 
 def _heard(

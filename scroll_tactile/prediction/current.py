@@ -21,7 +21,7 @@ from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.model import Draft, Model
+from scroll_tactile.prediction.model import Draft, Measures, Model
 from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel", "Snapshot"]
@@ -104,7 +104,7 @@ class CurrentModel:
             with suppress(MemoryError, InputError, RuntimeError):
                 self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
                 self._since = []
-                self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit)
+                self._coming = self._worker.submit(_fit, Draft.of(ledger.memory, self._kind), model.measures)
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
@@ -169,6 +169,14 @@ class CurrentModel:
         if self._composer is None or self._composer[:3] != state:
             self._composer = *state, Composer.of(model, ledger.memory)
         return self._composer[3]
+
+
+def _fit(draft: Draft, measures: Measures | None) -> Model:
+    """A model; where beginnings are asked for, with how it judges them."""
+    model = draft.fit()
+    if measures is not None:
+        model.early(measures)
+    return model
 
 
 def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:

@@ -25,9 +25,10 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "Judgement", "Model", "enough_memory"]
+__all__ = ["Draft", "Judgement", "Measures", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
+Measures = Callable[["Model"], Early | None]
 
 # Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
 # less than that part of it. At 40 up to a thousand were solved for, and a touch took three to ten times as long.
@@ -163,7 +164,8 @@ class Model:
     views: the views that judge beside them; whole: the calibration of both, for whole touches at the last stage.
     pooled: the kept touches beside it, if any; conformal: how typical others are of them. least: the columns of all but
     the shortest touches that were learned. readouts: scale → its readout. calibrations: of the stages, as far as any
-    touch reached them. apart: scale → the sampled touches left out; sample: these. dependence: how far touches of one
+    touch reached them. apart: scale → the sampled touches left out; sample: these. measures: by what beginnings were
+    measured, None before they were. dependence: how far touches of one
     thing say the same. longest: the columns of the longest touch that was learned. fitted_to: the touches that it was
     fitted to.
     """
@@ -194,11 +196,13 @@ class Model:
         self.least = draft.memory.statistics.usual_least
         self.sample = draft.sample
         self._early: list[Early | None] = []
+        self.measures: Measures | None = None
 
-    def early(self, measure: Callable[[], Early | None]) -> Early | None:
-        """How beginnings are judged: by `measure` when it is first asked for, and the same from then on."""
+    def early(self, measures: Measures) -> Early | None:
+        """How beginnings are judged: as it `measures` when it is first asked for, and the same from then on."""
         if not self._early:
-            self._early.append(measure())
+            self._early.append(measures(self))
+            self.measures = measures
         return self._early[0]
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:

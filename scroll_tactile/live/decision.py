@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.prediction.beginnings import rehearsal
+from scroll_tactile.prediction.beginnings import early_answers
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import UNMEASURED
@@ -73,10 +73,10 @@ def decision_rule(model: Model, extractor: FeatureExtractor, risk: float) -> Dec
     if not 0 < risk < 1:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
     least = max(1, min(model.least, model.longest))
-    rehearsed = rehearsal(model, extractor)
-    if rehearsed is None:
+    early = early_answers(model, extractor)
+    if early is None:
         return DecisionRule((least,), risk, 1 - risk, 2 * UNMEASURED)
-    moments, said = rehearsed
+    moments, said = early.moments, early.fitted
     known = said.novelty <= np.array([np.quantile(moment.novelties, KNOWN) for moment in moments])
     sure = least_sure(
         np.where(known, said.chances.max(axis=2), np.nan), said.chances.argmax(axis=2) == said.targets[:, None], risk

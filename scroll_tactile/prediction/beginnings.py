@@ -18,7 +18,7 @@ from scroll_tactile.prediction.comparing import compared
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.deviation import spaced
-from scroll_tactile.readouts.early import Early, Heard, Moment, Rehearsal, early_of, moments_of
+from scroll_tactile.readouts.early import Early, Heard, early_of, moments_of
 from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.readouts.pooled import Pooled
@@ -28,11 +28,11 @@ from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["early_answers", "rehearsal"]
+__all__ = ["early_answers"]
 
 FloatArray = npt.NDArray[np.float64]
 
-LEFT_OUT = 64  # touches, each judged at every moment; and as many others for decisions
+LEFT_OUT = 100  # touches, each judged at every moment
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,6 @@ def early_answers(model: Model, extractor: FeatureExtractor) -> Early | None:
     return model.early(_Measured(extractor))
 
 
-def rehearsal(model: Model, extractor: FeatureExtractor) -> tuple[tuple[Moment, ...], Rehearsal] | None:
-    """The moments, and what is said there of the touches by which they are judged and of as many others.
-
-    None where `early_answers` is.
-    """
-    early = early_answers(model, extractor)
-    if early is None or model.pooled is None:
-        return None
-    moments = [moment.columns for moment in early.moments]
-    more = _heard(model, extractor, model.pooled, moments, second=True)
-    return early.moments, early.fitted.and_more(early.rehearsed(*more)) if len(more[1]) else early.fitted
-
-
 @dataclass(frozen=True)
 class _Measured:
     """Measures how models judge beginnings; a copy of a model shares it, and with it the embedding."""
@@ -83,24 +70,23 @@ class _Measured:
             return None
         sensor, least = self.extractor.sensor, min(model.least, model.pooled.recall.longest)
         moments = moments_of(sensor.rate, model.plan.milestones(), least, fewest_readings(sensor))
-        return early_of(*_heard(model, self.extractor, model.pooled, moments, second=False))
+        return early_of(*_heard(model, self.extractor, model.pooled, moments))
 
     def __deepcopy__(self, memo: object) -> _Measured:
         return self
 
 
 def _heard(
-    model: Model, extractor: FeatureExtractor, pooled: Pooled, moments: Sequence[int], *, second: bool
+    model: Model, extractor: FeatureExtractor, pooled: Pooled, moments: Sequence[int]
 ) -> tuple[list[Heard], npt.NDArray[np.intp]]:
     """What is said of touches left out at each moment, and their materials; nothing of fewer than two materials."""
     left = _left(model, pooled)
     names = sorted({touch.material for touch in left} & model.known)
-    chosen = left[1::2] if second else left[::2]
     if len(names) < 2:
         return [], np.empty(0, np.intp)
     with one_thread():
-        said = [_said(model, extractor, pooled, names, touch, moments) for touch in chosen]
-    targets = np.array([names.index(touch.material) for touch in chosen], dtype=np.intp)
+        said = [_said(model, extractor, pooled, names, touch, moments) for touch in left]
+    targets = np.array([names.index(touch.material) for touch in left], dtype=np.intp)
     return [_gathered(columns, [of.get(columns) for of in said], targets) for columns in moments], targets
 
 
@@ -112,7 +98,7 @@ def _left(model: Model, pooled: Pooled) -> list[_Left]:
         for material, key, sampled in model.sample
         if key in rows and all(_others(readout, material, sampled) for readout in model.readouts.values())
     ]
-    return [found[i] for i in spaced(found, 2 * LEFT_OUT)]
+    return [found[i] for i in spaced(found, LEFT_OUT)]
 
 
 def _others(readout: Readout, material: str, sampled: SampledTouch) -> bool:

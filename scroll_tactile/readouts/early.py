@@ -129,14 +129,6 @@ class Rehearsal:
     novelty: FloatArray
     targets: npt.NDArray[np.intp]
 
-    def and_more(self, other: Rehearsal) -> Rehearsal:
-        """This one and another of the same moments and materials."""
-        return Rehearsal(
-            np.concatenate([self.chances, other.chances]),
-            np.concatenate([self.novelty, other.novelty]),
-            np.concatenate([self.targets, other.targets]),
-        )
-
 
 def moments_of(rate: float, milestones: Sequence[int], least: int, fewest: int) -> tuple[int, ...]:
     """The moments at which beginnings are measured, in columns: `fewest` or more, and below `least`.

@@ -8,7 +8,7 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.prediction import beginnings
-from scroll_tactile.prediction.beginnings import early_answers, rehearsal
+from scroll_tactile.prediction.beginnings import early_answers
 from scroll_tactile.prediction.features import FeatureExtractor
 
 SKIN = Sensor(name="skin", channels=6, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.2)
@@ -58,7 +58,7 @@ def test_what_is_said_of_touches_left_out_is_what_a_memory_without_them_says(mod
     monkeypatch.setattr("scroll_tactile.readouts.early.FEWEST", 2)
     fresh = learned().model()
     early, said = early_answers(fresh, extractor), []
-    left = beginnings._left(fresh, fresh.pooled)[::2]
+    left = beginnings._left(fresh, fresh.pooled)
     keys = {key for key, row in fresh.pooled.recall.rows().items() if row in [touch.row for touch in left]}
     without = learned([(name, touch) for name, touch in TOUCHES if touch.key not in keys])
     without._current.present(without._ledger)._early = [early]
@@ -73,10 +73,10 @@ def test_what_is_said_of_touches_left_out_is_what_a_memory_without_them_says(mod
 
 def test_all_is_a_function_of_the_set(model, extractor):
     again = learned(TOUCHES[::-1]).model()
-    (moments, said), (other_moments, other) = rehearsal(model, extractor), rehearsal(again, extractor)
-    assert said.chances.tobytes() == other.chances.tobytes()
-    assert said.novelty.tobytes() == other.novelty.tobytes()
-    assert [moment.trusted for moment in moments] == [moment.trusted for moment in other_moments]
+    one, other = early_answers(model, extractor), early_answers(again, extractor)
+    assert one.fitted.chances.tobytes() == other.fitted.chances.tobytes()
+    assert one.fitted.novelty.tobytes() == other.fitted.novelty.tobytes()
+    assert [moment.trusted for moment in one.moments] == [moment.trusted for moment in other.moments]
 
 
 def test_it_is_measured_once(model, extractor):
@@ -84,8 +84,8 @@ def test_it_is_measured_once(model, extractor):
 
 
 def test_nothing_is_measured_where_nothing_is_kept(extractor):
-    assert rehearsal(learned(recall=0).model(), extractor) is None
-    assert rehearsal(learned(TOUCHES[:2]).model(), extractor) is None
+    assert early_answers(learned(recall=0).model(), extractor) is None
+    assert early_answers(learned(TOUCHES[:2]).model(), extractor) is None
 
 
 def test_touches_with_gaps_are_left_out_too():

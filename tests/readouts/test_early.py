@@ -79,5 +79,3 @@ def test_moments_that_few_touches_reached_are_left_out():
     assert [early.at(columns).columns for columns in (2, 10, 39, 40, 500)] == [10, 10, 10, 40, 40]
     assert np.isnan(early.fitted.chances[1::2, 1]).all() and not np.isnan(early.fitted.chances[:, 0]).any()
     assert early_of([short], targets) is None
-    both = early.fitted.and_more(early.fitted)
-    assert both.chances.shape == (2 * COUNT, 2, MATERIALS) and both.targets.tolist() == [*targets, *targets]

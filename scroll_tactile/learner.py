@@ -38,7 +38,7 @@ from scroll_tactile.prediction.model import Draft, Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_text
+from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_source, require_text
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
@@ -239,20 +239,29 @@ class TactileLearner:
         with self._ledger.lock:
             return self._ledger.memory.statistics.materials
 
-    def observe(self, material: str, stream: Readings) -> Receipt:
+    def stream(self, readings: Readings) -> Stream:
+        """What `observe` makes of readings before it learns them: sound, and of a camera's the frames in contact.
+
+        Raises StreamError, and SensorMismatchError for another sensor's stream.
+        """
+        return self._extractor.stream(readings)
+
+    def observe(self, material: str, stream: Readings, *, source: str | None = None) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
         unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
         (T, height, width, 3), the first of the gel at rest (see `Frames`), of which those in contact are kept.
+        source: where it comes from, such as a file's name: kept in the journal for `observations`, and nothing else.
 
-        Raises StreamError (NoContactError where the gel was not pressed), MaterialError (nothing was kept),
-        CapacityError, or StoreError.
+        Raises StreamError (NoContactError where the gel was not pressed), MaterialError or InputError for a name or a
+        source that is none (nothing was kept), CapacityError, or StoreError.
         """
-        material = require_name(material)
+        material, source = require_name(material), None if source is None else require_source(source)
         touch = self._verified().stream(stream)
         image = self._extractor.image(touch)
-        receipt = self._ledger.observe(material, touch, image.shape[1], self._extractor.codes(image, touch.key))
+        codes = self._extractor.codes(image, touch.key)
+        receipt = self._ledger.observe(material, touch, image.shape[1], codes, source)
         with self._ledger.lock:
             self._current.prepare(self._ledger)
         return receipt
@@ -303,6 +312,16 @@ class TactileLearner:
         compacted, or for a receipt of another memory; InputError in a memory without a path; StoreError.
         """
         self._ledger.retract(receipt)
+
+    def relabel(self, receipt: Receipt | int, material: str) -> int:
+        """Give an observation another name: retract it and observe its readings under the new one, durable as one.
+
+        Returns its new sequence; it keeps its time and source. A description stays with the name that it was given to.
+
+        Raises what `retract` raises (nothing was changed), also MaterialError for a name that is none; InputError where
+        it has that name already, and in a batch.
+        """
+        return self._ledger.relabel(receipt, require_name(material))
 
     def forget(self, material: str) -> int:
         """Retract all observations of a material, as `retract` does one, and its description; returns how many.

@@ -34,7 +34,8 @@ class Observation:
     """What the journal says of one observation.
 
     sequence, material, key: as in its receipt. time: when it was observed, in seconds since 1970. state: "kept", with
-    its features; "compacted", learned and without them; or "retracted".
+    its features; "compacted", learned and without them; or "retracted". source: the file or place it came from, where
+    `observe` was given one.
     """
 
     sequence: int
@@ -42,6 +43,7 @@ class Observation:
     key: bytes
     time: float
     state: Literal["kept", "compacted", "retracted"]
+    source: str | None = None
 
 
 @dataclass(frozen=True)

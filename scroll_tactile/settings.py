@@ -10,9 +10,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialError
 
-__all__ = ["LONGEST_NAME", "FrozenModel", "Settings", "candidates_of", "names_of", "require_name", "require_text"]
+__all__ = [
+    "LONGEST_NAME",
+    "LONGEST_SOURCE",
+    "FrozenModel",
+    "Settings",
+    "candidates_of",
+    "names_of",
+    "require_name",
+    "require_source",
+    "require_text",
+]
 
 LONGEST_NAME = 200  # characters
+LONGEST_SOURCE = 1000
 
 
 class FrozenModel(BaseModel):
@@ -66,6 +77,17 @@ def require_name(material: str) -> str:
     if not material.isprintable():
         raise MaterialError(f"expected a name of printable characters; came {material!r}")
     return str(material)
+
+
+def require_source(source: str) -> str:
+    """Where a touch comes from, as a str and no subclass; raises InputError for what `observe` does not keep."""
+    if not isinstance(source, str):
+        raise InputError(f"expected source as a string; came {type(source).__name__} {source!r:.60}")
+    if not (0 < len(source) <= LONGEST_SOURCE and source.isprintable()):
+        raise InputError(
+            f"expected a source of 1 to {LONGEST_SOURCE} printable characters; came {len(source)}: {source!r:.60}"
+        )
+    return str(source)
 
 
 def require_text(material: str) -> None:

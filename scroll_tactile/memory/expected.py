@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import MaterialError
-from scroll_tactile.settings import require_name
+from scroll_tactile.errors import InputError
+from scroll_tactile.settings import require_name, require_source
 from scroll_tactile.statistics.grid import BITS
 
-__all__ = ["KEY_BYTES", "MOST_COLUMNS", "Unexpected", "array", "codes", "counts", "expect", "keys", "name", "whole"]
+__all__ = [
+    "KEY_BYTES",
+    "MOST_COLUMNS",
+    "Unexpected",
+    "array",
+    "codes",
+    "counts",
+    "expect",
+    "keys",
+    "name",
+    "source",
+    "whole",
+]
 
 KEY_BYTES = 32  # of a stream's content hash, see `Stream.key`
 MOST_COLUMNS = 2**28  # of a touch: 256 MiB of the smallest readings
@@ -37,11 +49,19 @@ def whole(field: str, value: Any, least: int, most: int) -> int:
 
 def name(field: str, value: Any) -> str:
     """What can name a material, by the rule that `observe` has; Unexpected for anything else."""
+    return _text(field, value, require_name)
+
+
+def source(field: str, value: Any) -> str:
+    """What can say where a touch comes from, by the rule that `observe` has; Unexpected for anything else."""
+    return _text(field, value, require_source)
+
+
+def _text(field: str, value: Any, rule: Callable[[str], str]) -> str:
     try:
-        require_name(value)
-    except MaterialError as error:
+        return rule(value)
+    except InputError as error:
         raise Unexpected(f"{field}: {error}") from None
-    return str(value)
 
 
 def array(

@@ -7,12 +7,13 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy.typing as npt
 
 from scroll_tactile.errors import FineTuneError, InputError, StreamError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
+from scroll_tactile.memory.changes import apply_appended, relabel
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
@@ -22,12 +23,12 @@ from scroll_tactile.memory.rows import (
     MOST_BYTES,
     OBSERVE,
     RETRACT,
+    SOURCE,
     Added,
     Codes,
     pack_codes,
     pack_readings,
     spans,
-    unspanned,
 )
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
@@ -142,7 +143,7 @@ class Ledger:
         except StoreError as error:  # of an earlier generation: the next commit would raise it instead of committing
             logger.warning("%s: no generation could be written: %s", store.path, error)
 
-    def observe(self, material: str, stream: Stream, columns: int, codes: Codes) -> Receipt:
+    def observe(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None = None) -> Receipt:
         """Append an observation to the journal, then add it to the memory."""
         if stream.readings.nbytes > MOST_BYTES:
             raise StreamError(
@@ -155,13 +156,13 @@ class Ledger:
             self.memory.statistics.require_room(codes)
             undo = self._memory.undo(material, stream.key, columns) if self.store is None else None
             with self._mutation(_nothing, undo):
-                sequence = self._append(material, stream, columns, codes)
+                sequence = self._append(material, stream, columns, codes, source)
                 self._changed([(material, codes, 1)])
             self._snapshot_if_due()
             durable = self.store is not None and not self._batching
         return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable)
 
-    def _append(self, material: str, stream: Stream, columns: int, codes: Codes) -> int:
+    def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
         memory = self._memory
         # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
         kept = self._bare or memory.exemplars is not None or memory.kept is not None
@@ -171,7 +172,8 @@ class Ledger:
             held = Exemplar.of(material, stream.key, packed, stages, codes) if kept else None
             memory.add(material, stream.key, columns, codes, sequence, held, stream.readings)
             return sequence
-        attributes = {"columns": columns, "nbytes": stream.readings.nbytes} if kept else {"columns": columns}
+        attributes: dict[str, Any] = {"columns": columns}
+        attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
         arrays = packed if self._bare else packed | pack_codes(codes)
         sequence = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays).sequence
         memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None, stream.readings)
@@ -231,6 +233,21 @@ class Ledger:
             self._changed(retracted)
         self._snapshot_if_due()
 
+    def relabel(self, receipt: Receipt | int, material: str) -> int:
+        """As `TactileLearner.relabel`."""
+        with self.lock:
+            store = self.require_store("relabel anything")
+            self._require_no_batch("a relabelling")
+            record = observation_of(store, self.memory, receipt)
+            with self._mutation(), store.batch():
+                self._changed(relabel(self._memory, store, record, material))
+            self._snapshot_if_due()
+            return self._memory.sequence
+
+    def _require_no_batch(self, what: str) -> None:
+        if self._batching:
+            raise InputError(f"{what} is a batch of its own: end the batch before it")
+
     @contextmanager
     def batch(self) -> Iterator[None]:
         """As `TactileLearner.batch`."""
@@ -266,8 +283,7 @@ class Ledger:
         """As `TactileLearner.merge`."""
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
-            if self._batching:
-                raise InputError("a merge is a batch of its own: end the batch before it")
+            self._require_no_batch("a merge")
             with MemoryStore.open(path, mode="read") as source:
                 source.read_with(memory.plan, thorough=True)
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
@@ -309,26 +325,13 @@ class Ledger:
                 if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     with self._mutation():
-                        self._changed(self._take_in(memory, store, records))
+                        self._changed(apply_appended(memory, store, records))
                     return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
             self._memory, self._whole = self._load(), True
             self._changed()
             return True
-
-    def _take_in(self, memory: Memory, store: Store, records: list[Record]) -> list[Added] | None:
-        """Apply the rows that a writer appended, and take an f* that it made; what changed, see `Memory.replay`."""
-        changed = [memory.replay(record, store) for record in records]
-        memory.refill(store)
-        newest = store.latest() if store.newest != memory.generation else None
-        if newest is not None and newest.upto <= memory.sequence:
-            memory.generation = newest.number
-            retractions = (head for head in store.heads(newest.upto, kind=RETRACT) if head.sequence <= memory.sequence)
-            gone = min((row for head in retractions for row in unspanned(head.attributes["sequences"])), default=None)
-            if gone is None or gone > cast(int, newest.attributes["tuned_upto"]):
-                memory.take_tuned(newest)
-        return None if None in changed else [each for added in changed for each in added or ()]
 
     def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
         """As `TactileLearner.ranked_exemplars`."""

@@ -12,7 +12,7 @@ from scroll_tactile.errors import InputError, MismatchError, ObservationError, U
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import require_counted
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
-from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, SOURCE, unspanned
 from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Generation, Head, Record, Store
@@ -77,10 +77,14 @@ def observations(store: Store) -> list[Observation]:
         return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
 
     return [
-        Observation(head.sequence, head.label, head.key, head.time, state(head))
+        Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head))
         for head in heads
         if head.kind in (OBSERVE, MEMBER)
     ]
+
+
+def _source(head: Head) -> str | None:
+    return cast("str | None", head.attributes.get(SOURCE))
 
 
 def compaction_point(store: Store, memory: Memory, keep: int) -> int:
@@ -172,7 +176,8 @@ class Incoming:
         for head in self.rows:
             if base is not None and head.sequence <= base.upto:
                 if head.kind != MERGE:  # a merge before the base is a part of it
-                    yield MEMBER, head.label, head.key, {}, None, head.time
+                    kept = {name: value for name, value in head.attributes.items() if name == SOURCE}
+                    yield MEMBER, head.label, head.key, kept, None, head.time
             else:
                 record = self.source.record(head.sequence)
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time

@@ -12,7 +12,17 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import DescriptionError, MismatchError
 from scroll_tactile.memory.descriptions import checked
-from scroll_tactile.memory.expected import KEY_BYTES, MOST_COLUMNS, Unexpected, array, codes, expect, name, whole
+from scroll_tactile.memory.expected import (
+    KEY_BYTES,
+    MOST_COLUMNS,
+    Unexpected,
+    array,
+    codes,
+    expect,
+    name,
+    source,
+    whole,
+)
 from scroll_tactile.memory.rows import (
     DESCRIBE,
     LARGEST,
@@ -22,6 +32,7 @@ from scroll_tactile.memory.rows import (
     REST,
     RETRACT,
     SHAPE,
+    SOURCE,
     WHOLE,
     ZERO,
     Arrays,
@@ -59,6 +70,8 @@ class RowChecks:
         if head.kind in (OBSERVE, MEMBER):
             name("label", head.label)
             expect(len(head.key) == KEY_BYTES, "key", f"{KEY_BYTES} bytes", head.key)
+            if SOURCE in head.attributes:
+                source(SOURCE, head.attributes[SOURCE])
         if head.kind == OBSERVE:
             self._check_observation(head.attributes)
         elif head.kind == RETRACT:

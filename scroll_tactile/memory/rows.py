@@ -20,6 +20,7 @@ __all__ = [
     "MOST_BYTES",
     "OBSERVE",
     "RETRACT",
+    "SOURCE",
     "Added",
     "Arrays",
     "Codes",
@@ -41,6 +42,7 @@ RETRACT = "retract"  # observations were retracted; the attribute "sequences" ho
 MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
 MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
+SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
 
 Arrays = Mapping[str, npt.NDArray[Any]]

@@ -21,7 +21,7 @@ from scroll_tactile.results import Observation
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["export_plain"]
+__all__ = ["date_of", "export_plain"]
 
 FORMAT = 2
 
@@ -34,8 +34,8 @@ def export_plain(
     """Write a memory into a new or empty folder; a file that is there is whole.
 
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
-      (learned from, features given up), retracted. A time out of the calendar's years 1 to 9999 is written as seconds
-      since 1970. Only where the memory has a path.
+      (learned from, features given up), retracted; and its source, where it has one. A time out of the calendar's
+      years 1 to 9999 is written as seconds since 1970. Only where the memory has a path.
     - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
       see `signals.views`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
       one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
@@ -69,8 +69,12 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
     held, journal = _one_state(learner)
     if learner.path is not None:
         progress("observations", 0, 1)
-        rows = [[row.sequence, row.material, row.key.hex(), _date(row.time), row.state] for row in journal]
-        _rows(target / "observations.csv", ["sequence", "material", "key", "time", "state"], rows)
+        header = ["sequence", "material", "key", "time", "state", "source"]
+        rows = [
+            [row.sequence, row.material, row.key.hex(), date_of(row.time), row.state, row.source or ""]
+            for row in journal
+        ]
+        _rows(target / "observations.csv", header, rows)
     if held.descriptions:
         header = ["material", "constituent", "present", "share"]
         _rows(target / "descriptions.csv", header, _described(held.descriptions))
@@ -108,7 +112,8 @@ def _one_state(learner: TactileLearner) -> tuple[TactileLearner, list[Observatio
             return held, journal
 
 
-def _date(seconds: float) -> str:
+def date_of(seconds: float) -> str:
+    """A moment in seconds since 1970 as ISO 8601, UTC; the number where no calendar has it."""
     try:
         return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
     except (OSError, OverflowError, ValueError):

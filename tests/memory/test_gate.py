@@ -117,6 +117,9 @@ ROWS = {
     "no name": ("name of 1 to 200", {"label": ""}),
     "a long name": ("name of 1 to 200", {"label": "x" * 10**6}),
     "an escape for a name": ("printable", {"label": "\x1b[2J"}),
+    "an escape for a source": ("printable", {"attributes": {"columns": 60, "nbytes": 480, "source": "\x1b[2J"}}),
+    "a long source": ("1 to 1000", {"attributes": {"columns": 60, "nbytes": 480, "source": "x" * 10**6}}),
+    "no text for a source": ("as a string", {"attributes": {"columns": 60, "nbytes": 480, "source": ["x"]}}),
 }
 
 

@@ -1,0 +1,135 @@
+"""Where a touch comes from is kept beside it, and changes nothing of what was learned; a wrong name is put right."""
+
+import pytest
+from touches import OBSERVED, SETTINGS, contents, fed, filled, require_same, stream, without
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError, MaterialError, ObservationError
+from store import Store, StoreFullError
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "m"
+
+
+def sources(learner):
+    return [(row.sequence, row.material, row.state, row.source) for row in learner.observations()]
+
+
+class TestSource:
+    def test_it_is_kept_through_opening_merging_compacting_and_reembedding(self, path, tmp_path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            learner.observe("a", stream((0, 60)), source="félt [1].npy[0:60] /rh/tactile")
+            learner.observe("b", stream((1, 60)))
+        with TactileLearner.open(path) as learner:
+            expected = [(1, "a", "kept", "félt [1].npy[0:60] /rh/tactile"), (2, "b", "kept", None)]
+            assert sources(learner) == expected
+            learner.reembed()
+            assert sources(learner) == expected
+            with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
+                other.merge(learner, shared="once")
+                assert sources(other) == expected
+            learner.compact()
+            with TactileLearner.open(tmp_path / "third", **SETTINGS) as third:
+                third.merge(learner, shared="once")
+                kept = [(material, state, source) for _, material, state, source in sources(third)]
+                assert kept == [("a", "compacted", expected[0][3]), ("b", "compacted", None)]
+
+    def test_nothing_that_is_learned_depends_on_it(self, path, tmp_path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            for i, (material, touch) in enumerate(OBSERVED):
+                learner.observe(material, stream(touch), source=f"{i}.npy")
+            require_same(learner, OBSERVED)
+        filled(tmp_path / "without")[0].close()
+        with Store.open(path, mode="read") as named, Store.open(tmp_path / "without", mode="read") as plain:
+            for row, other in zip(named.records(), plain.records(), strict=True):
+                assert {**row.attributes} == {**other.attributes, "source": f"{row.sequence - 1}.npy"}
+                assert {name: array.tobytes() for name, array in row.arrays.items()} == {
+                    name: array.tobytes() for name, array in other.arrays.items()
+                }
+
+    @pytest.mark.parametrize("wrong", ["", "x" * 1001, "a\x1b[2J", "\ud800", 7, b"a", ["a"]])
+    def test_what_is_none_is_refused_and_nothing_kept(self, path, wrong):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            with pytest.raises(InputError, match="source"):
+                learner.observe("a", stream((0, 60)), source=wrong)
+            assert learner.observations() == []
+
+    def test_a_memory_without_a_path_takes_and_forgets_it(self):
+        learner = TactileLearner(**SETTINGS)
+        learner.observe("a", stream((0, 60)), source="x.npy")
+        assert learner.digest() == fed([("a", (0, 60))]).digest()
+
+
+class TestRelabel:
+    def test_it_is_then_as_if_it_had_had_the_name_from_the_start(self, path):
+        learner, receipts = filled(path)
+        renamed = [*without(1), ("silk", OBSERVED[1][1])]
+        with learner:
+            assert learner.relabel(receipts[1], "silk") == 14
+            assert learner.observations()[-1].time == learner.observations()[1].time
+            require_same(learner, renamed)
+        with TactileLearner.open(path) as again:
+            require_same(again, renamed)
+            assert again.relabel(14, "b") == 16
+            require_same(again, OBSERVED)
+
+    def test_it_keeps_the_source_and_follows_what_was_learned(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner:
+            for i, (material, touch) in enumerate(OBSERVED):
+                learner.observe(material, stream(touch), source=f"{i}.npy")
+            learner.predict(stream((7, 25)))
+            learner.relabel(2, "a")
+            assert sources(learner)[1] == (2, "b", "retracted", "1.npy")
+            assert sources(learner)[-1] == (14, "a", "kept", "1.npy")
+            assert dict(learner.predict(stream((7, 25))).ranking).keys() == {"a", "b", "c"}
+            require_same(learner, [*without(1), ("a", OBSERVED[1][1])])
+
+    @pytest.mark.parametrize("settings", [{"exemplars": 0, "recall": 0}, {"exemplars": 0}], ids=["codes", "kept"])
+    def test_a_memory_that_keeps_no_exemplars(self, path, settings):
+        learner, receipts = filled(path, **settings)
+        with learner:
+            learner.relabel(receipts[1], "silk")
+            require_same(learner, [*without(1), ("silk", OBSERVED[1][1])], **settings)
+
+    def test_what_cannot_be_relabelled_is_refused_and_nothing_changed(self, path):
+        learner, _ = filled(path)
+        with learner:
+            for sequence, name, error, match in (
+                (1, "a", InputError, "is called 'a' already"),
+                (1, "", MaterialError, "1 to 200"),
+                (99, "b", ObservationError, "there is no observation"),
+            ):
+                with pytest.raises(error, match=match):
+                    learner.relabel(sequence, name)
+            with learner.batch(), pytest.raises(InputError, match="a batch of its own"):
+                learner.relabel(1, "b")
+            require_same(learner, OBSERVED)
+            learner.compact()
+            with pytest.raises(ObservationError, match="were compacted, and their features given up"):
+                learner.relabel(1, "b")
+        with pytest.raises(InputError, match="without a path"):
+            fed(OBSERVED).relabel(1, "b")
+
+    @pytest.mark.parametrize("failing", [1, 2])
+    def test_it_is_one_change(self, path, monkeypatch, failing):
+        learner, _ = filled(path)
+        append, calls = Store.append, []
+
+        def full(self, *words, **options):
+            calls.append(1)
+            if len(calls) == failing:
+                raise StoreFullError("no space left")
+            return append(self, *words, **options)
+
+        with learner:
+            before = contents(learner)
+            monkeypatch.setattr(Store, "append", full)
+            with pytest.raises(StoreFullError):
+                learner.relabel(2, "a")
+            monkeypatch.undo()
+            assert contents(learner) == before
+            require_same(learner, OBSERVED)
+        with TactileLearner.open(path) as again:
+            require_same(again, OBSERVED)

@@ -9,6 +9,7 @@ Five sensors come with the project; one's own is one more, made in one line:
 """
 
 import math
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -23,7 +24,9 @@ from pydantic import (
     model_validator,
 )
 
-__all__ = ["BIOTAC", "BIOTAC_ALL", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known"]
+from scroll_tactile.errors import InputError
+
+__all__ = ["BIOTAC", "BIOTAC_ALL", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known", "read_sensor"]
 
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
 
@@ -197,3 +200,21 @@ GELSIGHT = Sensor(
 def known() -> dict[str, Sensor]:
     """The sensors that come with the project, by name."""
     return {sensor.name: sensor for sensor in (BIOTAC, BIOTAC_ALL, ROBOSKIN, CONTACTILE, GELSIGHT)}
+
+
+def read_sensor(text: str) -> Sensor:
+    """A sensor by its name, or from a JSON file of its fields.
+
+    Raises InputError for an unknown name, a file that is not there, or fields that do not fit together.
+    """
+    usual = known()
+    if text in usual:
+        return usual[text]
+    path = Path(text)
+    if not path.is_file():
+        raise InputError(f"expected a sensor, one of {', '.join(usual)}, or a JSON file of its fields; came {text!r}")
+    try:
+        return Sensor.model_validate_json(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:  # pydantic's errors are ValueErrors, of a line for each field
+        what = "; ".join(line.strip() for line in str(error).splitlines() if not line.strip().startswith("For further"))
+        raise InputError(f"{path} does not describe a sensor: {what}") from error

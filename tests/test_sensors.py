@@ -3,6 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from scroll_tactile import sensors
+from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import BIOTAC, BIOTAC_ALL, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
@@ -122,3 +123,14 @@ def test_a_camera_has_one_range():
     fields = {"name": "eye", "channels": 12, "rate": 5.0, "high": 1.0, "unit": "1", "duration": 1.0, "camera": True}
     with pytest.raises(ValidationError, match="a camera has one low for all its pixels"):
         Sensor(**fields, layout=(2, 2, 3), low=(0.0,) * 12)
+
+
+def test_a_sensor_is_read_by_its_name_or_from_a_file(tmp_path):
+    assert sensors.read_sensor("roboskin") == ROBOSKIN
+    (tmp_path / "s.json").write_text(CONTACTILE.model_dump_json())
+    assert sensors.read_sensor(str(tmp_path / "s.json")) == CONTACTILE
+    (tmp_path / "s.json").write_text('{"name": "x", "channels": 0}')
+    with pytest.raises(InputError, match="channels"):
+        sensors.read_sensor(str(tmp_path / "s.json"))
+    with pytest.raises(InputError, match="one of biotac"):
+        sensors.read_sensor("biotacc")

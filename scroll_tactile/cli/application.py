@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from scroll_tactile.cli.bulk import evaluate, learn
 from scroll_tactile.cli.demonstration import demo
 from scroll_tactile.cli.everyday import inspect, observe, predict
 from scroll_tactile.cli.makeup import compose, describe
@@ -21,6 +22,6 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, predict, live, inspect, describe, compose):
+for command in (demo, observe, learn, predict, evaluate, live, inspect, describe, compose):
     app.command()(command)
 app.add_typer(memory, name="memory")

@@ -39,7 +39,7 @@ def demo(
     --memory.
     """
     from scroll_tactile.pipelines.demo import Demo
-    from scroll_tactile.recordings.arrays import read_sensor
+    from scroll_tactile.sensors import read_sensor
 
     task = Demo(
         read_sensor(sensor),

@@ -2,21 +2,60 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from scroll_tactile.cli.terminal import console, opened, opened_for_upkeep, percent, say, say_json, shown, verdict
-from scroll_tactile.settings import require_name
+from scroll_tactile.cli.terminal import (
+    console,
+    opened,
+    opened_for_upkeep,
+    percent,
+    say,
+    say_csv,
+    say_json,
+    say_refused,
+    shown,
+    verdict,
+)
+from scroll_tactile.errors import InputError, printable
+from scroll_tactile.results import Prediction
+from scroll_tactile.settings import LONGEST_SOURCE, require_name
 
-__all__ = ["inspect", "observe", "predict"]
+if TYPE_CHECKING:
+    from scroll_tactile.pipelines.learning import Answered
+    from scroll_tactile.pipelines.sources import Refused
+
+__all__ = ["ANSWER", "answer_row", "inspect", "observe", "predict"]
 
 MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
 StreamFile = Annotated[
-    Path, typer.Argument(help="A .npy or .csv file of readings: a row each, a column per channel.", show_default=False)
+    Path, typer.Argument(help="A recording of one touch, such as a .npy or .csv: a row a reading.", show_default=False)
 ]
+
+Sources = Annotated[
+    list[str],
+    typer.Argument(
+        help="Recordings, or folders of them: .npy, .csv, .bag, .db3, .mcap, .h5, .zarr, LeRobot data sets, "
+        "and addresses such as s3://…",
+        show_default=False,
+    ),
+]
+Topic = Annotated[str | None, typer.Option(help="The topic that has the readings, in a recording of several.")]
+Field = Annotated[str | None, typer.Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")]
+Clock = Annotated[str | None, typer.Option(help="device, header, publish or log; or a field, column or array.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        help="A known sensor under its driver, in place of sensor, topic and field: biotac, biotac-sp, xela-uskin, "
+        "papillarray, anyskin, robotiq-tsf, digit, gelsight."
+    ),
+]
+
+ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 
 
 def observe(
@@ -32,15 +71,18 @@ def observe(
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
-    from scroll_tactile.recordings.arrays import read_sensor, read_stream, require_readable
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.recordings import read
+    from scroll_tactile.sensors import read_sensor
 
     require_name(material)
-    readings = read_stream(file)
+    recording = read(file)
     chosen = None if sensor is None else read_sensor(sensor)
     if chosen is not None and not memory.exists():
-        require_readable(readings, chosen)  # what is refused makes no memory
+        TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
-        receipt = learner.observe(material, readings)
+        source = printable(str(file))[-LONGEST_SOURCE:]
+        receipt = learner.observe(material, recording.stream(learner.sensor), source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
@@ -49,34 +91,89 @@ def observe(
 
 def predict(
     memory: MemoryFolder,
-    file: StreamFile,
+    sources: Sources,
     scene: Annotated[
         str | None, typer.Option(help="The materials that can be here, separated by commas; all of them otherwise.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with the whole ranking.")] = False,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
+    ] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
 ) -> None:
-    """Say what a touch in a file feels like; the memory stays as it is."""
-    candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
-    from scroll_tactile.recordings.arrays import read_stream
+    """Say what touches in files feel like; the memory stays as it is.
 
-    readings = read_stream(file)
+    Of many the exit code is 1 where some were refused.
+    """
+    from scroll_tactile.pipelines.learning import answers
+    from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources
+
+    candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
+    found, refused = find_sources(sources)
+    options = SourceOptions(topic=topic, field=field, clock=clock, preset=preset)
+    alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
-        prediction = learner.predict(readings, scene=candidates)
+        answered = answers(learner, found, options, scene=candidates)
+        if alone:
+            several = [*refused, *answered]
+            if len(several) == 1:
+                _show_answer(several[0], as_json)
+                return
+            refused, answered = [], iter(several)
+        if as_csv:
+            say_csv(*ANSWER)
+        for each in answered:
+            if isinstance(each, Refused):
+                refused.append(each)
+            elif as_csv:
+                say_csv(*answer_row(each))
+            elif as_json:
+                say_json({"source": each.touch.source} | _answer(each.prediction))
+            else:
+                say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+    say_refused(refused)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _show_answer(found: Answered | Refused, as_json: bool) -> None:
+    """The one answer that there is, or why there is none."""
+    from scroll_tactile.pipelines.sources import Refused
+
+    if isinstance(found, Refused):
+        raise InputError(found.why)
+    prediction = found.prediction
     if as_json:
-        infinite = prediction.novelty == float("inf")  # JSON has no infinity
-        answer = {
-            "material": prediction.material,
-            "probability": prediction.probability,
-            "known": prediction.known,
-            "novelty": None if infinite else prediction.novelty,
-            "seconds": prediction.seconds,
-            "ranking": prediction.ranking,
-        }
-        say_json(answer)
+        say_json(_answer(prediction))
         return
     say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
     for name, probability in prediction.ranking[:5]:
         say(f"  {percent(probability):>8}  {shown(name)}")
+
+
+def _answer(prediction: Prediction) -> dict[str, Any]:
+    return {
+        "material": prediction.material,
+        "probability": prediction.probability,
+        "known": prediction.known,
+        "novelty": finite(prediction.novelty),
+        "seconds": prediction.seconds,
+        "ranking": prediction.ranking,
+    }
+
+
+def answer_row(answered: Answered) -> list[Any]:
+    """The cells that `ANSWER` names."""
+    of = answered.prediction
+    return [answered.touch.source, of.material, of.probability, of.known, finite(of.novelty), of.seconds]
+
+
+def finite(number: float) -> float | None:
+    """The number; None where it is infinite, which neither JSON nor tables have."""
+    return None if math.isinf(number) else number
 
 
 def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:

@@ -58,11 +58,11 @@ def compose(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
-    from scroll_tactile.recordings.arrays import read_stream
+    from scroll_tactile.recordings import read
 
-    readings = read_stream(file)
+    recording = read(file)
     with opened(memory, mode="read") as learner:
-        made_of = learner.compose(readings)
+        made_of = learner.compose(recording.stream(learner.sensor))
     if as_json:
         found = [
             {

@@ -57,7 +57,7 @@ def live(
                 session.begin()
             before: LiveState | None = None
             count = 0
-            for row in _rows(file):
+            for row in _rows(file, timed):
                 count += 1
                 reading, time = (row[1:], float(row[0])) if timed else (row, None)
                 now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
@@ -67,13 +67,17 @@ def live(
         _summed_up(session.report, as_json)
 
 
-def _rows(file: Path) -> Iterator[npt.NDArray[np.float64]]:
+def _rows(file: Path, timed: bool = False) -> Iterator[npt.NDArray[np.float64]]:
+    """Readings, one after the other; timed: with their times before them."""
     import numpy as np
 
-    from scroll_tactile.recordings.arrays import read_stream
+    from scroll_tactile.recordings import read
 
     if str(file) != "-":
-        yield from read_stream(file)
+        recording = read(file)
+        named = timed and recording.report.clock is not None  # a table names its times; elsewhere they come first
+        for time, reading in zip(recording.times, recording.readings, strict=True):
+            yield np.concatenate([[time], reading]) if named else reading
         return
     for number, line in enumerate(sys.stdin, start=1):
         if not line.strip():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +15,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
@@ -23,6 +25,7 @@ from store import NotAStoreError, Store, StoreError
 
 if TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.pipelines.sources import Refused
     from scroll_tactile.sensors import Sensor
 
 __all__ = [
@@ -34,10 +37,15 @@ __all__ = [
     "percent",
     "progress_bar",
     "say",
+    "say_csv",
     "say_json",
+    "say_refused",
     "shown",
     "verdict",
 ]
+
+
+MOST_REFUSED = 20
 
 
 def console(*, error: bool = False) -> Console:
@@ -53,6 +61,21 @@ def say(text: str) -> None:
 def say_json(found: Mapping[str, Any]) -> None:
     """Print JSON in ASCII, whatever the names in it."""
     typer.echo(json.dumps(found).replace("\x7f", "\\u007f"))
+
+
+def say_csv(*cells: object) -> None:
+    """Print a line of CSV; what is None has an empty cell."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow(["" if cell is None else cell for cell in cells])
+    typer.echo(line.getvalue())
+
+
+def say_refused(refused: Sequence[Refused]) -> None:
+    """Print on the standard error what could not be taken, and why; at most 20 lines."""
+    for each in refused[:MOST_REFUSED]:
+        _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(' '.join(each.why.split()))}")
+    if len(refused) > MOST_REFUSED:
+        _warn(f"[yellow]refused:[/] {len(refused) - MOST_REFUSED} more")
 
 
 def shown(text: object) -> str:
@@ -126,7 +149,13 @@ def verdict(prediction: Prediction) -> str:
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     screen = console(error=True)
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("starting", total=None)

@@ -152,6 +152,47 @@ def retract(
 
 
 @memory.command()
+def relabel(
+    folder: MemoryFolder,
+    observation: Annotated[int, typer.Argument(help="Its number, as list gives it.", show_default=False)],
+    material: Annotated[str, typer.Argument(help="What it was a touch of.", show_default=False)],
+) -> None:
+    """Put a wrong name right: retract one observation and learn it under another name, exactly and as one change."""
+    with opened_for_upkeep(folder) as learner:
+        sequence = learner.relabel(observation, material)
+    say(f"observation {observation} was retracted; as {shown(material)} it is observation {sequence}")
+
+
+@memory.command("list")
+def list_observations(
+    folder: MemoryFolder,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each.")] = False,
+) -> None:
+    """List the observations: number, material, time, what became of it (kept, compacted, retracted), and source."""
+    from scroll_tactile.memory.gate import MemoryStore
+    from scroll_tactile.memory.merge import observations
+    from scroll_tactile.pipelines.plain_export import date_of
+
+    with MemoryStore.open(folder, mode="read") as store:
+        found = observations(store)
+    for row in found:
+        if as_json:
+            say_json(
+                {
+                    "sequence": row.sequence,
+                    "material": row.material,
+                    "time": row.time,
+                    "state": row.state,
+                    "source": row.source,
+                    "key": row.key.hex(),
+                }
+            )
+        else:
+            state = "" if row.state == "kept" else f"  [yellow]{row.state}[/]"
+            say(f"{row.sequence:>6}  {date_of(row.time)}  {shown(row.material)}{state}  {shown(row.source or '')}")
+
+
+@memory.command()
 def forget(
     folder: MemoryFolder,
     material: Annotated[str, typer.Argument(help="Its name.", show_default=False)],

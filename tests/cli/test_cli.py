@@ -119,7 +119,7 @@ class TestMemory:
         (tmp_path / "bad.csv").write_text("1,2\n1,two\n")
         assert "row 2, column 2" in refused("predict", memory, tmp_path / "bad.csv")
         np.save(tmp_path / "wide.npy", np.zeros((75, 61)))
-        assert "(T, 60)" in refused("predict", memory, tmp_path / "wide.npy")
+        assert "60 channels" in refused("predict", memory, tmp_path / "wide.npy")
 
 
 class TestDemo:

@@ -16,8 +16,7 @@ from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
-from scroll_tactile.recordings.arrays import read_sensor
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.sensors import Sensor, read_sensor
 
 __all__ = ["schedules"]
 

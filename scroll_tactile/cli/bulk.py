@@ -1,0 +1,256 @@
+"""`scroll-tactile learn` and `evaluate`: the touches of many files and folders in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from scroll_tactile.cli.everyday import ANSWER, Clock, Field, MemoryFolder, Preset, Sources, Topic, answer_row
+from scroll_tactile.cli.terminal import (
+    confusion_text,
+    opened,
+    percent,
+    progress_bar,
+    say,
+    say_csv,
+    say_json,
+    say_refused,
+    shown,
+    verdict,
+)
+from scroll_tactile.errors import InputError
+
+if TYPE_CHECKING:
+    from scroll_tactile.pipelines.learning import Evaluation, Learned
+    from scroll_tactile.pipelines.sources import Refused, SourceOptions
+
+__all__ = ["evaluate", "learn"]
+
+MOST_SHOWN = 20  # mistakes; JSON and CSV have all
+MOST_NAMES = 40  # of a table of confusions
+
+
+class Place(StrEnum):
+    """What names a touch."""
+
+    FILE = "file"
+    FOLDER = "folder"
+    TOPIC = "topic"
+    TASK = "task"
+
+
+class Cut(StrEnum):
+    """How a recording is cut into touches."""
+
+    EPISODES = "episodes"
+    INTERVALS = "intervals"
+    NONE = "none"
+    CONTACT = "contact"
+
+
+Label = Annotated[str | None, typer.Option(help="What all of them are touches of.")]
+LabelBy = Annotated[Place | None, typer.Option(help="What names each touch.")]
+Labels = Annotated[
+    Path | None, typer.Option(help="A .csv of touches, with columns file, begin, end (in seconds) and material.")
+]
+LabelTopic = Annotated[
+    str | None, typer.Option(help="A topic with texts, or a column, that says what is touched from then on.")
+]
+CutBy = Annotated[
+    Cut | None, typer.Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def learn(
+    memory: MemoryFolder,
+    sources: Sources,
+    sensor: Annotated[
+        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
+    ] = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
+
+    Episodes name themselves where a recording says what they are. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.pipelines.learning import learn as learn_sources
+    from scroll_tactile.pipelines.sources import find_sources, has_touches
+    from scroll_tactile.recordings import presets
+    from scroll_tactile.sensors import read_sensor
+
+    found, missing = find_sources(sources)
+    options = _options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
+    chosen = None if sensor is None else read_sensor(sensor)
+    if chosen is None and preset is not None and not memory.exists():
+        chosen = presets.find(preset).sensor
+    with progress_bar() as progress:
+        # What is refused makes no memory.
+        if chosen is None or memory.exists() or has_touches(chosen, found, options):
+            opening: AbstractContextManager[TactileLearner] = opened(memory, sensor=chosen)
+        else:
+            opening = nullcontext(TactileLearner(sensor=chosen))
+        with opening as learner:
+            done = learn_sources(learner, found, options, progress)
+            held = sum(learner.materials.values())
+    done.refused[:0] = missing
+    _report_learned(done, held, as_json)
+    if done.refused:
+        raise typer.Exit(1)
+
+
+def _options(
+    found: Sequence[str],
+    preset: str | None,
+    topic: str | None,
+    field: str | None,
+    clock: str | None,
+    label: str | None,
+    label_by: Place | None,
+    labels: Path | None,
+    label_topic: str | None,
+    cut: Cut | None,
+) -> SourceOptions:
+    from scroll_tactile.pipelines.sources import SourceOptions
+    from scroll_tactile.recordings import read_intervals
+
+    if labels is not None and label_topic is not None:
+        raise InputError("give --labels or --label-topic: both say where touches begin")
+    intervals = None if labels is None else tuple(read_intervals(labels, found))
+    if intervals == ():
+        raise InputError(f"expected touches in {labels}, one row each; there are none")
+    return SourceOptions(
+        topic=topic,
+        field=field,
+        clock=clock,
+        preset=preset,
+        labels=label_topic,
+        cut=None if cut is None else cut.value,
+        material=label,
+        by=None if label_by is None else label_by.value,
+        intervals=intervals,
+    )
+
+
+def _report_learned(done: Learned, held: int, as_json: bool) -> None:
+    count = done.learned.total()
+    if as_json:
+        found = {
+            "files": done.files,
+            "touches": count,
+            "learned": dict(sorted(done.learned.items())),
+            "skipped": done.skipped,
+            "refused": _refusals(done.refused),
+            "observations": held,
+        }
+        say_json(found)
+        return
+    of = f" of {len(done.learned)} materials" if count else ""
+    say(f"[bold]learned:[/] {count} touches{of} from {done.files} files; {held} are in the memory now")
+    for name, touches in sorted(done.learned.items()):
+        say(f"  {touches:>6}  {shown(name)}")
+    if done.skipped:
+        say(f"[bold]skipped:[/] {done.skipped} touches that it had already")
+    say_refused(done.refused)
+
+
+def evaluate(
+    memory: MemoryFolder,
+    sources: Sources,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    as_json: AsJson = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
+) -> None:
+    """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
+
+    The memory stays as it is. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.pipelines.learning import evaluate_sources
+    from scroll_tactile.pipelines.sources import find_sources
+
+    found, missing = find_sources(sources)
+    options = _options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
+    with opened(memory, mode="read") as learner, progress_bar() as progress:
+        done = evaluate_sources(learner, found, options, progress)
+    refused = [*missing, *done.refused]
+    if as_json:
+        say_json(_figures(done) | {"refused": _refusals(refused)})
+    elif as_csv:
+        say_csv(*ANSWER, "material", "right")
+        for each in done.answered:
+            say_csv(*answer_row(each), each.touch.material, each.prediction.material == each.touch.material)
+    else:
+        _report_evaluated(done)
+    if not as_json:
+        say_refused(refused)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _refusals(refused: Sequence[Refused]) -> list[dict[str, str]]:
+    return [{"source": each.source, "why": each.why} for each in refused]
+
+
+def _figures(done: Evaluation) -> dict[str, Any]:
+    familiar, strange = done.familiar, done.strange
+    wrong = [
+        dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": each.touch.material} for each in done.wrong
+    ]
+    return {
+        "touches": len(familiar),
+        "accuracy": done.answers.accuracy if familiar else None,
+        "called_unknown": sum(not each.prediction.known for each in familiar),
+        "calibration_error": done.calibration_error,
+        "confusions": [list(confusion) for confusion in done.answers.confusions()],
+        "never_learned": len(strange),
+        "never_learned_called_unknown": sum(not each.prediction.known for each in strange),
+        "wrong": wrong,
+    }
+
+
+def _report_evaluated(done: Evaluation) -> None:
+    from scroll_tactile.pipelines.metrics import confusion_counts
+
+    found, answers = _figures(done), done.answers
+    say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} materials that it learned")
+    if found["touches"]:
+        say(f"[bold]accuracy:[/] {percent(found['accuracy'])}")
+        say(f"[bold]calibration error:[/] {found['calibration_error']:.3f}")
+        say(f"[bold]called unknown:[/] {found['called_unknown']}")
+    if found["never_learned"]:
+        say(
+            f"[bold]touches of materials that it never learned:[/] {found['never_learned']}, of which it calls "
+            f"{found['never_learned_called_unknown']} unknown"
+        )
+    names = sorted({*answers.truth, *(name for name in answers.predicted if name)})
+    if answers.confusions() and len(names) <= MOST_NAMES:
+        tested = [answers.truth.count(name) for name in names]
+        say(escape(confusion_text(names, confusion_counts(names, tested, answers.confusions()))))
+    for each in done.wrong[:MOST_SHOWN]:
+        say(f"  {shown(each.touch.source)}, {shown(each.touch.material)}: {verdict(each.prediction)}")
+    if len(done.wrong) > MOST_SHOWN:
+        say(f"  … and {len(done.wrong) - MOST_SHOWN} more, which --json lists")

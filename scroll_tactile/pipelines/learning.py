@@ -1,0 +1,179 @@
+"""Many sources, one memory: the touches in files and folders are learned, or answered; what cannot be is listed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from scroll_tactile.errors import InputError, printable
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.classification import Answers
+from scroll_tactile.pipelines.metrics import calibration_error
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
+from scroll_tactile.results import Prediction
+
+__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn"]
+
+BATCH_TOUCHES = 64  # become durable together: what a kill can cost …
+BATCH_BYTES = 1 << 25  # … unless their readings would be more than this
+
+Progress = Callable[[str, int, int], object]
+
+
+@dataclass
+class Learned:
+    """What a pass over sources did.
+
+    files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
+    name, by the hash of their content. refused: what was not learned.
+    """
+
+    files: int = 0
+    learned: Counter[str] = field(default_factory=Counter)
+    skipped: int = 0
+    refused: list[Refused] = field(default_factory=list)
+
+
+def learn(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    progress: Progress = lambda what, done, of: None,
+) -> Learned:
+    """Observe the touches in sources, each once: a pass that was cut short is gone on with by the same call.
+
+    At most 64 touches become durable together, so that a kill loses those. A touch that the memory has under another
+    name is refused. progress: called with (what is being done, files done, files in all).
+
+    Raises StoreError and CapacityError; what was learned until then is kept.
+    """
+    done, batch = Learned(), _Batch(learner)
+    standing = [row for row in learner.observations() if row.state != "retracted"]
+    names = {row.key: row.material for row in standing}
+    known = {(row.key, row.material) for row in standing}
+    for number, address in enumerate(sources):
+        progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
+        for touch in source_touches(learner, address, options):
+            if isinstance(touch, Refused):
+                done.refused.append(touch)
+                continue
+            key, material = touch.stream.key, str(touch.material)
+            if (key, material) in known:
+                done.skipped += 1
+            elif (name := names.setdefault(key, material)) != material:
+                why = f"the memory has this touch already, as {name!r} and not as {material!r}: relabel one of them"
+                done.refused.append(Refused(touch.source, why))
+            else:
+                known.add((key, material))
+                batch.add(touch, done)
+        done.files += 1
+    batch.observe(done)
+    progress(f"{done.learned.total()} touches", len(sources), len(sources))
+    return done
+
+
+class _Batch:
+    """Touches that are about to become durable together."""
+
+    def __init__(self, learner: TactileLearner) -> None:
+        self._learner = learner
+        self._touches: list[SourceTouch] = []
+        self._bytes = 0
+
+    def add(self, touch: SourceTouch, done: Learned) -> None:
+        self._touches.append(touch)
+        self._bytes += touch.stream.readings.nbytes
+        if len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
+            self.observe(done)
+
+    def observe(self, done: Learned) -> None:
+        touches, self._touches, self._bytes = self._touches, [], 0
+        with self._learner.batch():
+            for touch in touches:
+                try:
+                    self._learner.observe(str(touch.material), touch.stream, source=touch.source)
+                    done.learned[str(touch.material)] += 1
+                except InputError as error:  # one that is too long
+                    done.refused.append(Refused(touch.source, str(error)))
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A touch out of a source, and what it feels like."""
+
+    touch: SourceTouch
+    prediction: Prediction
+
+
+def answers(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    *,
+    scene: Sequence[str] | None = None,
+    named: bool = False,
+    progress: Progress = lambda what, done, of: None,
+) -> Iterator[Answered | Refused]:
+    """What each touch in sources feels like; the memory stays as it is. named: as of `source_touches`."""
+    for number, address in enumerate(sources):
+        progress(printable(Path(address).name), number, len(sources))
+        for touch in source_touches(learner, address, options, named=named):
+            yield touch if isinstance(touch, Refused) else Answered(touch, learner.predict(touch.stream, scene=scene))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Answers to touches whose material is known.
+
+    answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory.
+    """
+
+    answered: tuple[Answered, ...]
+    refused: tuple[Refused, ...]
+    learned: frozenset[str]
+
+    @property
+    def familiar(self) -> list[Answered]:
+        """Touches of materials that the memory has: accuracy, confusions and calibration are theirs."""
+        return [each for each in self.answered if each.touch.material in self.learned]
+
+    @property
+    def strange(self) -> list[Answered]:
+        """Touches of materials that it never learned, which it should call unknown."""
+        return [each for each in self.answered if each.touch.material not in self.learned]
+
+    @property
+    def answers(self) -> Answers:
+        """Of the familiar ones."""
+        return Answers(
+            [str(each.touch.material) for each in self.familiar], [each.prediction for each in self.familiar]
+        )
+
+    @property
+    def wrong(self) -> list[Answered]:
+        """Touches taken for another material: the familiar ones, and strange ones that it called known."""
+        mistaken = (each for each in self.answered if each.prediction.material != each.touch.material)
+        return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known]
+
+    @property
+    def calibration_error(self) -> float | None:
+        """Expected calibration error of the familiar ones, see `metrics`; None without any."""
+        familiar, truth = self.familiar, self.answers
+        right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
+        return calibration_error([each.prediction.probability for each in familiar], right) if familiar else None
+
+
+def evaluate_sources(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    progress: Progress = lambda what, done, of: None,
+) -> Evaluation:
+    """Answer every touch in sources with what the memory knows, settled, and keep what it should have said."""
+    learner.settle()
+    found = list(answers(learner, sources, options, named=True, progress=progress))
+    answered = tuple(each for each in found if isinstance(each, Answered))
+    refused = tuple(each for each in found if isinstance(each, Refused))
+    return Evaluation(answered, refused, frozenset(learner.materials))

@@ -1,0 +1,150 @@
+"""Files and folders as touches with names: what is read of each source, how it is cut, and what cannot be taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from scroll_tactile.errors import InputError, RecordingError, SensorMismatchError, printable
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
+from scroll_tactile.recordings.locations import is_remote
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.settings import LONGEST_SOURCE, require_name
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["Cut", "Refused", "SourceOptions", "SourceTouch", "find_sources", "has_touches", "source_touches"]
+
+Cut = Literal["episodes", "intervals", "none", "contact"]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How sources are read, cut into touches, and named.
+
+    topic, field, clock, preset, labels: as of `recordings.read`. cut: None cuts by the intervals where there are some,
+    by episodes where a recording has some, and not otherwise.
+    material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
+    At most one of the three names them; without any, episodes name themselves.
+
+    Raises InputError for what does not fit together, MaterialError for a material that is none.
+    """
+
+    topic: str | None = None
+    field: str | None = None
+    clock: str | None = None
+    preset: str | None = None
+    labels: str | None = None
+    cut: Cut | None = None
+    material: str | None = None
+    by: Literal["topic", "file", "folder", "task"] | None = None
+    intervals: Sequence[Interval] | None = None
+
+    def __post_init__(self) -> None:
+        if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
+            raise InputError("touches can be named in one way: by one material, by a place, or by a table of intervals")
+        if self.material is not None:
+            require_name(self.material)
+        if self.preset is not None:
+            presets.find(self.preset)
+        if self.cut == "intervals" and self.intervals is None:
+            raise InputError("to cut by intervals takes a table of them, with columns file, begin, end and material")
+        if self.intervals is not None and self.cut not in (None, "intervals"):
+            raise InputError(f"a table of intervals cuts by them; came cut {self.cut!r} beside it")
+
+    def touches_in(self, address: str, sensor: Sensor) -> tuple[Recording, tuple[Touch, ...]]:
+        """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
+        recording = read(
+            address, topic=self.topic, field=self.field, clock=self.clock, preset=self.preset, labels=self.labels
+        )
+        if self.intervals is not None:
+            return recording, touches(recording, self.intervals)
+        if self.cut == "contact":
+            return recording, touches(recording, partial(contact_spans, sensor), self.by)
+        whole = self.cut == "none" or (self.cut is None and not recording.episodes)
+        return recording, touches(recording, "whole" if whole else "episodes", self.by)
+
+
+def contact_spans(sensor: Sensor, recording: Recording) -> Iterable[tuple[int, int]]:
+    """Begin and end of each touch of this sensor in a recording; raises InputError until `live` finds them."""
+    raise InputError("this version does not cut by contact yet: cut by episodes or intervals, or not")
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A source, or a touch in one, that could not be taken, and why."""
+
+    source: str
+    why: str
+
+
+@dataclass(frozen=True)
+class SourceTouch:
+    """A touch out of a source: where it comes from, what names it (None where nothing does), and its stream."""
+
+    source: str
+    material: str | None
+    stream: Stream
+
+
+def find_sources(paths: Sequence[str]) -> tuple[list[str], list[Refused]]:
+    """The recordings in files, folders and addresses, each once and in order; and the paths where there are none."""
+    found: dict[object, str] = {}
+    refused = []
+    for path in paths:
+        if is_remote(path):
+            found.setdefault(path, path)
+            continue
+        try:
+            inside = find(path)
+            if not inside:
+                what = "there is none in this folder" if Path(path).is_dir() else "a file of this kind is none"
+                raise RecordingError(f"expected recordings: {what}")
+            for recording in inside:
+                found.setdefault(recording.resolve(), str(recording))
+        except (InputError, OSError) as error:
+            refused.append(Refused(path, str(error)))
+    return list(found.values()), refused
+
+
+def source_touches(
+    learner: TactileLearner, address: str, options: SourceOptions, *, named: bool = True
+) -> Iterator[SourceTouch | Refused]:
+    """The touches in a source, sound for this learner; what is not is refused.
+
+    named: whether a touch that nothing names is refused.
+    """
+    try:
+        recording, found = options.touches_in(address, learner.sensor)
+    except (InputError, OSError) as error:
+        yield Refused(address, str(error))
+        return
+    for touch in found:
+        source = _source(recording, touch, options)
+        try:
+            material = options.material if options.material is not None else touch.material
+            if named and material is None:
+                raise InputError("nothing names it: say what was touched")
+            part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
+            stream = learner.stream(part.stream(learner.sensor))
+            yield SourceTouch(source, material if material is None else require_name(material), stream)
+        except (InputError, SensorMismatchError) as error:
+            yield Refused(source, str(error))
+
+
+def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
+    """The path as it was given, the readings where they are not all, topic and field where there are several."""
+    whole = (touch.begin, touch.end) == (0, len(recording))
+    where = recording.source + ("" if whole else f"[{touch.begin}:{touch.end}]")
+    within = [recording.topic, recording.field] if recording.topic is not None else [options.field]
+    text = printable(" ".join([where, *(part for part in within if part)]))
+    return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"
+
+
+def has_touches(sensor: Sensor, sources: Iterable[str], options: SourceOptions) -> bool:
+    """Whether there is anything to learn for a new memory of this sensor."""
+    learner = TactileLearner(sensor=sensor)
+    return any(isinstance(each, SourceTouch) for path in sources for each in source_touches(learner, path, options))

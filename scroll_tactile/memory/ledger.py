@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy.typing as npt
 
-from scroll_tactile.errors import FineTuneError, InputError, StreamError
+from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.changes import apply_appended, relabel
 from scroll_tactile.memory.descriptions import Description
@@ -20,7 +20,6 @@ from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
 from scroll_tactile.memory.rows import (
     DESCRIBE,
-    MOST_BYTES,
     OBSERVE,
     RETRACT,
     SOURCE,
@@ -28,6 +27,7 @@ from scroll_tactile.memory.rows import (
     Codes,
     pack_codes,
     pack_readings,
+    require_row,
     spans,
 )
 from scroll_tactile.memory.state import Memory, give_back_scratch
@@ -145,11 +145,7 @@ class Ledger:
 
     def observe(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None = None) -> Receipt:
         """Append an observation to the journal, then add it to the memory."""
-        if stream.readings.nbytes > MOST_BYTES:
-            raise StreamError(
-                f"expected a touch of at most {MOST_BYTES // (4 * stream.sensor.channels)} readings of sensor "
-                f"{stream.sensor.name!r}, 256 MiB; came {len(stream)}. Cut it into touches"
-            )
+        require_row(stream)
         with self.lock:
             self.require_open()
             # Before the journal has it: every row there must fit at the next opening.

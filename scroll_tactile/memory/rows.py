@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import MismatchError
+from scroll_tactile.errors import MismatchError, StreamError
+from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import EARLIER, Scale, WindowPlan
 from scroll_tactile.statistics.sample import stage_rows
 
@@ -29,6 +30,7 @@ __all__ = [
     "only_readings",
     "pack_codes",
     "pack_readings",
+    "require_row",
     "row_codes",
     "spans",
     "unpack_codes",
@@ -59,6 +61,15 @@ CODES = "stages-"  # and a scale
 WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
 SHAPE, ZERO, REST = "readings-shape", "readings-zero", "readings-rest"
 MANTISSA, LARGEST = 24, 128  # bits of a float32's mantissa, and its largest exponent
+
+
+def require_row(stream: Stream) -> None:
+    """Raise StreamError for a touch that is too long for a row of the journal."""
+    if stream.readings.nbytes > MOST_BYTES:
+        raise StreamError(
+            f"expected a touch of at most {MOST_BYTES // (4 * stream.sensor.channels)} readings of sensor "
+            f"{stream.sensor.name!r}, 256 MiB; came {len(stream)}. Cut it into touches"
+        )
 
 
 def pack_readings(readings: Readings) -> dict[str, npt.NDArray[Any]]:

@@ -1,0 +1,222 @@
+"""Commands over many files, and over the observations of a memory, as they are typed."""
+
+import csv
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from scroll_tactile import Kernels, TactileLearner, sensors
+from scroll_tactile.datasets.simulator import Scene
+
+SCENE = Scene(sensors.ROBOSKIN)
+NAMES = ("silk", "wool")
+
+
+def touch(folder: Path, name: str, i: int) -> Path:
+    (folder / name).mkdir(parents=True, exist_ok=True)
+    np.save(folder / name / f"{i}.npy", SCENE.touch(name, i).readings)
+    return folder / name / f"{i}.npy"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("touches")
+    for name in NAMES:
+        for i in range(3):
+            touch(folder, name, i)
+    return folder
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Path:
+    TactileLearner.open(tmp_path / "m", sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64)).close()
+    return tmp_path / "m"
+
+
+@pytest.fixture
+def learned(memory: Path, data: Path) -> Path:
+    assert run("learn", memory, data, "--label-by", "folder").exit_code == 0
+    return memory
+
+
+class TestLearn:
+    def test_a_new_memory_from_folders(self, tmp_path: Path, data: Path) -> None:
+        result = run("learn", tmp_path / "new", data, "--sensor", "roboskin", "--label-by", "folder")
+        assert result.exit_code == 0, result.output
+        assert "learned: 6 touches of 2 materials from 6 files; 6 are in the memory now" in result.stdout
+        found = json.loads(run("learn", tmp_path / "new", data, "--label-by", "folder", "--json").stdout)
+        expected = {"files": 6, "touches": 0, "learned": {}, "skipped": 6, "refused": [], "observations": 6}
+        assert found == expected
+        assert "skipped: 6 touches" in run("learn", tmp_path / "new", data, "--label-by", "folder").stdout
+
+    def test_some_refused_is_exit_code_1_and_the_rest_is_learned(
+        self, memory: Path, data: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
+        words = (memory, data / "silk", tmp_path / "bad.npy", tmp_path / "none.npy", "--label", "silk")
+        result = run("learn", *words)
+        assert result.exit_code == 1
+        assert "learned: 3 touches of 1 materials from 4 files" in result.stdout
+        lines = [line for line in result.stderr.splitlines() if line.startswith("refused:")]
+        assert len(lines) == 2 and "bad.npy" in lines[1] and "it is not there" in lines[0]
+        found = json.loads(run("learn", *words, "--json").stdout)
+        assert [Path(each["source"]).name for each in found["refused"]] == ["none.npy", "bad.npy"]
+
+    def test_what_is_refused_makes_no_memory(self, tmp_path: Path, data: Path) -> None:
+        new = tmp_path / "new"
+        assert "--sensor" in refused("learn", new, data, "--label", "silk")
+        for words in ((data, "--sensor", "biotac", "--label", "a"), (data, "--sensor", "roboskin")):
+            result = run("learn", new, *words)
+            assert result.exit_code == 1 and "learned: 0 touches from 6 files" in result.stdout
+            assert result.stderr.count("refused:") == 6
+        assert not new.exists()
+
+    def test_labels_in_a_table(self, memory: Path, data: Path, tmp_path: Path) -> None:
+        rows = SCENE.touch("silk", 0).readings
+        table = np.hstack([np.arange(len(rows))[:, None] / 50, rows])
+        np.savetxt(
+            tmp_path / "t.csv", table, delimiter=",", header=",".join(["time", *map(str, range(60))]), comments=""
+        )
+        (tmp_path / "labels.csv").write_text("file,begin,end,material\nt.csv,0,0.5,silk\nt.csv,0.5,1,wool\n")
+        result = run("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "labels.csv")
+        assert result.exit_code == 0, result.output
+        assert "2 touches of 2 materials from 1 files" in result.stdout
+        listed = [json.loads(line) for line in run("memory", "list", memory, "--json").stdout.splitlines()]
+        assert [row["source"].partition("t.csv")[2] for row in listed] == ["[0:25]", "[25:50]"]
+        for text, said in (
+            ("file,begin,end,material\nother.csv,0,1,silk\n", "none of the recordings"),
+            ("file,begin,end,material\nt.csv,0,1,\n", "expected a file and a material"),
+            ("file,begin,end\n", "no column 'material'"),
+            ("file,begin,end,material\n", "there are none"),
+        ):
+            (tmp_path / "wrong.csv").write_text(text)
+            assert said in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "wrong.csv")
+        assert "cannot be read" in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "no.csv")
+
+    def test_options_that_do_not_fit_are_one_line(self, memory: Path, data: Path) -> None:
+        assert "in one way" in refused("learn", memory, data, "--label", "a", "--label-by", "file")
+        assert "1 to 200" in refused("learn", memory, data, "--label", "")
+        assert "takes a table" in refused("learn", memory, data, "--cut", "intervals")
+        assert "expected a preset" in refused("learn", memory, data, "--preset", "nose", "--label", "a")
+        assert "biotac" in refused("learn", memory, data, "--sensor", "biotac", "--label", "a")
+        assert run("learn", memory, data, "--cut", "thin").exit_code == 2
+        with TactileLearner.open(memory):
+            assert "is being written by process" in refused("learn", memory, data, "--label", "a")
+
+    def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
+        for i in range(400):
+            touch(tmp_path / "many", "silk", i)
+        words = [sys.executable, "-m", "scroll_tactile.cli", "learn", memory, tmp_path / "many", "--label", "silk"]
+        process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        try:
+            until = time.monotonic() + 100
+            while not _observed(memory) and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.01)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=100)
+        finally:
+            process.kill()
+        assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
+        before = _observed(memory)
+        assert 0 < before < 400
+        found = json.loads(run("learn", memory, tmp_path / "many", "--label", "silk", "--json").stdout)
+        assert (found["touches"], found["skipped"], found["observations"]) == (400 - before, before, 400)
+
+
+def _observed(memory: Path) -> int:
+    with TactileLearner.open(memory, mode="read") as learner:
+        return sum(learner.materials.values())
+
+
+class TestPredict:
+    def test_many_have_a_line_each(self, learned: Path, data: Path, tmp_path: Path) -> None:
+        result = run("predict", learned, data / "silk", data / "wool" / "1.npy", tmp_path / "none.npy")
+        assert result.exit_code == 1
+        assert [line.split(": ")[0] for line in result.stdout.splitlines()] == [
+            *(str(data / "silk" / f"{i}.npy") for i in range(3)),
+            str(data / "wool" / "1.npy"),
+        ]
+        assert "refused:" in result.stderr and "none.npy" in result.stderr
+        answers = [json.loads(line) for line in run("predict", learned, data, "--json").stdout.splitlines()]
+        assert [answer["material"] for answer in answers] == ["silk"] * 3 + ["wool"] * 3
+        alone = json.loads(run("predict", learned, data / "silk" / "0.npy", "--json").stdout)
+        assert answers[0] == {"source": str(data / "silk" / "0.npy")} | alone
+        rows = list(csv.DictReader(io.StringIO(run("predict", learned, data, "--csv").stdout)))
+        assert [(row["answer"], float(row["probability"])) for row in rows] == [
+            (answer["material"], answer["probability"]) for answer in answers
+        ]
+
+    def test_csv_of_an_empty_memory_has_empty_cells(self, memory: Path, data: Path) -> None:
+        (row,) = csv.DictReader(io.StringIO(run("predict", memory, data / "silk" / "0.npy", "--csv").stdout))
+        assert (row["answer"], row["known"], row["novelty"]) == ("", "False", "")
+
+    def test_a_table_with_numbers_for_a_header_is_read_as_pandas_meant_it(self, learned: Path, tmp_path: Path) -> None:
+        readings = SCENE.touch("wool", 7).readings
+        np.save(tmp_path / "t.npy", readings)
+        header = ",".join(map(str, range(60)))
+        np.savetxt(tmp_path / "t.csv", readings, delimiter=",", header=header, comments="", fmt="%.9g")
+        from_table = json.loads(run("predict", learned, tmp_path / "t.csv", "--json").stdout)
+        assert from_table == json.loads(run("predict", learned, tmp_path / "t.npy", "--json").stdout)
+        assert run("observe", learned, "wool", tmp_path / "t.csv").exit_code == 0
+        found = json.loads(run("learn", learned, tmp_path / "t.npy", "--label", "wool", "--json").stdout)
+        assert (found["touches"], found["skipped"]) == (0, 1)
+
+
+class TestEvaluate:
+    def test_it_shows_what_it_got_wrong(self, learned: Path, data: Path, tmp_path: Path) -> None:
+        touch(tmp_path / "more", "wool", 5)
+        (tmp_path / "more" / "wool").rename(tmp_path / "more" / "silk")
+        touch(tmp_path / "more", "denim", 0)
+        words = ("evaluate", learned, data, tmp_path / "more", "--label-by", "folder")
+        found = json.loads(run(*words, "--json").stdout)
+        assert (found["touches"], found["never_learned"], found["accuracy"]) == (7, 1, 6 / 7)
+        assert found["confusions"] == [["silk", "wool", 1]]
+        (wrong,) = (row for row in found["wrong"] if row["material"] == "silk")
+        assert (Path(wrong["source"]).name, wrong["answer"]) == ("5.npy", "wool")
+        text = run(*words).stdout
+        for said in ("accuracy: 85.7 %", "calibration error:", "called unknown:", "never learned: 1", "5.npy, silk:"):
+            assert said in text, text
+        rows = list(csv.DictReader(io.StringIO(run(*words, "--csv").stdout)))
+        assert len(rows) == 8
+        assert [row["right"] for row in rows if row["material"] == "silk"] == ["True"] * 3 + ["False"]
+
+    def test_what_is_refused_is_exit_code_1(self, learned: Path, data: Path, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        result = run("evaluate", learned, data / "silk", tmp_path / "empty", "--label", "silk")
+        assert result.exit_code == 1
+        assert "accuracy: 100.0 %" in result.stdout and "there is none in this folder" in result.stderr
+        assert "nothing names it" in run("evaluate", learned, data / "silk").stderr
+
+
+class TestList:
+    def test_relabelling_is_listed(self, learned: Path) -> None:
+        assert "as wool it is observation 8" in run("memory", "relabel", learned, "1", "wool").stdout
+        lines = run("memory", "list", learned).stdout.splitlines()
+        assert len(lines) == 7
+        assert "silk  retracted" in lines[0] and lines[0].endswith("silk/0.npy")
+        assert "  wool  " in lines[-1] and lines[-1].endswith("silk/0.npy")
+        assert json.loads(run("inspect", learned, "--json").stdout)["materials"] == {"silk": 2, "wool": 4}
+        assert "was retracted already" in refused("memory", "relabel", learned, "1", "wool")
+        assert "is called 'wool' already" in refused("memory", "relabel", learned, "8", "wool")
+        assert "1 to 200" in refused("memory", "relabel", learned, "8", "")
+        assert run("memory", "compact", learned, "--yes").exit_code == 0
+        assert "were compacted" in refused("memory", "relabel", learned, "8", "silk")
+        states = [json.loads(line)["state"] for line in run("memory", "list", learned, "--json").stdout.splitlines()]
+        assert states == ["retracted", *["compacted"] * 6]
+
+    def test_observe_keeps_the_name_of_its_file(self, memory: Path, data: Path) -> None:
+        run("observe", memory, "silk", data / "silk" / "0.npy")
+        row = json.loads(run("memory", "list", memory, "--json").stdout)
+        assert (row["sequence"], row["material"], row["state"]) == (1, "silk", "kept")
+        assert row["source"] == str(data / "silk" / "0.npy")
+
+    def test_an_empty_memory_lists_nothing(self, memory: Path) -> None:
+        assert run("memory", "list", memory).stdout == ""

@@ -37,6 +37,13 @@ def test_a_recording_is_replayed_with_its_touches(memory):
     assert result.output.count("touched for") == len(SHIFT.touches)
 
 
+def test_times_in_a_table_are_those_of_its_column(memory):
+    table, header = np.column_stack([SHIFT.readings, SHIFT.times]), ",".join([*map(str, range(60)), "time"])
+    np.savetxt(memory / "timed.csv", table, delimiter=",", header=header, comments="", fmt="%.17g")
+    expected = run("live", memory / "memory", memory / "timed.npy", "--timed", "--json").stdout
+    assert run("live", memory / "memory", memory / "timed.csv", "--timed", "--json").stdout == expected
+
+
 def test_each_thing_that_happens_is_a_line_of_json(memory):
     result = run("live", memory / "memory", memory / "timed.npy", "--timed", "--json")
     lines = [json.loads(line) for line in result.stdout.splitlines()]

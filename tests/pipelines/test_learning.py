@@ -6,6 +6,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from live.live_touches import GEL, frames, gel_learner, shift
+from live.live_touches import learner as live_learner
 from recordings.bags import START, biotac, typestore, write
 from touches import PAD, SETTINGS, fed, filled, require_same, stream
 
@@ -14,7 +16,7 @@ from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import InputError, MaterialError
 from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.learning import evaluate_sources, learn
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, contact_spans, find_sources, source_touches
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
 from scroll_tactile.recordings import Interval
 from scroll_tactile.results import Prediction
 from store import LockedError
@@ -86,11 +88,43 @@ class TestSources:
         with pytest.raises(error, match=match):
             SourceOptions(**options)
 
-    def test_cutting_by_contact_is_refused_until_it_can_be(self, data, learner):
-        with pytest.raises(InputError, match="does not cut by contact yet"):
-            contact_spans(PAD, None)
-        (refused,) = source_touches(learner, str(data / "a" / "0.npy"), SourceOptions(by="file", cut="contact"))
-        assert isinstance(refused, Refused) and "contact" in refused.why
+    def test_contacts_are_where_a_live_session_finds_them(self, tmp_path):
+        rows, places = shift("abc")
+        np.save(tmp_path / "t.npy", rows)
+        made = live_learner()
+        found = list(source_touches(made, str(tmp_path / "t.npy"), SourceOptions(cut="contact", material="a")))
+        with made.live() as session:
+            ended = session.push(rows).touches
+        assert [touch.stream for touch in found] == [touch.stream for touch in ended]
+        spans = [each.source.rpartition("npy")[2].strip("[]").split(":") for each in found]
+        assert np.abs(np.array(spans, int) - places).max() <= 3
+
+    def test_a_gap_in_time_ends_a_contact(self, tmp_path):
+        rows, places = shift("ab")
+        middle = sum(places[0]) // 2
+        times = np.arange(len(rows)) / PAD.rate + 10.0 * (np.arange(len(rows)) >= middle)
+        table = np.column_stack([times, rows])
+        np.savetxt(tmp_path / "t.csv", table, delimiter=",", header="time,x,y", comments="", fmt="%.17g")
+        made = live_learner()
+        options = SourceOptions(cut="contact", material="a")
+        first, *others = source_touches(made, str(tmp_path / "t.csv"), options)
+        assert first.source.endswith(f":{middle}]") and len(others) == 2
+
+    def test_no_contact_and_another_sensor_are_refused(self, tmp_path):
+        np.save(tmp_path / "rest.npy", shift("a")[0][:110])
+        np.save(tmp_path / "other.npy", np.zeros((200, 5)))
+        for name, why in (("rest", "no contact was found"), ("other", "another sensor's recording")):
+            (refused,) = source_touches(live_learner(), str(tmp_path / f"{name}.npy"), SourceOptions(cut="contact"))
+            assert isinstance(refused, Refused) and why in refused.why
+
+    def test_frames_of_a_camera_begin_with_the_one_at_rest(self, tmp_path):
+        np.save(tmp_path / "gel.npy", frames(GEL.materials[0], 7, 5))
+        made = gel_learner()
+        options = SourceOptions(cut="contact", material="a")
+        (touch,) = source_touches(made, str(tmp_path / "gel.npy"), options)
+        with made.live() as session:
+            (ended,) = session.push(np.load(tmp_path / "gel.npy")).touches
+        np.testing.assert_array_equal(touch.stream.readings, ended.stream.readings)
 
     def test_names_with_anything_in_them_are_kept_printable_and_bounded(self, tmp_path, learner):
         odd = put(tmp_path / ("fé[b]\x1b\n" + "x" * 200) / "=1+1 .npy", (0, 60))

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import monotonic
 
 from scroll_tactile.errors import InputError, printable
 from scroll_tactile.learner import TactileLearner
@@ -16,8 +17,9 @@ from scroll_tactile.results import Prediction
 
 __all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn"]
 
-BATCH_TOUCHES = 64  # become durable together: what a kill can cost …
-BATCH_BYTES = 1 << 25  # … unless their readings would be more than this
+BATCH_TOUCHES = 256  # become durable together: what a kill can cost …
+BATCH_BYTES = 1 << 25  # … unless their readings would be more than this, or the first was read so long ago:
+BATCH_SECONDS = 5.0
 
 Progress = Callable[[str, int, int], object]
 
@@ -44,8 +46,8 @@ def learn(
 ) -> Learned:
     """Observe the touches in sources, each once: a pass that was cut short is gone on with by the same call.
 
-    At most 64 touches become durable together, so that a kill loses those. A touch that the memory has under another
-    name is refused. progress: called with (what is being done, files done, files in all).
+    At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
+    has under another name is refused. progress: called with (what is being done, files done, files in all).
 
     Raises StoreError and CapacityError; what was learned until then is kept.
     """
@@ -81,11 +83,15 @@ class _Batch:
         self._learner = learner
         self._touches: list[SourceTouch] = []
         self._bytes = 0
+        self._since = 0.0
 
     def add(self, touch: SourceTouch, done: Learned) -> None:
+        if not self._touches:
+            self._since = monotonic()
         self._touches.append(touch)
         self._bytes += touch.stream.readings.nbytes
-        if len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
+        late = monotonic() - self._since >= BATCH_SECONDS
+        if late or len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
             self.observe(done)
 
     def observe(self, done: Learned) -> None:

@@ -60,6 +60,7 @@ HISTORY: tuple[tuple[str, Operation, int], ...] = (
     ("observe, and a generation", ("observe", "b", (5, 60)), 1),
     ("batch", ("batch", (OBSERVE, ("observe", "a", (2, 40)), ("retract", 3), ("forget", "ü"))), NEVER),
     ("retract", ("retract", 2), NEVER),
+    ("relabel", ("relabel", 5, "ü"), NEVER),
     ("forget", ("forget", "c"), NEVER),
     ("describe", ("describe", "b", (("silk", 0.25), ("wool", 0.75))), NEVER),
     ("merge", ("merge", "taken", "twice", "theirs"), NEVER),

@@ -1,10 +1,10 @@
 """What a memory must hold: a list of touches that cannot go wrong, and the operations that change it.
 
 An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
-("forget", material), ("describe", material, constituents or None), ("merge", name, shared), ("compact", keep),
-("fine_tune",), ("backup",). `after` says what it makes of a `State` and what the call returns, `perform` does it to a
-learner, and `expected` is what can be seen of a learner in that state: made anew, in memory, from the touches in
-another order.
+("forget", material), ("relabel", sequence, material), ("describe", material, constituents or None),
+("merge", name, shared), ("compact", keep), ("fine_tune",), ("backup",). `after` says what it makes of a `State` and
+what the call returns, `perform` does it to a learner, and `expected` is what can be seen of a learner in that state:
+made anew, in memory, from the touches in another order.
 """
 
 from __future__ import annotations
@@ -177,6 +177,16 @@ def _forget(state: State, _: Any, material: str) -> tuple[State, Any]:
     return state.without({one.sequence for one in found}).with_said(material, None), len(found)
 
 
+def _relabel(state: State, _: Any, sequence: int, material: str) -> tuple[State, Any]:
+    found = {one.sequence: one for one in state.loose}
+    if sequence not in found:
+        return state, "ObservationError"
+    if found[sequence].material == material:
+        return state, "InputError"
+    then = state.without({sequence}).with_one(material, found[sequence].touch)
+    return then, then.last
+
+
 def _describe(state: State, _: Any, material: str, constituents: Constituents | None) -> tuple[State, Any]:
     changed = repr(dict(state.said).get(material)) != repr(constituents)
     return replace(state.with_said(material, constituents), last=state.last + changed), None
@@ -228,6 +238,7 @@ _AFTER = {
     "batch": _batch,
     "retract": _retract,
     "forget": _forget,
+    "relabel": _relabel,
     "describe": _describe,
     "merge": _merge,
     "compact": _compact,
@@ -269,6 +280,7 @@ _CALLS = {
     "batch": _do_batch,
     "retract": lambda learner, _, sequence: learner.retract(sequence),
     "forget": lambda learner, _, material: learner.forget(material),
+    "relabel": lambda learner, _, sequence, material: learner.relabel(sequence, material),
     "describe": lambda learner, _, material, said: learner.describe(material, said and dict(said)),
     "merge": _do_merge,
     "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,

@@ -9,7 +9,7 @@ from touches import stream
 
 from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
 
-KINDS = ("observe", "batch", "retract", "forget", "describe", "merge", "compact", "fine_tune", "backup")
+KINDS = ("observe", "batch", "retract", "forget", "relabel", "describe", "merge", "compact", "fine_tune", "backup")
 
 # Few touches, so that the same stream is observed again, by this memory and by those merged into it.
 SEEDS = 6
@@ -51,8 +51,9 @@ def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) 
         return kind, _together(rng, state, others)
     if kind == "describe":
         return kind, rng.choice(MATERIALS), rng.choice(SAID)
-    if kind in ("retract", "forget"):
-        return kind, _to_retract(rng, state, kind)
+    if kind in ("retract", "forget", "relabel"):
+        name = (rng.choice(MATERIALS),) if kind == "relabel" else ()
+        return kind, _to_retract(rng, state, kind), *name
     if kind == "merge":
         return kind, rng.choice(sorted(others)), rng.choice(("twice", "once")), rng.choice(("same", "ours", "theirs"))
     return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)

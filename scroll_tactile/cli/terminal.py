@@ -71,9 +71,14 @@ def say_csv(*cells: object) -> None:
 
 
 def say_refused(refused: Sequence[Refused]) -> None:
-    """Print on the standard error what could not be taken, and why; at most 20 lines."""
+    """Print on the standard error what could not be taken, and why; at most 20, and one list of what a file has."""
+    listed = False
     for each in refused[:MOST_REFUSED]:
-        _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(' '.join(each.why.split()))}")
+        first, *others = each.why.splitlines() or [""]
+        _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(first)}")
+        for line in [] if listed else others:
+            _warn(f"  {shown(line)}")
+        listed = listed or bool(others)
     if len(refused) > MOST_REFUSED:
         _warn(f"[yellow]refused:[/] {len(refused) - MOST_REFUSED} more")
 

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from commands import refused, run
@@ -69,6 +70,19 @@ class TestLearn:
         assert len(lines) == 2 and "bad.npy" in lines[1] and "it is not there" in lines[0]
         found = json.loads(run("learn", *words, "--json").stdout)
         assert [Path(each["source"]).name for each in found["refused"]] == ["none.npy", "bad.npy"]
+
+    def test_what_a_recording_has_is_listed_once(self, memory: Path, tmp_path: Path) -> None:
+        for name in ("a", "b"):
+            with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+                for key in ("tip", "pad"):
+                    file[f"data/demo_0/obs/{key}"] = SCENE.touch("silk", 0).readings
+        errors = run("learn", memory, tmp_path / "a.h5", tmp_path / "b.h5", "--label", "silk").stderr
+        assert errors.count("refused:") == 2 and errors.count("expected a field to read") == 2
+        assert errors.count("tip  [60]") == 1
+        words = (memory, tmp_path / "a.h5", "--field", "pad", "--label", "silk")
+        assert run("learn", *words).exit_code == 0
+        listed = json.loads(run("memory", "list", memory, "--json").stdout)
+        assert listed["source"] == f"{tmp_path}/a.h5 pad"
 
     def test_what_is_refused_makes_no_memory(self, tmp_path: Path, data: Path) -> None:
         new = tmp_path / "new"

@@ -128,7 +128,7 @@ class TestLearn:
     def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
         for i in range(400):
             touch(tmp_path / "many", "silk", i)
-        words = [sys.executable, "-m", "scroll_tactile.cli", "learn", memory, tmp_path / "many", "--label", "silk"]
+        words = [sys.executable, "-c", SLOWLY, "learn", memory, tmp_path / "many", "--label", "silk"]
         process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:
             until = time.monotonic() + 100
@@ -143,6 +143,19 @@ class TestLearn:
         assert 0 < before < 400
         found = json.loads(run("learn", memory, tmp_path / "many", "--label", "silk", "--json").stdout)
         assert (found["touches"], found["skipped"], found["observations"]) == (400 - before, before, 400)
+
+
+SLOWLY = """
+import time
+from scroll_tactile.cli import main
+from scroll_tactile.pipelines import learning
+learning.BATCH_TOUCHES, whole = 8, learning.source_touches
+def source_touches(*options):
+    time.sleep(0.02)
+    return whole(*options)
+learning.source_touches = source_touches
+main()
+"""
 
 
 def _observed(memory: Path) -> int:

@@ -9,6 +9,7 @@ from scroll_tactile.cli.demonstration import demo
 from scroll_tactile.cli.everyday import inspect, observe, predict
 from scroll_tactile.cli.makeup import compose, describe
 from scroll_tactile.cli.replay import live
+from scroll_tactile.cli.reporting import report
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
 
@@ -22,6 +23,6 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, learn, predict, evaluate, live, inspect, describe, compose):
+for command in (demo, observe, learn, predict, evaluate, live, inspect, describe, compose, report):
     app.command()(command)
 app.add_typer(memory, name="memory")

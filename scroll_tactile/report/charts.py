@@ -1,0 +1,187 @@
+"""The figures of a page, each a drawing to scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.report.drawing import LEFT, LETTER, WIDTH, Axis, Drawing, clipped_name
+
+__all__ = ["Bin", "answers", "confusions", "dated", "histogram", "reliability", "shares", "timeline", "tree"]
+
+ROW = 15.0  # units a row of names
+RIGHT = WIDTH - 8.0
+COLUMNS = 256  # places along a time axis that are told apart
+
+
+def dated(seconds: float) -> str:
+    """A time since 1970 as a date in UTC."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    except (OSError, OverflowError, ValueError):
+        return f"{seconds:g} s since 1970"
+
+
+def timeline(rows: Sequence[tuple[str, Sequence[float], Sequence[float]]], begin: float, end: float) -> str:
+    """When each material was touched. rows: name, times of touches that count, and of retracted ones, in seconds."""
+    drawing = Drawing(ROW * len(rows) + 34, "When each material was observed")
+    axis, bottom = Axis(begin, end, LEFT, RIGHT), ROW * len(rows) + 2
+    for i, (name, kept, retracted) in enumerate(rows):
+        top = ROW * i + 2
+        drawing.text(LEFT - 6, top + 11, clipped_name(name), anchor="end", title=name)
+        drawing.line([(LEFT, top + ROW / 2), (RIGHT, top + ROW / 2)], "grid")
+        for times, kind in ((kept, "tick"), (retracted, "tick gone")):
+            places = sorted({round(axis(time) * COLUMNS / WIDTH) * WIDTH / COLUMNS for time in times})
+            drawing.ticks(places, top + 2, ROW - 4, kind)
+    drawing.text(LEFT, bottom + 13, dated(begin), "small")
+    if end > begin:
+        drawing.text(RIGHT, bottom + 13, dated(end), "small", "end")
+    drawing.text((LEFT + RIGHT) / 2, bottom + 27, "time of observation (UTC)", "small", "middle")
+    return drawing.svg()
+
+
+def histogram(counts: Sequence[int], low: float, high: float, label: str, what: str, form: str = "{:g}") -> str:
+    """How often numbers fall into equal steps from low to high. label: of the numbers; what: is counted."""
+    drawing = Drawing(158, f"How many {what}, by {label}")
+    axis, up = Axis(low, high, 46, RIGHT), Axis(0, max(counts, default=1), 122, 8)
+    drawing.up(up, 46, RIGHT)
+    wide = (axis.end - axis.begin) / max(len(counts), 1)
+    for i, count in enumerate(counts):
+        if count:
+            top = min(up(count), 121.0)
+            drawing.box(axis.begin + i * wide, top, max(wide - 0.6, 0.6), 122 - top, "fill", title=f"{count} {what}")
+    drawing.across(axis, 8, 122, label, form)
+    return drawing.svg()
+
+
+def tree(names: Sequence[str], joins: npt.NDArray[np.float64]) -> tuple[str, list[str]]:
+    """Materials joined from the nearest to the farthest, and the order that brings near ones together.
+
+    joins: as `scipy.cluster.hierarchy.linkage` gives them, (C − 1, 4).
+    """
+    from scipy.cluster.hierarchy import leaves_list
+
+    count, order = len(names), leaves_list(joins).tolist()
+    drawing = Drawing(ROW * count + 34, "Which materials are joined at which separation")
+    least, most = (math.log10(max(float(height), 0.1)) for height in (joins[:, 2].min(), joins[:, 2].max()))
+    axis, bottom = Axis(least - 0.15 * (most - least) - 0.05, most + 0.02, LEFT, RIGHT), ROW * count + 4
+    for height in (0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000, 10_000):
+        if axis.low <= math.log10(height) <= axis.high:
+            drawing.line([(axis(math.log10(height)), 4), (axis(math.log10(height)), bottom)], "grid")
+            drawing.text(axis(math.log10(height)), bottom + 12, f"{height:g}", "small", "middle")
+    drawing.text((LEFT + RIGHT) / 2, bottom + 25, "separation (log scale)", "small", "middle")
+    places = {leaf: (LEFT, ROW * i + ROW / 2 + 2) for i, leaf in enumerate(order)}
+    for i in order:
+        drawing.text(LEFT - 6, places[i][1] + 4, clipped_name(names[i]), anchor="end", title=names[i])
+    for i, (first, second, height, _) in enumerate(joins.tolist()):
+        (x1, y1), (x2, y2), x = places[int(first)], places[int(second)], axis(math.log10(max(height, 0.1)))
+        drawing.line([(x1, y1), (x, y1), (x, y2), (x2, y2)], "branch")
+        places[count + i] = (x, (y1 + y2) / 2)
+    return drawing.svg(), [names[i] for i in order]
+
+
+def confusions(names: Sequence[str], counts: npt.NDArray[np.int64]) -> str:
+    """Counts of (truth, answer), (C, C): the diagonal in one colour, mistakes in another."""
+    side = min(22.0, (RIGHT - LEFT - 14) / len(names))
+    left = LEFT + 14
+    drawing = Drawing(side * len(names) + 22, "Counts of the material that was touched by the answer that was given")
+    totals = np.maximum(counts.sum(axis=1), 1)
+    for i, name in enumerate(names):
+        y = side * i + 16
+        drawing.text(LEFT - 6, y + side / 2 + 4, clipped_name(name), anchor="end", title=name)
+        drawing.text(left - 3, y + side / 2 + 3, i + 1, "tiny", "end")
+        drawing.text(left + side * (i + 0.5), 11, i + 1, "tiny", "middle")
+        for j, other in enumerate(names):
+            count, title = int(counts[i, j]), f"{name} called {other}: {counts[i, j]} of {counts[i].sum()}"
+            if count:
+                share = 0.25 + 0.75 * count / int(totals[i])
+                kind = "fill" if i == j else "wrong"
+                drawing.box(left + side * j, y, side - 1, side - 1, kind, share, title)
+                strong = "tiny strong" if share > 0.6 else "tiny"
+                drawing.text(left + side * (j + 0.5) - 0.5, y + side / 2 + 3, count, strong, "middle")
+            else:
+                drawing.box(left + side * j, y, side - 1, side - 1, "none")
+    return drawing.svg()
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Answers of about one confidence: how many, its mean, the share that is right, and its 95 % interval."""
+
+    count: int
+    confidence: float
+    right: float
+    low: float
+    high: float
+
+
+def reliability(bins: Sequence[Bin], confidences: Sequence[float]) -> str:
+    """The share of right answers by their probability, and how many answers have which."""
+    drawing = Drawing(300, "Share of right answers by the probability that was given")
+    axis, up, down = Axis(0, 1, 46, RIGHT), Axis(0, 1, 205, 8), Axis(0, 1, 262, 226)
+    drawing.up(up, 46, RIGHT, "{:.0%}")
+    drawing.line([(axis(0), up(0)), (axis(1), up(1))], "ideal")
+    for found in bins:
+        x = axis(found.confidence)
+        drawing.line([(x, up(found.low)), (x, up(found.high))], "whisker")
+        title = f"{found.count} answers with {found.confidence:.0%}: {found.right:.0%} right"
+        drawing.dot(x, up(found.right), 3 + 3 * math.sqrt(found.count / max(b.count for b in bins)), "point", title)
+    counts = np.histogram(confidences, bins=20, range=(0, 1))[0]
+    for i, count in enumerate(counts.tolist()):
+        if count:
+            tall = max(1.0, 36 * math.sqrt(count / counts.max()))
+            drawing.box(axis(i / 20), down(0) - tall, axis(0.05) - axis(0) - 0.8, tall, "fill", 0.6, f"{count} answers")
+    drawing.across(axis, 262, 262, "probability that was given", "{:.0%}")
+    drawing.text(46, 221, "how many answers (root scale)", "tiny")
+    return drawing.svg()
+
+
+def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: str) -> str:
+    """Bars of shares from 0 to 1. rows: name, share, what shows over it; usual: where a line stands."""
+    most = max([share for _, share, _ in rows] + [usual or 0.0, 0.1])
+    drawing = Drawing(ROW * len(rows) + 34, label)
+    axis, bottom = Axis(0, most, LEFT, RIGHT - 30), ROW * len(rows) + 4
+    drawing.across(axis, 4, bottom, label, "{:.0%}", 4)
+    for i, (name, share, title) in enumerate(rows):
+        y = ROW * i + 4
+        drawing.text(LEFT - 6, y + 11, clipped_name(name), anchor="end", title=name)
+        drawing.box(LEFT, y + 2, max(axis(share) - LEFT, 0.8), ROW - 4, "fill", title=title)
+        drawing.text(axis(share) + 4, y + 10.5, f"{share:.0%}", "tiny")
+    if usual is not None:
+        drawing.line([(axis(usual), 2), (axis(usual), bottom)], "ideal")
+    return drawing.svg()
+
+
+def answers(
+    seconds: Sequence[float], chances: Mapping[str, Sequence[float]], own: str, decided: tuple[float, str] | None
+) -> str:
+    """Probability of each material over the time of a touch of `own`. decided: when, in seconds, and what to say."""
+    last = {name: line[-1] for name, line in chances.items()}
+    rival = max((name for name in chances if name != own), key=lambda name: max(chances[name]), default=None)
+    drawing = Drawing(196, f"Probability of each material over the time of a touch of {own}")
+    axis, up = Axis(0, max(seconds), 40, RIGHT), Axis(0, 1, 140, 20)
+    drawing.up(up, 40, RIGHT, "{:.0%}")
+    for name in sorted(last, key=lambda name: (name == own, name == rival)):
+        kind = "own" if name == own else "rival" if name == rival else "other"
+        if name in (own, rival) or max(chances[name]) > 0.02:
+            drawing.line([(axis(at), up(p)) for at, p in zip(seconds, chances[name], strict=True)], kind)
+    for at, p in zip(seconds, chances[own], strict=True):
+        drawing.dot(axis(at), up(p), 2.2, "point", f"{own} with {p:.1%} after {at:.2g} s")
+    if decided is not None:
+        x, words = axis(decided[0]), decided[1]
+        drawing.line([(x, 12), (x, 140)], "decided")
+        late = x > WIDTH / 2
+        drawing.text(x + (-4 if late else 4), 11, words, "small", "end" if late else "start")
+    drawing.across(axis, 140, 140, "seconds of touch")
+    drawing.line([(40, 184), (60, 184)], "own")
+    drawing.text(64, 188, clipped_name(own, 18), title=own)
+    if rival is not None:
+        x = 64 + LETTER * len(clipped_name(own, 18)) + 16
+        drawing.line([(x, 184), (x + 20, 184)], "rival")
+        drawing.text(x + 24, 188, clipped_name(rival, 18), title=rival)
+    return drawing.svg()

@@ -1,0 +1,123 @@
+"""All that the page of a memory rests on, each found once and when it is first needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import CapacityError, ScrollTactileError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
+from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.report.drawing import as_counted
+from scroll_tactile.report.growing import Decided, Growing, chosen, growing, stream_of
+from scroll_tactile.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in
+from scroll_tactile.report.page import note
+from scroll_tactile.results import Observation
+from scroll_tactile.signals.stream import validate
+
+__all__ = ["MemoryFacts"]
+
+
+@dataclass
+class MemoryFacts:
+    """What a memory knows. missing: what the page cannot show and why, filled as it is made."""
+
+    learner: TactileLearner
+    decided: Decided
+    missing: list[str] = field(default_factory=list)
+
+    def lacks(self, what: str, why: str) -> str:
+        """Note that something is missing, and say so in its place."""
+        self.missing.append(f"{what}: {why}")
+        return note(f"Not shown: {why}")
+
+    @cached_property
+    def counts(self) -> dict[str, int]:
+        """Material → touches, in the order of names."""
+        return dict(sorted(self.learner.materials.items(), key=lambda pair: as_counted(pair[0])))
+
+    @cached_property
+    def journal(self) -> list[Observation]:
+        """All observations in order; none of a memory without a path."""
+        return self.learner.observations()
+
+    @cached_property
+    def model(self) -> Model | None:
+        """The model, just fitted; None of an empty memory, and where none can be fitted."""
+        try:
+            return self.learner.model() if self.counts else None
+        except CapacityError:
+            raise
+        except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit
+            self.missing.append(f"Nothing could be fitted: {error}")
+            return None
+
+    @cached_property
+    def unseen(self) -> list[UnseenTouch]:
+        """What is said of touches that were left out."""
+        return [] if self.model is None else unseen_touches(self.model, self.learner.settings.false_alarms)
+
+    @cached_property
+    def trust(self) -> Trust | None:
+        """How far answers can be believed; None where nothing could be left out."""
+        return trust_in(self.unseen) if self.unseen else None
+
+    @cached_property
+    def mistakes(self) -> list[Mistake]:
+        """All confusions, the most frequent first."""
+        return mistakes(self.unseen)
+
+    @cached_property
+    def near(self) -> tuple[list[str], npt.NDArray[np.float64]]:
+        """Materials and their separations; none where there are too few, or too many."""
+        if self.model is None or not 1 < len(self.counts) <= MOST_NEAR:
+            return [], np.zeros((0, 0))
+        return separations(self.learner, self.model)
+
+    @cached_property
+    def kept(self) -> list[Kept]:
+        """The kept touches, in the order of observation where that is known."""
+        touches = self.learner.memory.kept.touches() if self.learner.memory.kept is not None else []
+        place = {row.key: row.sequence for row in self.journal}
+        return sorted(touches, key=lambda touch: (place.get(touch.key, 0), touch.material, touch.key))
+
+    @property
+    def ordered(self) -> bool:
+        """Whether that order is known."""
+        return bool(self.journal)
+
+    @cached_property
+    def exemplars(self) -> dict[str, list[Exemplar]]:
+        """Material → its exemplars with readings."""
+        return self.learner.ranked_exemplars()
+
+    @cached_property
+    def growing(self) -> tuple[list[Growing], str]:
+        """How answers to a few left-out touches grow, and why there are no more. It moves the model, and comes last."""
+        sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
+        held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
+        if self.model is None or not self.unseen:
+            return [], self.nothing_left_out
+        touches = chosen(self.unseen, kept or held, sensor.camera)
+        if not touches:
+            return [], "of no touch that could be left out the readings are kept."
+        streams = {
+            touch.key: stream_of(kept[touch.key].levels, sensor) if kept else validate(held[touch.key].readings, sensor)
+            for touch in touches
+        }
+        return growing(self.learner, self.model, touches, streams, self.decided)
+
+    @property
+    def nothing_left_out(self) -> str:
+        """Why no touch could be left out."""
+        if not self.counts:
+            return "no touch was observed yet."
+        if len(self.counts) == 1:
+            return "one material has nothing to be mixed up with; teach a second one."
+        return "nothing can be left out: that takes two materials with two touches or more of each."

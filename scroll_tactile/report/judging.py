@@ -1,0 +1,146 @@
+"""The parts of a memory's page that say how it judges: what is near, mixed up, calibrated, and how answers grow."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.report.charts import answers, confusions, reliability, shares, tree
+from scroll_tactile.report.facts import MemoryFacts
+from scroll_tactile.report.growing import SURE, Growing, sure
+from scroll_tactile.report.knowledge import MOST_NEAR, bins_of, unknown_by
+from scroll_tactile.report.page import figure, note, side_by_side, table
+
+__all__ = ["ROWS", "alike", "growing_answers", "mixed_up", "trusted"]
+
+ROWS = 40  # materials, of which each has a row in a figure; of more there are tables
+SQUARE = 30  # materials, of which all pairs have a cell in a figure
+MOST_MISTAKES = 60
+PAIRS = 30
+
+
+def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
+    """Who is near whom, and the order of materials that brings near ones together; empty where there are many."""
+    names, apart = facts.near
+    if len(names) < 2:
+        many = len(facts.counts) > MOST_NEAR
+        why = f"there are more than {MOST_NEAR} materials." if many else "it takes two materials, touched long enough."
+        return facts.lacks("Who is near whom", why), []
+    pairs = table(["material", "feels like", "separation"], _nearest(names, apart), "nearest pairs")
+    found = f"<div><h3>Nearest pairs</h3>{pairs}</div>"
+    words = (
+        "Separation is the log-odds that a typical touch of one has over the other. Of touches that scatter as a bell "
+        "curve, at 3 one in nine is taken for the other, at 10 one in eighty, at 20 one in a thousand."
+    )
+    if len(names) > ROWS:
+        return note(words) + found, []
+    drawn, order = tree(names, _joins(apart))
+    caption = f"Materials that join further to the left feel more alike (average linkage). {words}"
+    return side_by_side(figure(drawn, caption), found), order
+
+
+def _joins(apart: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    from scipy.cluster.hierarchy import linkage
+    from scipy.spatial.distance import squareform
+
+    return np.asarray(linkage(squareform(apart, checks=False), "average"))
+
+
+def _nearest(names: list[str], apart: npt.NDArray[np.float64]) -> list[list[object]]:
+    first, second = np.triu_indices(len(names), 1)
+    order = np.argsort(apart[first, second], kind="stable")[:PAIRS]
+    return [[names[i], names[j], float(apart[i, j])] for i, j in zip(first[order], second[order], strict=True)]
+
+
+def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
+    """Confusions of touches left out. order: of the materials in the figure."""
+    trust = facts.trust
+    if trust is None:
+        return facts.lacks("What it mixes up", facts.nothing_left_out)
+    tested = {touch.material for touch in facts.unseen}
+    words = (
+        f"{trust.count} touches of {len(tested)} materials were left out one by one: {trust.right:.1%} right "
+        f"(95 % interval {trust.low:.1%} to {trust.high:.1%})."
+    )
+    if len(tested) < len(facts.counts):
+        words += (
+            f" Of {len(facts.counts) - len(tested)} others no touch could be left out, or none is among those sampled;"
+            " nothing is called by their names here."
+        )
+    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in facts.mistakes[:MOST_MISTAKES]]
+    rest = len(facts.mistakes) - len(rows)
+    listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
+    more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
+    found = f"<div><h3>Worst confusions</h3>{listed}{more}</div>" if rows else note("None was called another material.")
+    if len(tested) > SQUARE:
+        return note(words) + found
+    names = [name for name in order or facts.counts if name in tested]
+    names += sorted(tested - set(names))
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.zeros((len(names), len(names)), np.int64)
+    for touch in facts.unseen:
+        if touch.answer in place:
+            counts[place[touch.material], place[touch.answer]] += 1
+    caption = (
+        "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "
+        "materials that feel alike stand side by side."
+    )
+    return note(words) + side_by_side(figure(confusions(names, counts), caption), found)
+
+
+def trusted(facts: MemoryFacts) -> str:
+    """Calibration, and what would be called unknown."""
+    trust, alarms = facts.trust, facts.learner.settings.false_alarms
+    if trust is None:
+        return facts.lacks("Whether to trust it", facts.nothing_left_out)
+    verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
+    caption = (
+        "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
+        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is usual of perfect answers. "
+        "Upright lines are 95 % intervals."
+    )
+    drawn = reliability(bins_of(facts.unseen), [touch.confidence for touch in facts.unseen])
+    strange = unknown_by(facts.unseen)
+    if len(strange) > ROWS:
+        strange = [row for row in strange if row[1]]
+    bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in strange[:ROWS]]
+    rest = f" {len(strange) - ROWS} more materials have any." if len(strange) > ROWS else ""
+    words = (
+        f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} (dashed) are meant "
+        f"to be.{rest} A material far above that varies more than it was shown to: teach more of it."
+    )
+    bar = figure(shares(bars, alarms, "share of touches left out called unknown"), words)
+    return side_by_side(figure(drawn, caption), bar if bars else note(words))
+
+
+def growing_answers(facts: MemoryFacts) -> str:
+    """How answers to a few touches grow while they are felt."""
+    found, why = facts.growing
+    if not found:
+        return facts.lacks("How answers grow", why)
+    words = (
+        "The probability of each material while a touch goes on, as if it had never been observed. Solid: its own "
+        "material; dashed: the strongest other; upright: the first moment to act on. The first two are the hardest "
+        "touches there are."
+    )
+    rest = facts.lacks("How answers grow", f"further touches: {why}") if why else ""
+    return note(words) + rest + side_by_side(*(_grown(facts, touch) for touch in found))
+
+
+def _grown(facts: MemoryFacts, touch: Growing) -> str:
+    names = sorted({touch.material, *(name for at in touch.predictions for name, _ in at.ranking[:3])})
+    chances = [dict(prediction.ranking) for prediction in touch.predictions]
+    lines = {name: [of[name] for of in chances] for name in names}
+    end = touch.predictions[-1]
+    verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
+    caption = f"A touch of {touch.material}. At its end: {verdict}{'' if end.known else ', and called unknown'}."
+    return figure(answers(touch.seconds, lines, touch.material, _moment(facts, touch)), caption)
+
+
+def _moment(facts: MemoryFacts, touch: Growing) -> tuple[float, str] | None:
+    if touch.decided is None:
+        return None
+    rule = f"{SURE:.0%} sure" if facts.decided is sure else "decided"
+    prediction, seconds = touch.predictions[touch.decided], touch.seconds[touch.decided]
+    wrong = "" if prediction.material == touch.material else ", wrongly"
+    return seconds, f"{rule} after {seconds:.2g} s{wrong}"

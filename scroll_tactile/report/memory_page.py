@@ -1,0 +1,172 @@
+"""The page of a memory: what it knows, what it mixes up, whether to trust it, and whether its sensor is well."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+
+import numpy as np
+
+from scroll_tactile import __version__
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.report.charts import dated, histogram, timeline
+from scroll_tactile.report.drawing import shown
+from scroll_tactile.report.facts import MemoryFacts
+from scroll_tactile.report.growing import Decided, sure
+from scroll_tactile.report.judging import ROWS, alike, growing_answers, mixed_up, trusted
+from scroll_tactile.report.page import Card, State, cards, figure, page, table
+from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
+
+__all__ = ["memory_page"]
+
+FEW = 30  # touches left out: with fewer, nothing said of them is certain
+FEW_TOUCHES = 3  # of a material
+RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
+BARS = 60
+
+
+def memory_page(learner: TactileLearner, *, decided: Decided = sure, name: str | None = None) -> str:
+    """One HTML page that shows what a memory knows; it needs no network and no script.
+
+    decided: whether a prediction after so many columns is safe to act on; 95 % of the probability unless given.
+    name: what stands above it; the folder's unless given. Nothing should be observed meanwhile: of a learner that goes
+    on, give a `copy.deepcopy`, which is a snapshot.
+
+    Where something is not there, such as readings in a compacted memory, the page says so, and why.
+
+    Raises CapacityError, and StoreError where a memory on disk cannot be read.
+    """
+    facts = MemoryFacts(learner, decided)
+    title = name or ("A memory without a path" if learner.path is None else learner.path.name)
+    near, order = alike(facts)
+    sensor = learner.sensor
+    sections = [
+        ("known", "What it knows", _known(facts)),
+        ("alike", "Who is near whom", near),
+        ("mixed", "What it mixes up", mixed_up(facts, order)),
+        ("trust", "Whether to trust it", trusted(facts)),
+        ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
+        ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
+    ]
+    sections.insert(4, ("growing", "How answers grow", growing_answers(facts)))
+    if facts.missing:
+        reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
+        sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))
+    channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
+    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), channels])
+    return page(title, _under(learner), summary, sections, _foot(learner))
+
+
+def _under(learner: TactileLearner) -> str:
+    sensor, embedding = learner.sensor, learner.embedding
+    return (
+        f"A tactile memory of sensor <b>{shown(sensor.name)}</b>, {sensor.channels} channels at {sensor.rate:g} Hz; "
+        f"embedding {shown(embedding.name)}, {embedding.dimension} features."
+    )
+
+
+def _foot(learner: TactileLearner) -> str:
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return (
+        f"Made {now} by scroll-tactile {shown(__version__)}. Digest of the memory <code>{learner.digest()}</code>, "
+        f"fingerprint of the embedding <code>{shown(learner.embedding.fingerprint[:16])}</code>. A touch that is left "
+        "out is judged by statistics and kept touches without it, and by the calibration of all."
+    )
+
+
+def _knows(facts: MemoryFacts) -> Card:
+    count = sum(facts.counts.values())
+    if not count:
+        return "none", "What it knows", "nothing yet", "Teach a touch: scroll-tactile observe."
+    least = min(facts.counts, key=lambda name: facts.counts[name])
+    last = max((row.time for row in facts.journal if row.state != "retracted"), default=None)
+    few = f"Fewest touches: {facts.counts[least]}, of {least}." if len(facts.counts) > 1 else ""
+    when = "" if last is None else f" Last touch {dated(last)} UTC."
+    answer = f"{len(facts.counts)} material{'s' * (len(facts.counts) > 1)}, {count} touch{'es' * (count > 1)}"
+    return "look" if facts.counts[least] < FEW_TOUCHES else "good", "What it knows", answer, few + when
+
+
+def _mixes(facts: MemoryFacts) -> Card:
+    trust, heading = facts.trust, "What it mixes up"
+    if trust is None:
+        return "none", heading, "not known", _sentence(facts.nothing_left_out)
+    wrong = round((1 - trust.right) * trust.count)
+    if not wrong:
+        return "good", heading, "nothing", f"All {trust.count} touches left out got their own name."
+    worst = facts.mistakes[0]
+    more = f"Most often {worst.material}, called {worst.answer}: {worst.count} of {worst.tested} times."
+    return _state(trust.right), heading, f"{wrong} of {trust.count} touches left out", more
+
+
+def _trusts(facts: MemoryFacts) -> Card:
+    trust, heading = facts.trust, "Whether to trust it"
+    if trust is None:
+        return "none", heading, "not known", _sentence(facts.nothing_left_out)
+    more = (
+        f"It says {trust.confidence:.1%} on average (ECE {trust.error:.3f}), and would call {trust.unknown:.0%} of its "
+        "own touches unknown."
+    )
+    if trust.count < FEW:
+        return "look", heading, f"right {trust.right:.0%}, by {trust.count} touches only", more
+    if trust.miscalibrated:
+        words = "overconfident" if trust.confidence > trust.right else "underconfident"
+        return "bad", heading, f"right {trust.right:.1%}, and {words}", more
+    return _state(trust.right), heading, f"right {trust.right:.1%}, and says so", more
+
+
+def _state(right: float) -> State:
+    return "good" if right >= RIGHT else "look" if right >= POOR else "bad"
+
+
+def _sentence(why: str) -> str:
+    return why[:1].upper() + why[1:]
+
+
+def _known(facts: MemoryFacts) -> str:
+    """Materials, and when they were observed."""
+    if not facts.counts:
+        return facts.lacks("What it knows", "no touch was observed yet.")
+    names, apart = facts.near
+    nearest: dict[str, tuple[str, float]] = {}
+    if len(names) > 1:
+        far = apart + np.diag(np.full(len(names), np.inf))
+        nearest = {name: (names[int(row.argmin())], float(row.min())) for name, row in zip(names, far, strict=True)}
+    first: dict[str, float] = {}
+    for row in facts.journal:
+        if row.state != "retracted":
+            first.setdefault(row.material, row.time)
+    tested = Counter(touch.material for touch in facts.unseen)
+    right = Counter(touch.material for touch in facts.unseen if touch.answer == touch.material)
+    rows = [
+        [
+            name,
+            count,
+            f"{right[name]} of {tested[name]}" if tested[name] else None,
+            *nearest.get(name, (None, None)),
+            dated(first[name]) if name in first else None,
+        ]
+        for name, count in facts.counts.items()
+    ]
+    header = ["material", "touches", "right, left out", "nearest", "separation", "first observed (UTC)"]
+    return _over_time(facts) + table(header, rows, "materials")
+
+
+def _over_time(facts: MemoryFacts) -> str:
+    if not facts.journal:
+        alone = facts.learner.path is None
+        why = "this memory has no path, so that nobody noted when." if alone else "its journal names no touches."
+        return facts.lacks("Touches over time", why)
+    times = [row.time for row in facts.journal]
+    begin, end = min(times), max(times)
+    gone = sum(row.state == "retracted" for row in facts.journal)
+    also = f" {gone} of them were retracted: dashed." if gone else ""
+    if len(facts.counts) <= ROWS:
+        rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
+        for row in facts.journal:
+            rows.setdefault(row.material, ([], []))[row.state == "retracted"].append(row.time)
+        drawn = timeline([(name, *both) for name, both in rows.items()][: 2 * ROWS], begin, end)
+        caption = f"Each upright line is a touch, or several at nearly one time; {len(times)} in all.{also}"
+        return figure(drawn, caption)
+    counts, _ = np.histogram(times, bins=BARS, range=(begin, end if end > begin else begin + 1))
+    drawn = histogram(counts.tolist(), 0, max(end - begin, 1.0), f"seconds since {dated(begin)} UTC", "touches")
+    return figure(drawn, f"How many touches were observed when; {len(times)} in all, the last {dated(end)} UTC.")

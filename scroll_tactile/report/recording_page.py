@@ -1,0 +1,230 @@
+"""The page of a recording: what a file has, how steady its clock is, and whether its channels are well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from os import PathLike, fspath
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile import __version__
+from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.readouts.likelihood import levels_of
+from scroll_tactile.recordings import Contents, Entry, Interval, Recording, describe, read, touches
+from scroll_tactile.recordings.presets import PRESETS
+from scroll_tactile.report.channels import channels_of
+from scroll_tactile.report.charts import dated, histogram, timeline
+from scroll_tactile.report.drawing import shown
+from scroll_tactile.report.page import Card, State, cards, figure, note, page, table
+from scroll_tactile.report.sensing import card_of, level_picture, state_rows
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["recording_page"]
+
+STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
+MOST_ROWS = 60
+MOST_NAMES = 40
+LOST = 0.001  # of the readings: more is worth a look
+
+
+def recording_page(path: str | PathLike[str], *, intervals: Sequence[Interval] | None = None, **chosen: Any) -> str:
+    """One HTML page that shows what a recording holds; it needs no network and no script.
+
+    chosen: topic, field, preset and the others of `read`; where a file has several fields and none is named, the
+    largest is shown. intervals: of touches in it; its episodes unless given.
+
+    Raises what `describe` and `read` raise.
+    """
+    contents = describe(path)
+    recording, why = _read(contents, fspath(path), chosen)
+    preset = chosen.get("preset")
+    sensor = PRESETS[preset].sensor if preset in PRESETS else None
+    sections = [("time", "Time", _time(recording)), ("channels", "Channels", _channels(recording, sensor))]
+    sections += [
+        ("touches", "Touches", _touches(recording, intervals)),
+        ("holds", "What the file has", _holds(contents)),
+    ]
+    where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
+    under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
+    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, sensor)])
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
+    return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
+
+
+def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
+    """The recording, of what was asked for or of the largest there is; and what to say of that choice."""
+    try:
+        return read(path, **chosen), ""
+    except FieldError:
+        if any(chosen.get(name) for name in ("topic", "field", "preset")) or not contents.entries:
+            raise
+    largest = max(contents.entries, key=_size)
+    found = read(path, **chosen | {"topic": largest.topic, "field": largest.field})
+    return found, " It is the largest of several; another is chosen by --topic and --field."
+
+
+def _size(entry: Entry) -> int:
+    return int(np.prod(entry.shape, dtype=np.int64)) * (entry.count or 1)
+
+
+def _shape(recording: Recording) -> str:
+    shape = recording.readings.shape[1:]
+    return f"{shape[0]} channels" if len(shape) == 1 else f"pictures of {' × '.join(map(str, shape))}"
+
+
+def _seconds(recording: Recording) -> float | None:
+    times = recording.times[np.isfinite(recording.times)]
+    return float(times.max() - times.min()) if len(times) > 1 else None
+
+
+def _length(recording: Recording) -> Card:
+    lasts = _seconds(recording)
+    count = len(recording)
+    cut = (
+        "The file ends before its end: what was whole was read."
+        if recording.report.cut_off
+        else "It was read to its end."
+    )
+    answer = f"{count} readings" + ("" if lasts is None else f", {lasts:.4g} s")
+    return "bad" if not count else "look" if recording.report.cut_off else "good", "How much", answer, cut
+
+
+def _clock(recording: Recording) -> Card:
+    report = recording.report
+    if report.rate is None:
+        return "none", "How steady", "no clock", "Its readings have no times: give --clock or --rate."
+    share = (report.jitter or 0.0) * report.rate
+    state: State = "bad" if report.backward else "look" if report.gaps or share > 0.2 else "good"
+    gaps = (
+        f"{len(report.gaps)} gaps, the longest {max(gap.seconds for gap in report.gaps):.3g} s"
+        if report.gaps
+        else "no gaps"
+    )
+    back = f"; time goes back {report.backward} times" if report.backward else ""
+    answer = f"{report.rate:.4g} Hz, ± {1e3 * (report.jitter or 0):.2g} ms"
+    return state, "How steady", answer, f"By the clock {report.clock!r}: {gaps}{back}."
+
+
+def _losses(recording: Recording) -> Card:
+    report = recording.report
+    counted = (
+        "No counter tells whether readings were lost." if report.lost is None else "By the counter in its messages."
+    )
+    if report.lost is None and not report.repeated and not report.unset:
+        return "none", "What was lost", "not counted", counted
+    parts = {"lost": report.lost or 0, "repeated": report.repeated, "without a stamp": report.unset}
+    bad = sum(parts.values())
+    answer = ", ".join(f"{count} {what}" for what, count in parts.items() if count) or "none lost"
+    return "look" if bad > LOST * len(recording) else "good", "What was lost", answer, counted
+
+
+def _levels(recording: Recording, sensor: Sensor | None) -> tuple[npt.NDArray[np.uint8], Sensor]:
+    """Levels (C, T), and the sensor that they are of: the preset's, or one whose range is that of these readings."""
+    readings = np.asarray(recording.readings, dtype=np.float64)
+    count = readings.shape[1]
+    if sensor is not None and sensor.channels == count:
+        return levels_of(readings, sensor), sensor
+    finite = np.where(np.isfinite(readings), readings, np.nan)
+    seen = np.isfinite(finite).any(axis=0)
+    low = np.where(seen, np.nanmin(finite, axis=0, where=seen, initial=np.inf), 0.0)
+    high = np.where(seen, np.nanmax(finite, axis=0, where=seen, initial=-np.inf), 1.0)
+    high = np.where(high > low, high, low + np.maximum(1.0, np.abs(low)))
+    own = Sensor(
+        name="seen", channels=count, rate=recording.report.rate or 1.0, low=tuple(low.tolist()),
+        high=tuple(high.tolist()), unit="", duration=max(1.0, 2 / (recording.report.rate or 1.0)),
+    )  # fmt: skip
+    return levels_of(finite, own), own
+
+
+def _state(recording: Recording, sensor: Sensor | None) -> Card:
+    if recording.readings.ndim != 2 or len(recording) < 2:
+        return "none", "Channels", "not looked at", "Only rows of numbers have channels that can be dead."
+    found = channels_of(*_stretches(recording, sensor), ordered=True)
+    return card_of(found, f"{len(recording)} readings")
+
+
+def _stretches(recording: Recording, sensor: Sensor | None) -> tuple[list[npt.NDArray[np.uint8]], list[str], Sensor]:
+    levels, own = _levels(recording, sensor)
+    parts = np.array_split(levels, max(1, min(STRETCHES, levels.shape[1] // 2)), axis=1)
+    return parts, [""] * len(parts), own
+
+
+def _channels(recording: Recording, sensor: Sensor | None) -> str:
+    if recording.readings.ndim != 2 or len(recording) < 2:
+        return note("Not shown: these are pictures, or too few readings.")
+    levels, own = _levels(recording, sensor)
+    found = channels_of(*_stretches(recording, sensor), ordered=True)
+    caption = (
+        "Each row is a channel, 1 at the top; time runs to the right. Dark is the least mean level that the channel "
+        "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
+    )
+    words = (
+        f"Dead: it never changes in most of {STRETCHES} equal stretches. Saturated: 5 % of the readings lie at the end "
+        "of the range. Drifting: its level moves by 5 % of the range from begin to end."
+    )
+    if own.name == "seen":
+        words += " The range of a channel is what was seen of it; with --preset it is its sensor's, and means more."
+    return level_picture(levels, "level of each channel over time", caption) + note(words) + state_rows(found, own, "")
+
+
+def _time(recording: Recording) -> str:
+    steps = np.diff(recording.times)
+    steps = steps[np.isfinite(steps)]
+    if not len(steps):
+        return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
+    longest = float(np.quantile(steps, 0.999)) * 1e3
+    usual = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
+    high = float(usual.max()) * 1.1 if len(usual) and usual.max() > 0 else 1.0
+    counts, _ = np.histogram(usual, bins=60, range=(0, high))
+    drawn = histogram(counts.tolist(), 0, high, "ms from a reading to the next", "readings")
+    caption = (
+        "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings."
+    )
+    longest_first = sorted(recording.report.gaps, key=lambda gap: -gap.seconds)
+    begin = float(recording.times[0])
+    rows = [[gap.index, f"{recording.times[gap.index - 1] - begin:.3f}", gap.seconds] for gap in longest_first]
+    gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
+    more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
+    first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > 1e8 else ""
+    said = "".join(note(text) for text in recording.report.notes)
+    return (
+        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + said
+    )
+
+
+def _touches(recording: Recording, intervals: Sequence[Interval] | None) -> str:
+    if intervals is None and not recording.episodes:
+        return note("Not cut: the file has no episodes or labels. A table of intervals cuts it: --intervals.")
+    try:
+        found = touches(recording, "episodes" if intervals is None else intervals)
+    except InputError as error:
+        return note(f"Not cut: {error}")
+    begin = float(recording.times[0]) if np.isfinite(recording.times).all() else None
+    rows = []
+    spans: dict[str, tuple[list[float], list[float]]] = {}
+    for touch in found:
+        start = None if begin is None else float(touch.times[0]) - begin
+        lasts = None if begin is None else float(touch.times[-1] - touch.times[0])
+        rows.append([touch.material or "no name", touch.end - touch.begin, start, lasts])
+        if start is not None:
+            spans.setdefault(touch.material or "no name", ([], []))[0].append(float(touch.times[0]))
+    drawn = ""
+    if begin is not None and len(spans) <= MOST_NAMES and len(found) > 1:
+        every = [(name, *both) for name, both in spans.items()]
+        drawn = figure(timeline(every, begin, float(recording.times[-1])), "Each upright line is the begin of a touch.")
+    listed = table(["material", "readings", "begins (s)", "lasts (s)"], rows[:1000], "touches")
+    return note(f"{len(found)} touches of {len({str(row[0]) for row in rows})} names.") + drawn + listed
+
+
+def _holds(contents: Contents) -> str:
+    rows = [
+        [entry.topic, entry.field, " × ".join(map(str, entry.shape)) or "1", entry.count, entry.rate, entry.kind]
+        for entry in contents.entries
+    ]
+    looked = f"Rates and counts {contents.looked}." if contents.looked else "All numbers in the file."
+    return note(looked) + table(["topic", "field", "shape", "readings", "Hz", "type"], rows, "contents")

@@ -1,0 +1,195 @@
+"""What a page shows of a sensor: the state of its channels, and pictures of touches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
+from scroll_tactile.report.drawing import as_counted, clipped_name, png, shown
+from scroll_tactile.report.page import Card, name_of, note, table
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import scaled_down
+
+__all__ = ["channel_card", "channel_section", "exemplar_pictures", "level_picture", "listed", "state_rows"]
+
+MOST_ROWS = 128  # channels, of which all have a row in a table
+MOST_PICTURES = 60
+LONGEST = 160  # columns of a picture
+HIGHEST = 64  # rows
+FRAME = (60, 80)  # of a camera's picture
+COLUMNS = 400  # touches beside each other in the picture of all
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def listed(channels: Sequence[Channel], most: int = 8) -> str:
+    """Their numbers in words."""
+    numbers = [str(channel.number) for channel in channels]
+    return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
+
+
+def channel_card(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> Card:
+    """What is to be seen first of the channels."""
+    if sensor.camera:
+        return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
+    if not kept:
+        return "none", "Channels", "not known", "No readings are kept that could tell."
+    return card_of(_channels(sensor, kept, ordered), f"{len(kept)} kept touches")
+
+
+def card_of(found: Sequence[Channel], by: str) -> Card:
+    """How channels stand, of these readings."""
+    wrong = {fault: [c for c in found if fault in c.faults] for c in found for fault in c.faults}
+    if not wrong:
+        return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or drifting, by {by}."
+    worst = "dead" in wrong or "died lately" in wrong
+    answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
+    more = ". ".join(f"{fault.capitalize()}: {listed(own)}" for fault, own in sorted(wrong.items()))
+    return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
+
+
+def _channels(sensor: Sensor, kept: Sequence[Kept], ordered: bool) -> list[Channel]:
+    return channels_of([touch.levels for touch in kept], [touch.material for touch in kept], sensor, ordered=ordered)
+
+
+def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> str:
+    """All channels, and their levels over the touches."""
+    if sensor.camera:
+        return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
+    if not kept:
+        return note(
+            "Not shown: this memory keeps no readings. One that was compacted before version 0.3, or opened with "
+            "recall=0, has none."
+        )
+    found = _channels(sensor, kept, ordered)
+    means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)
+    order = "in the order of observation" if ordered else "by material"
+    caption = (
+        f"Each row is a channel, 1 at the top; each column a touch, {order}. Dark is the least mean level that "
+        "the channel had, yellow the most. A dead channel is a stripe of one colour; a drifting one changes from left "
+        "to right."
+    )
+    words = (
+        f"Dead: never changes in {DEAD:.0%} of the touches, or in so many of the last {LATELY} (or no touch ever "
+        f"reached it). Saturated: {SATURATED:.0%} of its readings lie at the end of its range. Drifting: its level "
+        f"moves by {DRIFTING:.0%} of the range from the first touch to the last, beside what the materials explain."
+    )
+    unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
+    head = level_picture(means, f"mean level of each channel in each of {len(kept)} touches", caption)
+    return head + note(words) + state_rows(found, sensor, unit)
+
+
+def state_rows(found: Sequence[Channel], sensor: Sensor, unit: str) -> str:
+    """The table of channels; of very many those with a fault."""
+    chosen = found if len(found) <= MOST_ROWS else [channel for channel in found if channel.faults][:MOST_ROWS]
+    low, high = (np.broadcast_to(limit, (len(found),)) for limit in sensor.limits)
+    rows = []
+    for channel in chosen:
+        begin, span = float(low[channel.number - 1]), float(high[channel.number - 1] - low[channel.number - 1])
+        moved = "" if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f} %"
+        rows.append(
+            [
+                channel.number,
+                ", ".join(channel.faults) or "fine",
+                f"{begin + span * channel.middle:.3g}",
+                f"{begin + span * channel.low:.3g} to {begin + span * channel.high:.3g}",
+                f"{channel.still:.0%}",
+                f"{channel.bottom:.1%}",
+                f"{channel.top:.1%}",
+                moved or None,
+            ]
+        )
+    header = [
+        "channel",
+        "state",
+        f"median ({unit})" if unit else "median",
+        "90 % lie in",
+        "never changes",
+        "at bottom",
+        "at top",
+        "drift",
+    ]
+    left = len(found) - len(rows)
+    return table(header, rows, "channels") + (note(f"{left} others have no fault, and no row.") if left else "")
+
+
+def _levels_mean(levels: LevelArray) -> npt.NDArray[np.float64]:
+    read = levels != MISSING
+    return np.asarray(np.where(read, levels, 0).sum(axis=1) / np.maximum(read.sum(axis=1), 1))
+
+
+def _averaged(levels: npt.NDArray[np.number], columns: int) -> npt.NDArray[np.float64]:
+    """Levels (C, T) with their columns averaged down to at most so many."""
+    if levels.shape[1] <= columns:
+        return levels.astype(np.float64)
+    edges = np.linspace(0, levels.shape[1], columns + 1).astype(np.intp)
+    return np.asarray(np.add.reduceat(levels, edges[:-1], axis=1, dtype=np.float64) / np.diff(edges))
+
+
+def _spread_out(means: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Mean levels (C, touches), each channel from its least to its most but for the outermost hundredths."""
+    low, high = (np.quantile(means, share, axis=1, keepdims=True) for share in (0.01, 0.99))
+    return np.asarray((means - low) / np.maximum(high - low, 1.0) * (LEVELS - 1))
+
+
+def _thinned(levels: npt.NDArray[np.floating], columns: int) -> Pixels:
+    """Levels (C, T) as a picture, the columns averaged down to so many."""
+    levels = _averaged(_averaged(levels, columns).T, 4 * HIGHEST).T
+    return np.rint(np.clip(levels, 0, LEVELS - 1) * (255 / (LEVELS - 1))).astype(np.uint8)
+
+
+def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str) -> str:
+    """A picture of levels (C, T), each channel from its least to its most; `alternative` is for who cannot see it."""
+    few = _averaged(levels, COLUMNS)
+    pixels = _thinned(_spread_out(few), COLUMNS)
+    height = max(60, min(260, 9 * len(pixels)))
+    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="height:{height}px">'
+    return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
+
+
+def exemplar_pictures(sensor: Sensor, kept: Sequence[Kept], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
+    """A small picture of one touch of each material, of as many as there is room for."""
+    found: dict[str, str] = {}
+    if sensor.camera:
+        for name, ranked in exemplars.items():
+            if ranked and len(found) < MOST_PICTURES:
+                found[name] = png(_frame(sensor, ranked[0].readings))
+    else:
+        for touch in kept:
+            if touch.material not in found and len(found) < MOST_PICTURES:
+                found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
+    if not found:
+        return note("Not shown: no readings are kept, neither as exemplars nor for recall.")
+    names = {*exemplars, *(touch.material for touch in kept)}
+    what = (
+        "The middle frame of one touch of each material."
+        if sensor.camera
+        else "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
+    )
+    more = f" {len(names) - len(found)} more are not shown." if len(names) > len(found) else ""
+    items = "".join(
+        f'<figure><img src="{data}" alt="a touch of {shown(name)}">'
+        f"<figcaption>{name_of(clipped_name(name, 40))}</figcaption></figure>"
+        for name, data in sorted(found.items(), key=lambda pair: as_counted(pair[0]))
+    )
+    return note(what + more) + f'<div class="pictures{" frames" if sensor.camera else ""}">{items}</div>'
+
+
+def _touch(levels: LevelArray) -> npt.NDArray[np.float64]:
+    """A touch's levels, each channel from its own least to its own most, so that what moves is seen."""
+    read = levels != MISSING
+    low = np.where(read, levels, LEVELS).min(axis=1, keepdims=True)
+    high = np.where(read, levels, 0).max(axis=1, keepdims=True)
+    return np.asarray((np.where(read, levels, low) - low) / np.maximum(high - low, 1) * (LEVELS - 1), dtype=np.float64)
+
+
+def _frame(sensor: Sensor, readings: npt.NDArray[np.float32]) -> Pixels:
+    low, high = sensor.limits
+    small = scaled_down(readings[len(readings) // 2][None], *FRAME)[0]
+    return np.asarray(np.rint(np.clip((small - low) / (high - low), 0, 1) * 255), dtype=np.uint8)

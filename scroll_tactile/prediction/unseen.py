@@ -65,6 +65,7 @@ def unseen_touches(model: Model, false_alarms: float) -> list[UnseenTouch]:
 
 def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
     rows = {} if model.pooled is None else model.pooled.recall.rows()
+    held = set() if model.pooled is None else model.pooled.recall.held
     names_at: dict[tuple[Scale, ...], list[str]] = {}
     for touch, (material, key, _) in enumerate(model.sample):
         found = _judged(model, touch)
@@ -76,7 +77,11 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
         if material not in names or len(names) < 2:
             continue
         probability, novelty, strange = _said(apart, names, touch, stage, calibration)
-        if model.pooled is not None and key in rows and (probability.max() < SURE or strange > model.pooled.familiar):
+        if (
+            model.pooled is not None
+            and (material, key) in held
+            and (probability.max() < SURE or strange > model.pooled.familiar)
+        ):
             probability, novelty = _recalled(model.pooled, rows[key], names, probability, novelty, strange)
         threshold = calibration.threshold(false_alarms)
         yield UnseenTouch(material, key, tuple(names), probability, novelty, threshold)

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.sensors import Sensor
 
 __all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "Channel", "channels_of", "drift"]
 
@@ -71,18 +70,20 @@ class Channel:
 
 
 def channels_of(
-    touches: Sequence[LevelArray], materials: Sequence[str], sensor: Sensor, *, ordered: bool
+    touches: Sequence[LevelArray], materials: Sequence[str], signed: npt.NDArray[np.bool_], *, ordered: bool
 ) -> list[Channel]:
-    """The channels of some touches, levels (C, T) each. ordered: whether they come in the order of observation."""
+    """The channels of some touches, levels (C, T) each.
+
+    signed: whether zero lies inside the range of each, (C,). ordered: whether the touches come as they were observed.
+    """
     count = len(touches[0])
     still = np.array([_still(levels) for levels in touches])
     means = np.array([_mean(levels) for levels in touches])
     counts = np.zeros((count, 256), np.int64)
     for levels in touches:
-        for channel, row in enumerate(levels):
-            counts[channel] += np.bincount(row, minlength=256)
+        placed = np.arange(count)[:, None] * 256 + levels
+        counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
     drifts = drift(means, materials) if ordered else [None] * count
-    signed = np.broadcast_to((sensor.limits[0] < 0) & (sensor.limits[1] > 0), (count,))
     lately = still[-LATELY:].mean(axis=0) if ordered else still.mean(axis=0)
     return [
         _channel(i, counts[i], (float(still[:, i].mean()), float(lately[i])), drifts[i], signed=bool(signed[i]))

@@ -15,7 +15,7 @@ from scroll_tactile.report.drawing import LEFT, LETTER, WIDTH, Axis, Drawing, cl
 __all__ = ["Bin", "answers", "confusions", "dated", "histogram", "reliability", "shares", "timeline", "tree"]
 
 ROW = 15.0  # units a row of names
-RIGHT = WIDTH - 8.0
+RIGHT = WIDTH - 15.0
 COLUMNS = 256  # places along a time axis that are told apart
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import printable
 
-__all__ = ["LEFT", "WIDTH", "Axis", "Drawing", "as_counted", "clipped_name", "png", "shown", "steps", "tinted"]
+__all__ = ["LEFT", "WIDTH", "Axis", "Drawing", "as_counted", "brief", "clipped_name", "png", "shown", "steps", "tinted"]
 
 WIDTH = 360.0  # of every drawing, in its units: a phone's width, so that text stays as large as it is written
 LEFT = 92.0  # of it, for names
@@ -37,6 +37,11 @@ def clipped_name(name: str, longest: int = LONGEST_NAME) -> str:
     """A name, not yet escaped, cut to what there is room for."""
     name = printable(name)
     return name if len(name) <= longest else name[: longest - 1] + "…"
+
+
+def brief(value: float) -> str:
+    """A number to three digits, without an exponent where it is of a size that people read."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e7 else f"{value:.3g}"
 
 
 def as_counted(name: str) -> list[tuple[int, str]]:

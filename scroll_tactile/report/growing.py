@@ -79,14 +79,18 @@ def growing(
 ) -> tuple[list[Growing], str]:
     """The answers to some touches, each as if it had never been observed; and why there are no more, where some lack.
 
-    model: just fitted to the learner's memory; what is left out comes back. streams: the touches, by key.
-    """  # fmt: skip
+    model: just fitted to the learner's memory; what is left out comes back. Another is fitted where it has followed as
+    much as it can. streams: the touches, by key.
+    """
     extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, learner.augmentation)
     sampled = {(material, key): touch for material, key, touch in model.sample}
     found: list[Growing] = []
     for touch in touches:
         try:
-            with _without(model, touch, sampled[touch.material, touch.key]) as whole:
+            own = sampled[touch.material, touch.key]
+            if not _has_room(model, own):
+                model = learner.model()
+            with _without(model, own, touch) as whole:
                 if not whole:
                     return found, "the readouts could not be solved without the others"
                 answers = list(_answers(learner, model, extractor, extractor.stream(streams[touch.key])))
@@ -98,12 +102,17 @@ def growing(
     return found, ""
 
 
+def _has_room(model: Model, sampled: SampledTouch) -> bool:
+    """Whether the readouts can follow that a touch goes and comes back."""
+    return all(2 * len(rows) <= model.readouts[scale].system.room for scale, rows in rows_added(model, sampled).items())
+
+
 @contextmanager
-def _without(model: Model, touch: UnseenTouch, sampled: SampledTouch) -> Iterator[bool]:
+def _without(model: Model, sampled: SampledTouch, touch: UnseenTouch) -> Iterator[bool]:
     """The model as if it had never observed a touch, but for how it is calibrated; whether it could be made so."""
     rows, recall = rows_added(model, sampled), model.pooled.recall if model.pooled else None
-    place = None if recall is None else recall.rows().get(touch.key)
-    kept = None if recall is None or place is None else Kept(touch.material, touch.key, recall.levels(place))
+    held = recall is not None and (touch.material, touch.key) in recall.held
+    kept = Kept(touch.material, touch.key, recall.levels(recall.rows()[touch.key])) if recall and held else None
     gone = []
     try:
         for scale, own in rows.items():

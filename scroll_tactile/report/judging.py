@@ -101,16 +101,16 @@ def trusted(facts: MemoryFacts) -> str:
     )
     drawn = reliability(bins_of(facts.unseen), [touch.confidence for touch in facts.unseen])
     strange = unknown_by(facts.unseen)
-    if len(strange) > ROWS:
-        strange = [row for row in strange if row[1]]
-    bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in strange[:ROWS]]
-    rest = f" {len(strange) - ROWS} more materials have any." if len(strange) > ROWS else ""
     words = (
-        f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} (dashed) are meant "
-        f"to be.{rest} A material far above that varies more than it was shown to: teach more of it."
+        f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
+        "material far above that varies more than it was shown to: teach more of it."
     )
-    bar = figure(shares(bars, alarms, "share of touches left out called unknown"), words)
-    return side_by_side(figure(drawn, caption), bar if bars else note(words))
+    if len(strange) <= ROWS:
+        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in strange]
+        return side_by_side(figure(drawn, caption), figure(shares(bars, alarms, "called unknown, left out"), words))
+    rows = [[name, unknown, count] for name, unknown, count in strange if unknown]
+    listed = table(["material", "called unknown", "of"], rows, "touches called unknown")
+    return side_by_side(figure(drawn, caption), f"<div>{note(words)}{listed if rows else ''}</div>")
 
 
 def growing_answers(facts: MemoryFacts) -> str:

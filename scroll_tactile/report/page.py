@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.report.drawing import shown
+from scroll_tactile.report.drawing import brief, shown
 
 __all__ = [
     "Card",
@@ -78,7 +78,9 @@ code{font-family:ui-monospace,Menlo,Consolas,monospace;font-size:.85em}
 footer{margin-top:2.5rem;border-top:1px solid var(--line);padding-top:.8rem;font-size:.85rem;color:var(--soft)}
 @media print{:root{color-scheme:light;--paper:#fff;--ink:#000;--soft:#444;--line:#ccc;--card:#fff;--blue:#0067a8;
 --red:#c04a00;--green:#00795a;--band:#eee}body{max-width:none;padding:0;font-size:10pt}nav{display:none}
-.table{max-height:none;overflow:visible}th{position:static}h2,h3{break-after:avoid}tr,.card{break-inside:avoid}
+.table{max-height:none;overflow:visible}
+table{font-size:8pt}th,td{padding:.1rem .35rem}th,th.number{position:static;white-space:normal}td.name{min-width:0}
+h2,h3{break-after:avoid}tr,.card{break-inside:avoid}
 figure{max-width:13cm}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}
 """
 
@@ -158,7 +160,7 @@ def _is_number(cell: object) -> bool:
 def _cell(cell: object) -> str:
     if cell is None:
         return ""
-    return f"{cell:.3g}" if isinstance(cell, float) else str(cell) if isinstance(cell, int) else name_of(cell)
+    return brief(cell) if isinstance(cell, float) else str(cell) if isinstance(cell, int) else name_of(cell)
 
 
 def require_page(path: str | os.PathLike[str]) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from os import PathLike, fspath
 from pathlib import PurePosixPath
@@ -13,17 +14,18 @@ import numpy.typing as npt
 
 from scroll_tactile import __version__
 from scroll_tactile.errors import FieldError, InputError
-from scroll_tactile.readouts.likelihood import levels_of
-from scroll_tactile.recordings import Contents, Entry, Interval, Recording, describe, read, touches
-from scroll_tactile.recordings.presets import PRESETS
-from scroll_tactile.report.channels import channels_of
+from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.recordings import Contents, Interval, Recording, describe, read, touches
+from scroll_tactile.recordings.presets import find
+from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, Channel, channels_of
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.page import Card, State, cards, figure, note, page, table
 from scroll_tactile.report.sensing import card_of, level_picture, state_rows
-from scroll_tactile.sensors import Sensor
 
 __all__ = ["recording_page"]
+
+FloatArray = npt.NDArray[np.float64]
 
 STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
 MOST_ROWS = 60
@@ -35,41 +37,36 @@ def recording_page(path: str | PathLike[str], *, intervals: Sequence[Interval] |
     """One HTML page that shows what a recording holds; it needs no network and no script.
 
     chosen: topic, field, preset and the others of `read`; where a file has several fields and none is named, the
-    largest is shown. intervals: of touches in it; its episodes unless given.
+    first is shown. intervals: of touches in it; its episodes unless given.
 
     Raises what `describe` and `read` raise.
     """
     contents = describe(path)
     recording, why = _read(contents, fspath(path), chosen)
-    preset = chosen.get("preset")
-    sensor = PRESETS[preset].sensor if preset in PRESETS else None
-    sections = [("time", "Time", _time(recording)), ("channels", "Channels", _channels(recording, sensor))]
+    seen = _Seen.of(recording, chosen.get("preset"))
+    sections = [("time", "Time", _time(recording)), ("channels", "Channels", _channels(seen))]
     sections += [
         ("touches", "Touches", _touches(recording, intervals)),
         ("holds", "What the file has", _holds(contents)),
     ]
     where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
     under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
-    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, sensor)])
+    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen)])
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
     return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
 
 
 def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
-    """The recording, of what was asked for or of the largest there is; and what to say of that choice."""
+    """The recording, of what was asked for or of the first field there is; and what to say of that choice."""
     try:
         return read(path, **chosen), ""
     except FieldError:
         if any(chosen.get(name) for name in ("topic", "field", "preset")) or not contents.entries:
             raise
-    largest = max(contents.entries, key=_size)
-    found = read(path, **chosen | {"topic": largest.topic, "field": largest.field})
-    return found, " It is the largest of several; another is chosen by --topic and --field."
-
-
-def _size(entry: Entry) -> int:
-    return int(np.prod(entry.shape, dtype=np.int64)) * (entry.count or 1)
+    first = contents.entries[0]
+    found = read(path, **chosen | {"topic": first.topic, "field": first.field})
+    return found, f" It is the first of {len(contents.entries)} below; --topic and --field choose another."
 
 
 def _shape(recording: Recording) -> str:
@@ -100,13 +97,12 @@ def _clock(recording: Recording) -> Card:
         return "none", "How steady", "no clock", "Its readings have no times: give --clock or --rate."
     share = (report.jitter or 0.0) * report.rate
     state: State = "bad" if report.backward else "look" if report.gaps or share > 0.2 else "good"
-    gaps = (
-        f"{len(report.gaps)} gaps, the longest {max(gap.seconds for gap in report.gaps):.3g} s"
-        if report.gaps
-        else "no gaps"
-    )
+    gaps = "no gaps"
+    if report.gaps:
+        longest = max(gap.seconds for gap in report.gaps)
+        gaps = f"{len(report.gaps)} gap{'s' * (len(report.gaps) > 1)}, the longest {longest:.3g} s"
     back = f"; time goes back {report.backward} times" if report.backward else ""
-    answer = f"{report.rate:.4g} Hz, ± {1e3 * (report.jitter or 0):.2g} ms"
+    answer = f"{report.rate:.4g} Hz ± {max(1e3 * (report.jitter or 0), 0.001):.2g} ms"
     return state, "How steady", answer, f"By the clock {report.clock!r}: {gaps}{back}."
 
 
@@ -123,53 +119,66 @@ def _losses(recording: Recording) -> Card:
     return "look" if bad > LOST * len(recording) else "good", "What was lost", answer, counted
 
 
-def _levels(recording: Recording, sensor: Sensor | None) -> tuple[npt.NDArray[np.uint8], Sensor]:
-    """Levels (C, T), and the sensor that they are of: the preset's, or one whose range is that of these readings."""
-    readings = np.asarray(recording.readings, dtype=np.float64)
-    count = readings.shape[1]
-    if sensor is not None and sensor.channels == count:
-        return levels_of(readings, sensor), sensor
-    finite = np.where(np.isfinite(readings), readings, np.nan)
-    seen = np.isfinite(finite).any(axis=0)
-    low = np.where(seen, np.nanmin(finite, axis=0, where=seen, initial=np.inf), 0.0)
-    high = np.where(seen, np.nanmax(finite, axis=0, where=seen, initial=-np.inf), 1.0)
-    high = np.where(high > low, high, low + np.maximum(1.0, np.abs(low)))
-    own = Sensor(
-        name="seen", channels=count, rate=recording.report.rate or 1.0, low=tuple(low.tolist()),
-        high=tuple(high.tolist()), unit="", duration=max(1.0, 2 / (recording.report.rate or 1.0)),
-    )  # fmt: skip
-    return levels_of(finite, own), own
+@dataclass(frozen=True)
+class _Seen:
+    """The readings as levels (C, T), the range of each channel, (C,), and whether it is its sensor's; the channels."""
+
+    levels: LevelArray
+    low: FloatArray
+    high: FloatArray
+    ranged: bool
+    channels: list[Channel]
+
+    @classmethod
+    def of(cls, recording: Recording, preset: str | None) -> _Seen | None:
+        """None of pictures, and of a single reading."""
+        if recording.readings.ndim != 2 or len(recording) < 2:
+            return None
+        readings = np.asarray(recording.readings, dtype=np.float64)
+        readings = np.where(np.isfinite(readings), readings, np.nan)
+        sensor = None if preset is None else find(preset).sized(readings.shape[1])
+        if sensor is not None:
+            low, high = (np.broadcast_to(limit, readings.shape[1:]).astype(np.float64) for limit in sensor.limits)
+        else:
+            low, high = _range(readings)
+        shares = (readings / 2 - low / 2) / np.maximum(high / 2 - low / 2, np.finfo(np.float64).tiny)
+        levels = np.rint(np.clip(np.nan_to_num(shares), 0, 1) * (LEVELS - 1)).astype(np.uint8)
+        levels[np.isnan(readings)] = MISSING
+        levels = np.ascontiguousarray(levels.T)
+        parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
+        signed = (low < 0) & (high > 0) & (sensor is not None)
+        return cls(levels, low, high, sensor is not None, channels_of(parts, [""] * len(parts), signed, ordered=True))
 
 
-def _state(recording: Recording, sensor: Sensor | None) -> Card:
-    if recording.readings.ndim != 2 or len(recording) < 2:
+def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the most of each channel; 0 and 0 where nothing was read."""
+    read = np.isfinite(readings)
+    low, high = np.where(read, readings, np.inf).min(axis=0), np.where(read, readings, -np.inf).max(axis=0)
+    return np.where(read.any(axis=0), low, 0.0), np.where(read.any(axis=0), high, 0.0)
+
+
+def _state(recording: Recording, seen: _Seen | None) -> Card:
+    if seen is None:
         return "none", "Channels", "not looked at", "Only rows of numbers have channels that can be dead."
-    found = channels_of(*_stretches(recording, sensor), ordered=True)
-    return card_of(found, f"{len(recording)} readings")
+    return card_of(seen.channels, f"{len(recording)} readings")
 
 
-def _stretches(recording: Recording, sensor: Sensor | None) -> tuple[list[npt.NDArray[np.uint8]], list[str], Sensor]:
-    levels, own = _levels(recording, sensor)
-    parts = np.array_split(levels, max(1, min(STRETCHES, levels.shape[1] // 2)), axis=1)
-    return parts, [""] * len(parts), own
-
-
-def _channels(recording: Recording, sensor: Sensor | None) -> str:
-    if recording.readings.ndim != 2 or len(recording) < 2:
+def _channels(seen: _Seen | None) -> str:
+    if seen is None:
         return note("Not shown: these are pictures, or too few readings.")
-    levels, own = _levels(recording, sensor)
-    found = channels_of(*_stretches(recording, sensor), ordered=True)
     caption = (
         "Each row is a channel, 1 at the top; time runs to the right. Dark is the least mean level that the channel "
         "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
     )
     words = (
-        f"Dead: it never changes in most of {STRETCHES} equal stretches. Saturated: 5 % of the readings lie at the end "
-        "of the range. Drifting: its level moves by 5 % of the range from begin to end."
+        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Saturated: "
+        f"{SATURATED:.0%} of the readings lie at the end of the range. Drifting: its level moves by {DRIFTING:.0%} of "
+        "the range from begin to end."
     )
-    if own.name == "seen":
+    if not seen.ranged:
         words += " The range of a channel is what was seen of it; with --preset it is its sensor's, and means more."
-    return level_picture(levels, "level of each channel over time", caption) + note(words) + state_rows(found, own, "")
+    drawn = level_picture(seen.levels, "level of each channel over time", caption)
+    return drawn + note(words) + state_rows(seen.channels, seen.low, seen.high, "")
 
 
 def _time(recording: Recording) -> str:

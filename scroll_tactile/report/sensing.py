@@ -11,7 +11,7 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
-from scroll_tactile.report.drawing import as_counted, clipped_name, png, shown
+from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
 from scroll_tactile.report.page import Card, name_of, note, table
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
@@ -45,7 +45,10 @@ def channel_card(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> Card
 
 def card_of(found: Sequence[Channel], by: str) -> Card:
     """How channels stand, of these readings."""
-    wrong = {fault: [c for c in found if fault in c.faults] for c in found for fault in c.faults}
+    wrong: dict[str, list[Channel]] = {}
+    for channel in found:
+        for fault in channel.faults:
+            wrong.setdefault(fault, []).append(channel)
     if not wrong:
         return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or drifting, by {by}."
     worst = "dead" in wrong or "died lately" in wrong
@@ -55,7 +58,9 @@ def card_of(found: Sequence[Channel], by: str) -> Card:
 
 
 def _channels(sensor: Sensor, kept: Sequence[Kept], ordered: bool) -> list[Channel]:
-    return channels_of([touch.levels for touch in kept], [touch.material for touch in kept], sensor, ordered=ordered)
+    low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
+    levels, materials = [touch.levels for touch in kept], [touch.material for touch in kept]
+    return channels_of(levels, materials, (low < 0) & (high > 0), ordered=ordered)
 
 
 def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> str:
@@ -81,24 +86,27 @@ def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> s
         f"moves by {DRIFTING:.0%} of the range from the first touch to the last, beside what the materials explain."
     )
     unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
+    low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)
     head = level_picture(means, f"mean level of each channel in each of {len(kept)} touches", caption)
-    return head + note(words) + state_rows(found, sensor, unit)
+    return head + note(words) + state_rows(found, low, high, unit)
 
 
-def state_rows(found: Sequence[Channel], sensor: Sensor, unit: str) -> str:
-    """The table of channels; of very many those with a fault."""
+def state_rows(found: Sequence[Channel], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str) -> str:
+    """The table of channels, whose range is from low to high, (C,) each; of very many those with a fault."""
     chosen = found if len(found) <= MOST_ROWS else [channel for channel in found if channel.faults][:MOST_ROWS]
-    low, high = (np.broadcast_to(limit, (len(found),)) for limit in sensor.limits)
     rows = []
     for channel in chosen:
-        begin, span = float(low[channel.number - 1]), float(high[channel.number - 1] - low[channel.number - 1])
+        bottom, top = float(low[channel.number - 1]), float(high[channel.number - 1])
+        median, least, most = (
+            brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
+        )
         moved = "" if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f} %"
         rows.append(
             [
                 channel.number,
                 ", ".join(channel.faults) or "fine",
-                f"{begin + span * channel.middle:.3g}",
-                f"{begin + span * channel.low:.3g} to {begin + span * channel.high:.3g}",
+                median,
+                f"{least} to {most}",
                 f"{channel.still:.0%}",
                 f"{channel.bottom:.1%}",
                 f"{channel.top:.1%}",

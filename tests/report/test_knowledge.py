@@ -1,0 +1,184 @@
+"""What a page says is measured: touches left out, separations, calibration, and faults of channels."""
+
+import numpy as np
+import pytest
+from touches import PAD, SMALL, fed
+
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile import sensors as known
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.pipelines.metrics import calibration_error
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
+from scroll_tactile.readouts.likelihood import levels_of
+from scroll_tactile.report.channels import channels_of, drift
+from scroll_tactile.report.growing import chosen, growing, stream_of
+from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
+
+SENSOR = known.BIOTAC
+SCENE = Scene(sensor=SENSOR)
+NAMES = SCENE.materials[:4]
+
+
+def taught(leave=None, repetitions=6):
+    learner = TactileLearner(sensor=SENSOR, embedding=Kernels(dimension=64))
+    for i in range(repetitions):
+        for name in NAMES:
+            if (name, i) != leave:
+                learner.observe(name, SCENE.touch(name, i, seconds=1.0))
+    return learner
+
+
+@pytest.fixture(scope="module")
+def learner():
+    return taught()
+
+
+def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
+    unseen = {touch.key: touch for touch in unseen_touches(learner.model(), 0.05)}
+    assert len(unseen) == 24
+    for name, i in [(NAMES[0], 0), (NAMES[1], 3), (NAMES[3], 5)]:
+        touch = SCENE.touch(name, i, seconds=1.0)
+        answer = taught(leave=(name, i)).predict(touch)
+        said = unseen[touch.key]
+        assert said.material == name
+        assert said.answer == answer.material
+        # The calibration is that of all, and not of all others.
+        assert said.confidence == pytest.approx(answer.probability, abs=0.05)
+        assert said.probability.sum() == pytest.approx(1)
+
+
+def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
+    name, i = NAMES[2], 1
+    touch = SCENE.touch(name, i, seconds=1.0)
+    model = learner.model()
+    unseen = [one for one in unseen_touches(model, 0.05) if one.key == touch.key]
+    before = {scale: readout.counts.copy() for scale, readout in model.readouts.items()}
+    found, why = growing(learner, model, unseen, {touch.key: touch})
+    assert why == ""
+    assert found[0].seconds[-1] == 1.0
+    other = taught(leave=(name, i))
+    for seconds, prediction in zip(found[0].seconds, found[0].predictions, strict=True):
+        expected = dict(other.predict(touch.first(seconds)).ranking)
+        assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.15)
+    # The model knows the touch again.
+    assert all(np.array_equal(readout.counts, before[scale]) for scale, readout in model.readouts.items())
+    assert (name, touch.key) in model.pooled.recall.held
+    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
+    encoded = extractor.encode(touch, model.longest, lambda columns: model.needed(model.names, columns))
+    again = model.judge(model.names, encoded.means, encoded.columns)
+    fresh = learner.model().judge(model.names, encoded.means, encoded.columns)
+    assert again.probability == pytest.approx(fresh.probability, abs=1e-6)
+
+
+def test_the_moment_of_decision_is_the_first_that_is_decided(learner):
+    model = learner.model()
+    unseen = chosen(unseen_touches(model, 0.05), [touch.key for touch in learner.memory.kept.touches()], camera=False)
+    streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
+    found, _ = growing(learner, model, unseen[:1], streams, decided=lambda prediction, columns: columns >= 30)
+    assert found[0].seconds[found[0].decided] == 0.3
+    never, _ = growing(learner, learner.model(), unseen[:1], streams, decided=lambda prediction, columns: False)
+    assert never[0].decided is None
+    assert len({touch.material for touch in unseen}) == len(NAMES)
+
+
+def test_separations_are_the_log_odds_between_means(learner):
+    model = learner.model()
+    names, apart = separations(learner, model)
+    assert names == sorted(NAMES)
+    assert np.array_equal(apart, apart.T)
+    assert (np.diagonal(apart) == 0).all()
+    scales = [*model.stages[len(model.calibrations) - 1], *model.views]
+    weights = (model.whole or model.calibrations[-1]).weights
+    total = 0.0
+    for scale, weight in zip(scales, weights, strict=True):
+        readout, statistics = model.readouts[scale], learner.memory.statistics
+        mean = statistics.sums(scale, names[:1])[0] / statistics.counts(scale, names[:1])[0]
+        scores = readout.scores(mean, [readout.places[name] for name in names[:2]], "lda")
+        total += weight * (scores[0] - scores[1])
+    assert apart[0, 1] == pytest.approx(total, rel=1e-6)
+
+
+def touch(material, answer, confidence, known=True):
+    names = tuple(sorted({material, answer, "z"}))
+    rest = (1 - confidence) / (len(names) - 1)
+    chances = np.array([confidence if name == answer else rest for name in names])
+    return UnseenTouch(material, material.encode(), names, chances, 0.0 if known else 9.0, 5.0)
+
+
+def test_trust_is_counted():
+    touches = [touch("a", "a", 0.95) for _ in range(18)] + [touch("a", "b", 0.9), touch("b", "b", 0.6, known=False)]
+    trust = trust_in(touches)
+    assert trust.count == 20
+    assert trust.right == 0.95
+    assert trust.unknown == 0.05
+    right = [one.answer == one.material for one in touches]
+    assert trust.error == pytest.approx(calibration_error([one.confidence for one in touches], right, bins=10))
+    assert [(one.material, one.answer, one.count, one.tested) for one in mistakes(touches)] == [("a", "b", 1, 19)]
+    assert unknown_by(touches) == [("b", 1, 1), ("a", 0, 19)]
+    assert sum(found.count for found in bins_of(touches)) == 20
+    assert interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert interval(0, 0) == (0.0, 1.0)
+
+
+def test_overconfidence_is_more_than_chance():
+    wrong = [touch("a", "b" if i % 2 else "a", 0.99) for i in range(60)]
+    assert trust_in(wrong).miscalibrated
+    assert not trust_in([touch("a", "a", 0.99) for _ in range(60)]).miscalibrated
+
+
+def faults(spoil, count=60):
+    """The faults of each channel of touches that `spoil` changed; materials by turns."""
+    random = np.random.default_rng(0)
+    touches = []
+    for i in range(count):
+        readings = 100 + 20 * (i % 3) + 10 * random.standard_normal((80, 4))
+        spoil(i / count, readings)
+        touches.append(levels_of(readings, SENSOR.model_copy(update={"channels": 4, "name": "four"})))
+    found = channels_of(touches, [f"m{i % 3}" for i in range(count)], np.zeros(4, bool), ordered=True)
+    return [channel.faults for channel in found]
+
+
+def test_faults_of_channels_are_found():
+    def spoil(part, readings):
+        readings[:, 0] = 3.0
+        readings[::8, 1] = 400.0
+        readings[:, 2] += 60 * part
+
+    assert faults(spoil) == [["dead"], ["saturated"], ["drifting"], []]
+
+    def died(part, readings):
+        if part > 0.6:
+            readings[:, 3] = 90.0
+
+    assert faults(died)[3] == ["died lately"]
+    assert faults(lambda part, readings: None) == [[]] * 4
+
+    def lost(part, readings):
+        readings[:20, 1] = np.nan
+
+    assert faults(lost)[1] == ["missing readings"]
+
+
+def test_materials_taught_one_after_the_other_are_no_drift():
+    random = np.random.default_rng(0)
+    materials = [f"m{i // 20}" for i in range(60)]
+    means = (np.arange(60) // 20)[:, None] * 0.2 + 0.01 * random.standard_normal((60, 1))
+    slope, error = drift(means, materials)[0]
+    assert abs(slope) < 4 * error
+    assert drift(means[:10], materials[:10]) == [None]
+    assert drift(means, [str(i) for i in range(60)]) == [None]
+
+
+def test_a_signed_channel_saturates_at_both_ends():
+    readings = np.random.default_rng(0).normal(0, 2, (400, 27))
+    readings[::4, 5] = -30.0
+    found = channels_of([levels_of(readings, known.CONTACTILE)], [""], np.ones(27, bool), ordered=False)
+    assert [channel.number for channel in found if channel.faults] == [6]
+
+
+def test_a_small_memory_of_two_channels_is_left_out_too():
+    learner = fed([(name, (seed, 60)) for seed in range(3) for name in "ab"])
+    assert learner.sensor == PAD
+    assert learner.embedding.fingerprint == SMALL.fingerprint
+    assert len(unseen_touches(learner.model(), 0.05)) == 6

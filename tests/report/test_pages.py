@@ -1,0 +1,344 @@
+"""Pages in a real browser: nothing is asked for, nothing runs over, and what is odd is escaped or explained."""
+
+import re
+import struct
+import zlib
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import Browser
+from commands import refused, run
+
+from scroll_tactile import Frames, Kernels, Sensor, TactileLearner
+from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.errors import CapacityError, InputError, RecordingError
+from scroll_tactile.report import memory_page, recording_page, save
+from scroll_tactile.report.drawing import png, shown, steps, tinted
+
+PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
+SMALL = Kernels(seed=0, dimension=64)
+ODD = ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\"'&amp;</svg>", "עור חום", "a" * 200]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    opened = Browser()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def learner(tmp_path_factory):
+    """Five materials, twelve touches of each, one of them retracted, in a folder."""
+    scene = Scene(sensor=PAD)
+    made = TactileLearner.open(tmp_path_factory.mktemp("page") / "memory", sensor=PAD, embedding=SMALL, exemplars=4)
+    with made.batch():
+        receipts = [made.observe(name, scene.touch(name, i)) for i in range(12) for name in scene.materials[:5]]
+    made.retract(receipts[7])
+    yield made
+    made.close()
+
+
+class Checked(HTMLParser):
+    """Every element that opens closes, and none is of a kind that runs or fetches anything."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.kinds, self.text = [], set(), []
+        self.feed(html)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.kinds.add(tag)
+        assert tag not in ("script", "iframe", "object", "embed", "form", "base")
+        for name, value in attrs:
+            assert not name.startswith("on"), (tag, name)
+            assert name != "src" or value.startswith("data:image/png;base64,")
+            assert name != "href" or value.startswith(("#", "data:,"))
+        if tag not in ("meta", "link", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        assert tag == "path"
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def words(html):
+    """The text of a sound page."""
+    return " ".join(Checked(html).text)
+
+
+@pytest.mark.parametrize(
+    ("width", "look"), [(320, "light"), (390, "light"), (390, "dark"), (1280, "light"), (1280, "dark"), (640, "print")]
+)
+def test_a_page_fits_every_width_and_asks_for_nothing(browser, learner, tmp_path, width, look):
+    save(memory_page(learner), tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", width, dark=look == "dark", media="print" if look == "print" else "screen")
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    assert browser.asked_for == [(tmp_path / "page.html").as_uri()]
+    assert browser.said == []
+    # No letters of a drawing lie outside it.
+    over = """[...document.querySelectorAll('svg text')].filter(text => {
+        const own = text.getBoundingClientRect(), all = text.ownerSVGElement.getBoundingClientRect();
+        return own.left < all.left - 1 || own.right > all.right + 1 || own.bottom > all.bottom + 1;
+    }).map(text => text.textContent)"""
+    assert browser.evaluate(over) == []
+    paper = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    shade = sum(int(part) for part in re.findall(r"\d+", paper)[:3])
+    assert shade < 120 if look == "dark" else shade > 700
+
+
+def test_a_page_is_read_without_a_script_and_prints(browser, learner, tmp_path):
+    save(memory_page(learner), tmp_path / "page.html")
+    browser.ask("Emulation.setScriptExecutionDisabled", value=True)
+    browser.show(tmp_path / "page.html")
+    browser.ask("Emulation.setScriptExecutionDisabled", value=False)
+    assert browser.printed().startswith(b"%PDF")
+    # Printed tables are whole: nothing is left to scroll.
+    browser.show(tmp_path / "page.html", media="print")
+    hidden = "[...document.querySelectorAll('.table')].filter(box => box.scrollHeight > box.clientHeight + 2).length"
+    assert browser.evaluate(hidden) == 0
+
+
+def test_the_policy_of_a_page_lets_nothing_run(browser, tmp_path):
+    html = recording_page(_table(tmp_path)).replace("</main>", "<script>document.title = 'ran'</script></main>")
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html")
+    assert browser.evaluate("document.title") == "touch.csv"
+    assert browser.said  # it says that it was refused
+
+
+def test_odd_names_are_shown_and_not_run(browser, tmp_path):
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=2)
+    for i in range(3):
+        for place, name in enumerate(ODD):
+            learner.observe(name, Scene(sensor=PAD).touch(Scene(sensor=PAD).materials[place], i))
+    html = memory_page(learner, name="\u202egpj.<b>exe\x1b[31m")
+    assert "\u202e" not in html
+    assert "\x1b" not in html
+    text = words(html)
+    assert all(name in text for name in ODD)
+    assert "\\u202egpj.<b>exe\\x1b[31m" in text
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", 390)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+    assert browser.said == []
+
+
+def test_what_a_page_says_of_a_memory(learner):
+    html = memory_page(learner)
+    text = words(html)
+    assert "5 materials, 59 touches" in text
+    assert "1 of them were retracted" in text
+    assert learner.digest() in text
+    assert "all 6 alive" in text
+    assert "What is missing" not in text
+    assert text.count("A touch of ") == 6
+    assert len(html) < 400_000
+
+
+def test_an_empty_memory_and_one_material_say_what_is_missing():
+    learner = TactileLearner(sensor=PAD, embedding=SMALL)
+    text = words(memory_page(learner))
+    assert "nothing yet" in text
+    assert "no touch was observed yet" in text
+    for i in range(4):
+        learner.observe("bark", Scene(sensor=PAD).touch("bark", i))
+    text = words(memory_page(learner))
+    assert "1 material, 4 touches" in text
+    assert "teach a second one" in text
+    learner.observe("silk", Scene(sensor=PAD).touch("silk", 0))
+    assert "2 materials, 5 touches" in words(memory_page(learner))
+
+
+def test_single_touches_leave_nothing_out():
+    learner = TactileLearner(sensor=PAD, embedding=SMALL)
+    scene = Scene(sensor=PAD)
+    for name in scene.materials[:3]:
+        learner.observe(name, scene.touch(name, 0))
+    text = words(memory_page(learner))
+    assert "two materials with two touches or more of each" in text
+    assert "Nearest pairs" in text
+
+
+def test_a_compacted_memory_and_one_that_keeps_no_readings(tmp_path):
+    scene = Scene(sensor=PAD)
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, recall=0, exemplars=0) as learner:
+        for i in range(4):
+            for name in scene.materials[:3]:
+                learner.observe(name, scene.touch(name, i))
+        learner.compact()
+    with TactileLearner.open(tmp_path / "m", mode="read") as learner:
+        text = words(memory_page(learner))
+    assert "3 materials, 12 touches" in text
+    assert "of no touch that could be left out the readings are kept" in text
+    assert "this memory keeps no readings" in text
+    assert "touches left out" in text
+
+
+class Own(Kernels):
+    """A user's embedding, that nobody but the user can make."""
+
+    name = "own"
+
+    @property
+    def fingerprint(self):
+        return "0f" * 32
+
+
+def test_a_memory_of_an_own_embedding_is_shown_as_far_as_it_goes(tmp_path):
+    scene = Scene(sensor=PAD)
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Own(dimension=64)) as learner:
+        for i in range(4):
+            for name in scene.materials[:3]:
+                learner.observe(name, scene.touch(name, i))
+    result = run("report", tmp_path / "m", tmp_path / "page.html")
+    assert result.exit_code == 0, result.output
+    text = words((tmp_path / "page.html").read_text())
+    assert "3 materials, 12 touches" in text
+    assert "How answers grow" in text
+    assert "Whether to trust it" in text
+
+
+def test_a_camera_memory_shows_frames(browser, tmp_path):
+    camera = Sensor(
+        name="cam", channels=48 * 64 * 3, rate=25.0, low=0.0, high=255.0, unit="counts", duration=0.4,
+        layout=(48, 64, 3), camera=True,
+    )  # fmt: skip
+    learner = TactileLearner(sensor=camera, embedding=Frames(), exemplars=6)
+    random = np.random.default_rng(0)
+    for i in range(3):
+        for shift, name in enumerate(("knit", "weave")):
+            frames = np.full((6, 48, 64, 3), 100.0) + random.normal(0, 1, (6, 48, 64, 3))
+            frames[2:, 10 + i : 30, 10 + 8 * shift : 40] += 60
+            learner.observe(name, frames.clip(0, 255))
+    html = memory_page(learner)
+    assert "a camera has no channels" in words(html)
+    assert html.count('alt="a touch of') == 2
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", 390)
+    assert browser.evaluate("[...document.images].every(image => image.naturalWidth > 0)") is True
+    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_five_hundred_materials_make_a_small_page(browser, tmp_path):
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=4)
+    random = np.random.default_rng(0)
+    own = random.uniform(20, 230, (500, 6))
+    for _ in range(2):
+        for number in range(500):
+            waves = 20 * np.sin(np.arange(50)[:, None] * (1 + number % 7) / 5)
+            learner.observe(f"material {number}", own[number] + waves + random.normal(0, 4, (50, 6)))
+    html = memory_page(learner)
+    assert len(html.encode()) < 3_000_000
+    text = words(html)
+    assert "500 materials, 1000 touches" in text
+    assert "material 499" in text
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", 390)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+    assert browser.evaluate("window.find('material 437')") is True
+
+
+def test_more_materials_than_the_ridge_weighs_leave_a_page(learner, monkeypatch):
+    def refuse(_):
+        raise InputError("the readout weighs 1024 materials at most")
+
+    monkeypatch.setattr(TactileLearner, "model", refuse)
+    assert "Nothing could be fitted: the readout weighs 1024 materials at most" in words(memory_page(learner))
+
+    def lack(_):
+        raise CapacityError("no memory is left")
+
+    monkeypatch.setattr(TactileLearner, "model", lack)
+    with pytest.raises(CapacityError):
+        memory_page(learner)
+
+
+def _table(folder):
+    """A recording of 300 readings of three channels at 100 Hz, the second dead, with a gap of half a second."""
+    times = np.arange(300) / 100 + np.where(np.arange(300) >= 200, 0.5, 0.0)
+    values = np.random.default_rng(0).normal(100, 10, (300, 3))
+    values[:, 1] = 7.0
+    rows = [f"{time:.3f},{a:.6g},{b:.6g},{c:.6g}" for time, (a, b, c) in zip(times, values, strict=True)]
+    path = folder / "touch.csv"
+    path.write_text("\n".join(["time,e1,e2,e3", *rows]) + "\n")
+    return path
+
+
+def test_what_a_page_says_of_a_recording(browser, tmp_path):
+    html = recording_page(_table(tmp_path), field="e*", clock="time")
+    text = words(html)
+    assert "300 readings" in text
+    assert "100 Hz" in text
+    assert "1 gap, the longest 0.51 s" in text
+    assert "Dead: 2" in text
+    save(html, tmp_path / "page.html")
+    for width in (390, 1280):
+        browser.show(tmp_path / "page.html", width)
+        assert browser.evaluate("document.documentElement.scrollWidth") <= width
+        assert browser.said == []
+
+
+def test_the_command_tells_memories_from_recordings(learner, tmp_path):
+    path = _table(tmp_path)
+    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time")
+    assert made.exit_code == 0, made.output
+    assert "touch.csv" in (tmp_path / "page.html").read_text()
+    assert "only of a recording" in refused("report", learner.path, tmp_path / "page.html", "--topic", "/x")
+    assert "ends in .html" in refused("report", path, tmp_path / "touch.csv")
+    assert "not there" in refused("report", tmp_path / "gone.mcap", tmp_path / "page.html")
+    assert "cannot be written" in refused("report", path, tmp_path / "no" / "page.html")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["page.html", "touch.csv"]
+
+
+def test_intervals_cut_a_recording_on_its_page(tmp_path):
+    path = _table(tmp_path)
+    cut = tmp_path / "cut.csv"
+    cut.write_text("file,begin,end,material\ntouch.csv,0,1,<oak>\ntouch.csv,1,1.5,silk\n")
+    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time", "--intervals", cut)
+    assert made.exit_code == 0, made.output
+    text = words((tmp_path / "page.html").read_text())
+    assert "2 touches of 2 names" in text
+    assert "<oak>" in text
+    with pytest.raises(RecordingError):
+        recording_page(tmp_path / "gone.npy")
+
+
+def test_a_png_is_what_was_drawn():
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert _decoded(png(pixels)) == (4, 3, 3, pixels.tobytes())
+    colours = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    assert _decoded(png(colours)) == (4, 2, 2, colours.tobytes())
+    assert tinted(np.array([0.0, 1.0])).tolist() == [[0, 32, 76], [255, 233, 69]]
+
+
+def _decoded(address):
+    import base64
+
+    data = base64.b64decode(address.removeprefix("data:image/png;base64,"))
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    chunks, place = {}, 8
+    while place < len(data):
+        (size,), kind = struct.unpack(">I", data[place : place + 4]), data[place + 4 : place + 8]
+        body = data[place + 8 : place + 8 + size]
+        assert struct.unpack(">I", data[place + 8 + size : place + 12 + size])[0] == zlib.crc32(kind + body)
+        chunks[kind], place = body, place + 12 + size
+    width, height, _, kind = struct.unpack(">IIBB", chunks[b"IHDR"][:10])
+    rows = zlib.decompress(chunks[b"IDAT"])
+    length = len(rows) // height
+    assert all(rows[i * length] == 0 for i in range(height))
+    return width, height, kind, b"".join(rows[i * length + 1 : (i + 1) * length] for i in range(height))
+
+
+def test_names_and_axes():
+    assert shown("<a>\x00\u202e\"'&") == "&lt;a&gt;\\x00\\u202e&quot;&#x27;&amp;"
+    assert steps(0, 1, 5) == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    assert steps(3, 3) == [3]
+    assert steps(0, float("inf")) == [0]

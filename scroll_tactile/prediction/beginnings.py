@@ -28,7 +28,7 @@ from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["early_answers"]
+__all__ = ["early_answers", "stream_of", "without"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -106,17 +106,20 @@ def _others(readout: Readout, material: str, sampled: SampledTouch) -> bool:
     return place is None or readout.counts[place] > sampled.pairs[:, 2].max()
 
 
-def _without(model: Model, touch: _Left) -> Model:
-    """The model as if it had never observed a touch, but for how it is calibrated."""
+def without(model: Model, material: str, sampled: SampledTouch) -> Model:
+    """The model as if it had never observed a sampled touch, of a material that has others; calibrated as it is.
+
+    Kept touches stay what they are. Whoever calls has BLAS on one thread.
+    """
     other = copy.copy(model)
     other.readouts = dict(model.readouts)
     asked = [[*stage, *model.plan.views] for stage in model.stages]
     for scale, readout in model.readouts.items():
-        own = rows_at(touch.sampled, asked, scale)
+        own = rows_at(sampled, asked, scale)
         if own:
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
-            times = max(1, round(touch.sampled.pairs[own[0], 2] / len(own)))
-            other.readouts[scale] = readout.without(touch.material, np.repeat(touch.sampled.rows[own], times, axis=0))
+            times = max(1, round(sampled.pairs[own[0], 2] / len(own)))
+            other.readouts[scale] = readout.without(material, np.repeat(sampled.rows[own], times, axis=0))
     return other
 
 
@@ -129,8 +132,8 @@ def _said(
     moments: Sequence[int],
 ) -> dict[int, _Said]:
     """What is said of the beginnings of a touch that is left out, by their columns."""
-    other, levels = _without(model, touch), pooled.recall.levels(touch.row)
-    whole, said = _stream_of(levels, extractor.sensor), {}
+    other, levels = without(model, touch.material, touch.sampled), pooled.recall.levels(touch.row)
+    whole, said = stream_of(levels, extractor.sensor), {}
     for columns in moments:
         if columns > levels.shape[1]:
             break
@@ -144,7 +147,7 @@ def _said(
     return said
 
 
-def _stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
+def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
     """The readings that kept levels stand for; what was missing as the last before it."""
     low, high = sensor.limits
     lacking = levels == MISSING

@@ -26,7 +26,7 @@ from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.readouts.early import Moment
 from scroll_tactile.readouts.pooled import Pooled
 
-__all__ = ["judged"]
+__all__ = ["SURE", "judged", "together"]
 
 SURE = 0.99  # of the probability: less than that is looked up
 COUNTED = 30.0  # values, as which the evidence for a way to compare a touch counts: neighbours say the same
@@ -45,7 +45,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     early = early_answers(model, extractor) if encoded.columns < model.least else None
     moment = None if early is None else early.at(encoded.columns)
     ways = compared(model, extractor, candidates, encoded, judgement, pooled)
-    answers = [_answer(pooled, candidates, way, moment if way.own_time else None) for way in ways]
+    answers = [together(pooled, candidates, way, moment if way.own_time else None) for way in ways]
     evidence = np.array([way.recollection.evidence for way in ways])
     weights = np.exp(COUNTED * (evidence - evidence.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
@@ -53,8 +53,8 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     return Judgement(probability / probability.sum(), best.novelty, best.calibration, best.strange)
 
 
-def _answer(pooled: Pooled, candidates: Sequence[str], way: Compared, moment: Moment | None) -> Judgement:
-    """What the model and the kept touches say together, compared in one way; moment: of a beginning."""
+def together(pooled: Pooled, candidates: Sequence[str], way: Compared, moment: Moment | None) -> Judgement:
+    """What the model and the kept touches say of a touch, compared in one way; moment: of a beginning."""
     judgement, recollection = way.judgement, way.recollection
     beside = pooled if moment is None else moment.believed(pooled)
     heard = beside.familiarity(judgement.strange, way.own_time) * beside.trusted * way.logs

@@ -8,19 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.recalling import SURE
+from scroll_tactile.prediction.comparing import Compared
+from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.prediction.recalling import SURE, together
 from scroll_tactile.readouts.calibration import Calibration, common_names
 from scroll_tactile.readouts.leave_one_out import LeftOut
-from scroll_tactile.readouts.pooled import Pooled
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["UnseenTouch", "rows_added", "unseen_touches"]
+__all__ = ["UnseenTouch", "unseen_touches"]
 
 FloatArray = npt.NDArray[np.float64]
-
-TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -76,15 +73,13 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
         names = names_at.setdefault(tuple(scales), common_names(apart))
         if material not in names or len(names) < 2:
             continue
-        probability, novelty, strange = _said(apart, names, touch, stage, calibration)
-        if (
-            model.pooled is not None
-            and (material, key) in held
-            and (probability.max() < SURE or strange > model.pooled.familiar)
-        ):
-            probability, novelty = _recalled(model.pooled, rows[key], names, probability, novelty, strange)
+        said, pooled = _said(apart, names, touch, stage, calibration), model.pooled
+        kept = pooled is not None and (material, key) in held
+        if pooled is not None and kept and (said.probability.max() < SURE or said.strange > pooled.familiar):
+            recollection = pooled.recall.recollect(pooled.recall.levels(rows[key]), left_out=rows[key])
+            said = together(pooled, names, Compared(said, recollection, own_time=True), None)
         threshold = calibration.threshold(false_alarms)
-        yield UnseenTouch(material, key, tuple(names), probability, novelty, threshold)
+        yield UnseenTouch(material, key, tuple(names), said.probability, said.novelty, threshold)
 
 
 def _judged(model: Model, touch: int) -> tuple[int, list[Scale], Calibration] | None:
@@ -101,8 +96,8 @@ def _judged(model: Model, touch: int) -> tuple[int, list[Scale], Calibration] | 
 
 def _said(
     apart: Sequence[LeftOut], names: Sequence[str], touch: int, stage: int, calibration: Calibration
-) -> tuple[FloatArray, float, float]:
-    """Probability of the materials, novelty and strangeness, by the readouts."""
+) -> Judgement:
+    """What the readouts say of a touch that they never observed."""
     rows = [left.rows[touch, stage] for left in apart]
     places = [[left.names.index(name) for name in names] for left in apart]
     strange = np.array([left.strangeness[row] for left, row in zip(apart, rows, strict=True)])
@@ -112,40 +107,5 @@ def _said(
         logits += weight * left.scores[row][own]
     distances = [left.distances[row][own].min() for left, row, own in zip(apart, rows, places, strict=True)]
     novelty = float(calibration.novelty(np.array(distances)))
-    return _chances(logits), novelty, float(calibration.relative(strange).min())
-
-
-def _recalled(
-    pooled: Pooled, row: int, names: Sequence[str], probability: FloatArray, novelty: float, strange: float
-) -> tuple[FloatArray, float]:
-    """Probability and novelty with what the other kept touches say; see `prediction.recalling`."""
-    recollection = pooled.recall.recollect(pooled.recall.levels(row), left_out=row)
-    places = {name: i for i, name in enumerate(pooled.recall.materials)}
-    least = float(recollection.scores.min())
-    scores = np.array([recollection.scores[places[name]] if name in places else least for name in names])
-    believed = pooled.familiarity(strange, own_time=True) * pooled.trusted * (1 - recollection.trust)
-    logits = believed * np.log(np.maximum(probability, TINY)) + scores * pooled.steepness(recollection)
-    share = recollection.trust
-    return _chances(logits), float((1 - share) * novelty + share * pooled.novelty(recollection))
-
-
-def rows_added(model: Model, touch: SampledTouch) -> dict[Scale, npt.NDArray[np.int32]]:
-    """The rows that a sampled touch added to the statistics, codes (k, d) by scale, as the sample has them.
-
-    Of windows that were learned one by one these are their means, as often as there were windows.
-    """
-    rows: dict[Scale, list[npt.NDArray[np.int32]]] = {}
-    times: dict[Scale, int] = {}
-    asked = [[*stage, *model.plan.views] for stage in model.stages]
-    for row, (stage, place, count) in zip(touch.rows, touch.pairs.tolist(), strict=True):
-        if stage < len(asked) and place < len(asked[stage]):
-            rows.setdefault(asked[stage][place], []).append(row)
-            times[asked[stage][place]] = count
-    return {
-        scale: np.repeat(np.stack(own), max(1, round(times[scale] / len(own))), axis=0) for scale, own in rows.items()
-    }
-
-
-def _chances(logits: FloatArray) -> FloatArray:
     chances = np.exp(logits - logits.max())
-    return np.asarray(chances / chances.sum())
+    return Judgement(chances / chances.sum(), novelty, calibration, float(calibration.relative(strange).min()))

@@ -12,7 +12,18 @@ import numpy.typing as npt
 
 from scroll_tactile.report.drawing import LEFT, LETTER, WIDTH, Axis, Drawing, clipped_name
 
-__all__ = ["Bin", "answers", "confusions", "dated", "histogram", "reliability", "shares", "timeline", "tree"]
+__all__ = [
+    "Bin",
+    "answers",
+    "confusions",
+    "dated",
+    "histogram",
+    "over_time",
+    "reliability",
+    "shares",
+    "timeline",
+    "tree",
+]
 
 ROW = 15.0  # units a row of names
 RIGHT = WIDTH - 15.0
@@ -154,6 +165,23 @@ def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: s
         drawing.text(axis(share) + 4, y + 10.5, f"{share:.0%}", "tiny")
     if usual is not None:
         drawing.line([(axis(usual), 2), (axis(usual), bottom)], "ideal")
+    return drawing.svg()
+
+
+def over_time(seconds: Sequence[float], lines: Mapping[str, Sequence[float]]) -> str:
+    """Shares of touches over the seconds of each; three lines at most."""
+    drawing = Drawing(186, "Shares of touches by the time that was felt of each")
+    axis, up = Axis(0, max(seconds), 40, RIGHT), Axis(0, 1, 140, 12)
+    drawing.up(up, 40, RIGHT, "{:.0%}")
+    x = 40.0
+    for kind, (name, line) in zip(("own", "decided", "rival"), lines.items(), strict=False):
+        drawing.line([(axis(at), up(share)) for at, share in zip(seconds, line, strict=True)], kind)
+        drawing.line([(x, 176), (x + 18, 176)], kind)
+        drawing.text(x + 22, 180, name)
+        x += 36 + LETTER * len(name)
+        for at, share in zip(seconds, line, strict=True):
+            drawing.dot(axis(at), up(share), 2, "point", f"{name}: {share:.0%} after {at:.2g} s")
+    drawing.across(axis, 140, 140, "seconds of touch")
     return drawing.svg()
 
 

@@ -8,14 +8,24 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import CapacityError, ScrollTactileError
+from scroll_tactile.errors import (
+    CapacityError,
+    EmbeddingError,
+    MismatchError,
+    ScrollTactileError,
+    StreamError,
+    WeightsError,
+)
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.prediction.beginnings import stream_of
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.drawing import as_counted
-from scroll_tactile.report.growing import Decided, Growing, chosen, growing, stream_of
+from scroll_tactile.report.growing import Growing, Soon, chosen, growing, soon
 from scroll_tactile.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in
 from scroll_tactile.report.page import note
 from scroll_tactile.results import Observation
@@ -23,13 +33,18 @@ from scroll_tactile.signals.stream import validate
 
 __all__ = ["MemoryFacts"]
 
+CANNOT_EMBED = EmbeddingError, MismatchError, StreamError, WeightsError
+
 
 @dataclass
 class MemoryFacts:
-    """What a memory knows. missing: what the page cannot show and why, filled as it is made."""
+    """What a memory knows.
+
+    risk: the share of wrong answers among those decided. missing: what the page lacks and why, filled as it is made.
+    """
 
     learner: TactileLearner
-    decided: Decided
+    risk: float
     missing: list[str] = field(default_factory=list)
 
     def lacks(self, what: str, why: str) -> str:
@@ -98,12 +113,38 @@ class MemoryFacts:
         return self.learner.ranked_exemplars()
 
     @cached_property
+    def extractor(self) -> FeatureExtractor:
+        """What makes features of touches."""
+        learner = self.learner
+        return FeatureExtractor(learner.sensor, learner.embedding, learner.plan, learner.augmentation)
+
+    @cached_property
+    def rule(self) -> DecisionRule | None:
+        """When an answer is safe to act on; None where nothing can be left out, or embedded."""
+        if self.model is None or not self.unseen:
+            return None
+        try:
+            return decision_rule(self.model, self.extractor, self.risk)
+        except CANNOT_EMBED as error:
+            self.missing.append(f"When answers are decided: {error}")
+            return None
+
+    @cached_property
+    def soon(self) -> Soon | None:
+        """How soon answers come; None where that was not measured."""
+        if self.model is None or self.rule is None:
+            return None
+        return soon(self.model, self.extractor, self.rule, self.learner.settings.false_alarms)
+
+    @cached_property
     def growing(self) -> tuple[list[Growing], str]:
-        """How answers to a few left-out touches grow, and why there are no more. It moves the model, and comes last."""
-        sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
-        held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
+        """How answers to a few left-out touches grow, or why there are none."""
         if self.model is None or not self.unseen:
             return [], self.nothing_left_out
+        if self.rule is None:
+            return [], "the embedding is not at hand; see below."
+        sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
+        held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
         touches = chosen(self.unseen, kept or held, sensor.camera)
         if not touches:
             return [], "of no touch that could be left out the readings are kept."
@@ -111,7 +152,10 @@ class MemoryFacts:
             touch.key: stream_of(kept[touch.key].levels, sensor) if kept else validate(held[touch.key].readings, sensor)
             for touch in touches
         }
-        return growing(self.learner, self.model, touches, streams, self.decided)
+        try:
+            return growing(self.learner, self.model, self.extractor, self.rule, touches, streams), ""
+        except CANNOT_EMBED as error:
+            return [], str(error)
 
     @property
     def nothing_left_out(self) -> str:

@@ -1,35 +1,40 @@
-"""How the answer to a touch grows while it is felt: of touches that are left out, moment after moment."""
+"""How answers grow while a touch is felt, of touches that are left out; and when they are decided."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from scroll_tactile.embeddings.protocol import capabilities_of
-from scroll_tactile.errors import EmbeddingError, MismatchError, StreamError, WeightsError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.live.decision import DecisionRule
+from scroll_tactile.prediction.answer import answer
+from scroll_tactile.prediction.beginnings import early_answers, without
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.recalling import judged
-from scroll_tactile.prediction.unseen import UnseenTouch, rows_added
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.prediction.unseen import UnseenTouch
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.stream import Stream, fewest_readings, validate
+from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Decided", "Growing", "chosen", "growing", "stream_of", "sure"]
+__all__ = ["Growing", "Soon", "chosen", "growing", "soon"]
 
-Decided = Callable[[Prediction, int], bool]
-"""Whether a prediction after so many columns is safe to act on."""
-
-SURE = 0.95
-PARTS = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)  # of a touch, after which it is asked about
+PARTS = (
+    0.025,
+    0.05,
+    0.1,
+    0.15,
+    0.2,
+    0.3,
+    0.45,
+    0.6,
+    0.8,
+    1.0,
+)  # of a touch, where a rule has no moments before its end
 CAMERA_PARTS = (0.2, 0.4, 0.7, 1.0)
 TOUCHES, CAMERA_TOUCHES = 6, 3
 
@@ -47,9 +52,52 @@ class Growing:
     decided: int | None
 
 
-def sure(prediction: Prediction, columns: int) -> bool:
-    """Whether one material has 95 % of the probability, and the touch is not called unknown."""
-    return prediction.known and prediction.probability >= SURE
+@dataclass(frozen=True)
+class Soon:
+    """What is said of touches left out after some seconds of each.
+
+    seconds: of touch. right: the share of those touched so long whose likeliest material is the true one. decided,
+    wrong: the share of all that are decided by then, and that were decided and are wrong. count: of touches.
+    """
+
+    seconds: tuple[float, ...]
+    right: tuple[float, ...]
+    decided: tuple[float, ...]
+    wrong: tuple[float, ...]
+    count: int
+
+    @property
+    def median(self) -> float | None:
+        """The first of these moments at which half of the touches are decided."""
+        return next((at for at, share in zip(self.seconds, self.decided, strict=True) if share >= 0.5), None)
+
+
+def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
+    """How soon answers come, by touches left out of which beginnings are judged; None where none are kept for it."""
+    early = early_answers(model, extractor)
+    if early is None:
+        return None
+    said, rate = early.fitted, extractor.sensor.rate
+    done, wrong = np.zeros(len(said.targets), bool), np.zeros(len(said.targets), bool)
+    right, decided, mistaken = [], [], []
+    for i, moment in enumerate(early.moments):
+        threshold = moment.calibrated(model.calibrations[-1]).threshold(false_alarms)
+        chances, novelty = said.chances[:, i], said.novelty[:, i]
+        reached = np.isfinite(novelty)
+        best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
+        for touch in np.flatnonzero(reached & ~done).tolist():
+            name, chance = str(best[touch]), float(chances[touch].max())
+            known = bool(novelty[touch] <= threshold)
+            prediction = Prediction(
+                name, chance, ((name, chance),), float(novelty[touch]), known, moment.columns / rate
+            )
+            if rule.decided(prediction, moment.columns):
+                done[touch], wrong[touch] = True, not known or best[touch] != said.targets[touch]
+        right.append(float((best == said.targets)[reached].mean()) if reached.any() else 0.0)
+        decided.append(float(done.mean()))
+        mistaken.append(float(wrong.mean()))
+    seconds = tuple(moment.columns / rate for moment in early.moments)
+    return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(said.targets))
 
 
 def chosen(unseen: Sequence[UnseenTouch], keys: Iterable[bytes], camera: bool) -> list[UnseenTouch]:
@@ -73,89 +121,55 @@ def chosen(unseen: Sequence[UnseenTouch], keys: Iterable[bytes], camera: bool) -
 def growing(
     learner: TactileLearner,
     model: Model,
+    extractor: FeatureExtractor,
+    rule: DecisionRule,
     touches: Sequence[UnseenTouch],
     streams: Mapping[bytes, Stream],
-    decided: Decided = sure,
-) -> tuple[list[Growing], str]:
-    """The answers to some touches, each as if it had never been observed; and why there are no more, where some lack.
+) -> list[Growing]:
+    """The answers to some touches, each as if it had never been observed. streams: the touches, by key.
 
-    model: just fitted to the learner's memory; what is left out comes back. Another is fitted where it has followed as
-    much as it can. streams: the touches, by key.
+    Raises EmbeddingMismatchError where only its user can make the memory's embedding, and what that raises.
     """
-    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, learner.augmentation)
-    sampled = {(material, key): touch for material, key, touch in model.sample}
-    found: list[Growing] = []
+    early_answers(model, extractor)  # of the whole model, not of one that lacks a touch
+    found = []
     for touch in touches:
-        try:
-            own = sampled[touch.material, touch.key]
-            if not _has_room(model, own):
-                model = learner.model()
-            with _without(model, own, touch) as whole:
-                if not whole:
-                    return found, "the readouts could not be solved without the others"
-                answers = list(_answers(learner, model, extractor, extractor.stream(streams[touch.key])))
-        except (EmbeddingError, MismatchError, StreamError, WeightsError) as error:
-            return found, str(error)
-        when = next((i for i, (columns, at) in enumerate(answers) if decided(at, columns)), None)
-        predictions = tuple(prediction for _, prediction in answers)
-        found.append(Growing(touch.material, tuple(p.seconds for p in predictions), predictions, when))
-    return found, ""
-
-
-def _has_room(model: Model, sampled: SampledTouch) -> bool:
-    """Whether the readouts can follow that a touch goes and comes back."""
-    return all(2 * len(rows) <= model.readouts[scale].system.room for scale, rows in rows_added(model, sampled).items())
+        stream = extractor.stream(streams[touch.key])
+        with _without(model, touch) as other:
+            said = list(_answers(learner, other, extractor, rule, stream))
+        decided = next((i for i, (columns, at) in enumerate(said) if rule.decided(at, columns)), None)
+        predictions = tuple(prediction for _, prediction in said)
+        found.append(Growing(touch.material, tuple(at.seconds for at in predictions), predictions, decided))
+    return found
 
 
 @contextmanager
-def _without(model: Model, sampled: SampledTouch, touch: UnseenTouch) -> Iterator[bool]:
-    """The model as if it had never observed a touch, but for how it is calibrated; whether it could be made so."""
-    rows, recall = rows_added(model, sampled), model.pooled.recall if model.pooled else None
-    held = recall is not None and (touch.material, touch.key) in recall.held
-    kept = Kept(touch.material, touch.key, recall.levels(recall.rows()[touch.key])) if recall and held else None
-    gone = []
+def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
+    """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
+    sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
+    with one_thread():
+        other = without(model, touch.material, sampled)
+    recall = None if model.pooled is None else model.pooled.recall
+    if recall is None or (touch.material, touch.key) not in recall.held:
+        yield other
+        return
+    kept = Kept(touch.material, touch.key, recall.levels(recall.rows()[touch.key]))
+    recall.follow((), [(touch.material, touch.key)])
     try:
-        for scale, own in rows.items():
-            gone.append(scale)
-            if not model.readouts[scale].follow([(touch.material, own, -1)]):
-                yield False
-                return
-        if recall is not None and kept is not None:
-            recall.follow((), [(touch.material, touch.key)])
-        yield True
+        yield other
     finally:
-        for scale in gone:
-            model.readouts[scale].follow([(touch.material, rows[scale], 1)])
-        if recall is not None and kept is not None and (touch.material, touch.key) not in recall.held:
-            recall.follow([kept])
+        recall.follow([kept])
 
 
 def _answers(
-    learner: TactileLearner, model: Model, extractor: FeatureExtractor, stream: Stream
+    learner: TactileLearner, model: Model, extractor: FeatureExtractor, rule: DecisionRule, stream: Stream
 ) -> Iterator[tuple[int, Prediction]]:
-    """Columns and prediction after each part of a touch."""
-    sensor, fewest = learner.sensor, fewest_readings(learner.sensor)
+    """Columns and prediction at the rule's moments, or at some, and at the end."""
+    sensor, names = learner.sensor, model.names
     first = 1 if sensor.camera and capabilities_of(learner.embedding).rest is not None else 0  # the frame at rest
     parts = CAMERA_PARTS if sensor.camera else PARTS
-    names = model.names
-    for count in sorted({max(fewest, first + 1, round(part * len(stream))) for part in parts}):
+    counts = {round(part * len(stream)) for part in parts} if len(rule.moments) < 2 else {*rule.moments, len(stream)}
+    for count in sorted({min(max(fewest_readings(sensor), first + 1, count), len(stream)) for count in counts}):
         beginning = stream.first(count / sensor.rate)
         encoded = extractor.encode(beginning, model.longest, lambda columns: model.needed(names, columns))
-        with one_thread():
-            judgement = judged(model, extractor, names, encoded)
-        order = np.argsort(-judgement.probability, kind="stable").tolist()
-        ranking = tuple((names[i], float(judgement.probability[i])) for i in order)
-        known = judgement.novelty <= judgement.calibration.threshold(learner.settings.false_alarms)
-        yield encoded.columns, Prediction(*ranking[0], ranking, judgement.novelty, bool(known), beginning.seconds)
-
-
-def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
-    """The touch that kept levels stand for; what was missing is as the last reading before it."""
-    low, high = sensor.limits
-    lacking = levels == MISSING
-    if lacking.any():
-        last = np.maximum.accumulate(np.where(lacking, 0, np.arange(levels.shape[1])), axis=1)
-        levels = np.where(lacking, np.take_along_axis(levels, last, axis=1), levels)
-        levels = np.where(levels == MISSING, 0, levels)
-    readings = low + (high - low) * (levels.T.astype(np.float32) / np.float32(LEVELS - 1))
-    return validate(readings.clip(low, high), sensor)
+        prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
+        yield encoded.columns, prediction

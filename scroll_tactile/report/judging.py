@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.report.charts import answers, confusions, reliability, shares, tree
+from scroll_tactile.report.charts import answers, confusions, over_time, reliability, shares, tree
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.growing import SURE, Growing, sure
+from scroll_tactile.report.growing import Growing
 from scroll_tactile.report.knowledge import MOST_NEAR, bins_of, unknown_by
 from scroll_tactile.report.page import figure, note, side_by_side, table
 
@@ -114,33 +114,43 @@ def trusted(facts: MemoryFacts) -> str:
 
 
 def growing_answers(facts: MemoryFacts) -> str:
-    """How answers to a few touches grow while they are felt."""
+    """How soon answers come, and how those to a few touches grow while they are felt."""
     found, why = facts.growing
     if not found:
         return facts.lacks("How answers grow", why)
     words = (
         "The probability of each material while a touch goes on, as if it had never been observed. Solid: its own "
-        "material; dashed: the strongest other; upright: the first moment to act on. The first two are the hardest "
-        "touches there are."
+        "material; dashed: the strongest other at any moment; upright: when it is decided, at a risk of "
+        f"{facts.risk:.0%}. The first two are the hardest touches there are."
     )
-    rest = facts.lacks("How answers grow", f"further touches: {why}") if why else ""
-    return note(words) + rest + side_by_side(*(_grown(facts, touch) for touch in found))
+    return _soon(facts) + note(words) + side_by_side(*(_grown(touch) for touch in found))
 
 
-def _grown(facts: MemoryFacts, touch: Growing) -> str:
+def _soon(facts: MemoryFacts) -> str:
+    said = facts.soon
+    if said is None:
+        return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
+    lines = {"right": said.right, "decided": said.decided, "decided and wrong": said.wrong}
+    caption = (
+        f"Of {said.count} touches left out, after each time: the share whose likeliest material is the true one, the "
+        "share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
+    )
+    return figure(over_time(said.seconds, lines), caption)
+
+
+def _grown(touch: Growing) -> str:
     names = sorted({touch.material, *(name for at in touch.predictions for name, _ in at.ranking[:3])})
     chances = [dict(prediction.ranking) for prediction in touch.predictions]
     lines = {name: [of[name] for of in chances] for name in names}
     end = touch.predictions[-1]
     verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
     caption = f"A touch of {touch.material}. At its end: {verdict}{'' if end.known else ', and called unknown'}."
-    return figure(answers(touch.seconds, lines, touch.material, _moment(facts, touch)), caption)
+    return figure(answers(touch.seconds, lines, touch.material, _moment(touch)), caption)
 
 
-def _moment(facts: MemoryFacts, touch: Growing) -> tuple[float, str] | None:
+def _moment(touch: Growing) -> tuple[float, str] | None:
     if touch.decided is None:
         return None
-    rule = f"{SURE:.0%} sure" if facts.decided is sure else "decided"
     prediction, seconds = touch.predictions[touch.decided], touch.seconds[touch.decided]
-    wrong = "" if prediction.material == touch.material else ", wrongly"
-    return seconds, f"{rule} after {seconds:.2g} s{wrong}"
+    how = "unknown" if not prediction.known else "right" if prediction.material == touch.material else "wrong"
+    return seconds, f"decided after {seconds:.2g} s: {how}"

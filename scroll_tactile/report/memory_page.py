@@ -12,7 +12,6 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.growing import Decided, sure
 from scroll_tactile.report.judging import ROWS, alike, growing_answers, mixed_up, trusted
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
 from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
@@ -25,18 +24,18 @@ RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
 BARS = 60
 
 
-def memory_page(learner: TactileLearner, *, decided: Decided = sure, name: str | None = None) -> str:
+def memory_page(learner: TactileLearner, *, risk: float = 0.05, name: str | None = None) -> str:
     """One HTML page that shows what a memory knows; it needs no network and no script.
 
-    decided: whether a prediction after so many columns is safe to act on; 95 % of the probability unless given.
-    name: what stands above it; the folder's unless given. Nothing should be observed meanwhile: of a learner that goes
+    risk: the share of wrong answers among those that are decided, as of `TactileLearner.live`. name: what stands above
+    it; the folder's unless given. Nothing should be observed meanwhile: of a learner that goes
     on, give a `copy.deepcopy`, which is a snapshot.
 
     Where something is not there, such as readings in a compacted memory, the page says so, and why.
 
-    Raises CapacityError, and StoreError where a memory on disk cannot be read.
+    Raises InputError for a risk that is no share; CapacityError; and StoreError where a memory on disk cannot be read.
     """
-    facts = MemoryFacts(learner, decided)
+    facts = MemoryFacts(learner, risk)
     title = name or ("A memory without a path" if learner.path is None else learner.path.name)
     near, order = alike(facts)
     sensor = learner.sensor
@@ -53,7 +52,7 @@ def memory_page(learner: TactileLearner, *, decided: Decided = sure, name: str |
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
         sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))
     channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
-    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), channels])
+    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels])
     return page(title, _under(learner), summary, sections, _foot(learner))
 
 
@@ -112,6 +111,17 @@ def _trusts(facts: MemoryFacts) -> Card:
         words = "overconfident" if trust.confidence > trust.right else "underconfident"
         return "bad", heading, f"right {trust.right:.1%}, and {words}", more
     return _state(trust.right), heading, f"right {trust.right:.1%}, and says so", more
+
+
+def _soon(facts: MemoryFacts) -> Card:
+    said, heading = facts.soon, "How soon it answers"
+    if said is None:
+        return "none", heading, "not known", "Too few touches are kept to measure it."
+    wrong = said.wrong[-1] / said.decided[-1] if said.decided[-1] else 0.0
+    more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these not rightly."
+    if said.median is None:
+        return "look", heading, "not before the end", more
+    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {said.median:.3g} s", more
 
 
 def _state(right: float) -> State:

@@ -47,7 +47,7 @@ border-top:1px solid var(--line);padding-top:1rem}h3{font-size:1rem;margin:1.2re
 p{margin:.4rem 0;max-width:44rem}.soft,figcaption,th{color:var(--soft)}a{color:var(--blue)}
 nav{font-size:.9rem;margin:.6rem 0 1rem}nav a{margin-right:.9rem;white-space:nowrap;display:inline-block;
 padding:.15rem 0}
-.cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(14rem,1fr));gap:.7rem;margin:1rem 0}
+.cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(11.6rem,1fr));gap:.7rem;margin:1rem 0}
 .card{background:var(--card);border:1px solid var(--line);border-left:.35rem solid var(--soft);border-radius:.4rem;
 padding:.6rem .8rem}.card b{display:block;font-size:1.25rem;line-height:1.25;margin:.1rem 0 .25rem}
 .card p{font-size:.88rem;margin:0}.card small{color:var(--soft)}.good{border-left-color:var(--green)}

@@ -7,12 +7,14 @@ from touches import PAD, SMALL, fed
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.pipelines.metrics import calibration_error
+from scroll_tactile.prediction.beginnings import stream_of
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
 from scroll_tactile.readouts.likelihood import levels_of
 from scroll_tactile.report.channels import channels_of, drift
-from scroll_tactile.report.growing import chosen, growing, stream_of
+from scroll_tactile.report.growing import chosen, growing, soon
 from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
 
 SENSOR = known.BIOTAC
@@ -48,38 +50,61 @@ def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
         assert said.probability.sum() == pytest.approx(1)
 
 
+def grown(learner, touches, rule=None):
+    model = learner.model()
+    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
+    streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
+    unseen = [touch for touch in unseen_touches(model, 0.05) if touch.key in touches]
+    rule = rule or decision_rule(model, extractor, 0.05)
+    return model, growing(learner, model, extractor, rule, unseen, streams)
+
+
 def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
     name, i = NAMES[2], 1
     touch = SCENE.touch(name, i, seconds=1.0)
-    model = learner.model()
-    unseen = [one for one in unseen_touches(model, 0.05) if one.key == touch.key]
-    before = {scale: readout.counts.copy() for scale, readout in model.readouts.items()}
-    found, why = growing(learner, model, unseen, {touch.key: touch})
-    assert why == ""
+    model, found = grown(learner, [touch.key])
+    assert found[0].material == name
     assert found[0].seconds[-1] == 1.0
     other = taught(leave=(name, i))
     for seconds, prediction in zip(found[0].seconds, found[0].predictions, strict=True):
         expected = dict(other.predict(touch.first(seconds)).ranking)
-        assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.15)
-    # The model knows the touch again.
-    assert all(np.array_equal(readout.counts, before[scale]) for scale, readout in model.readouts.items())
+        assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
+    # The model has not lost the touch.
     assert (name, touch.key) in model.pooled.recall.held
-    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
-    encoded = extractor.encode(touch, model.longest, lambda columns: model.needed(model.names, columns))
-    again = model.judge(model.names, encoded.means, encoded.columns)
-    fresh = learner.model().judge(model.names, encoded.means, encoded.columns)
-    assert again.probability == pytest.approx(fresh.probability, abs=1e-6)
+    assert len(model.pooled.recall) == 24
 
 
-def test_the_moment_of_decision_is_the_first_that_is_decided(learner):
+def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
+    key = SCENE.touch(NAMES[0], 0, seconds=1.0).key
+    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.05, sure=0.0, strange=0.0))
+    assert found[0].seconds == (0.1, 0.3, 0.5, 1.0)
+    assert found[0].decided == 0
+    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.0, sure=1.1, strange=1e9))
+    assert found[0].decided is None
+
+
+def test_a_few_touches_of_different_materials_are_chosen(learner):
+    unseen = unseen_touches(learner.model(), 0.05)
+    few = chosen(unseen, [touch.key for touch in unseen], camera=False)
+    assert len(few) == 6
+    assert {touch.material for touch in few} == set(NAMES)
+    least = min(unseen, key=lambda touch: touch.probability[touch.names.index(touch.material)])
+    assert few[0].key == least.key
+    assert chosen(unseen, [], camera=False) == []
+
+
+def test_how_soon_answers_come_is_counted(learner):
     model = learner.model()
-    unseen = chosen(unseen_touches(model, 0.05), [touch.key for touch in learner.memory.kept.touches()], camera=False)
-    streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
-    found, _ = growing(learner, model, unseen[:1], streams, decided=lambda prediction, columns: columns >= 30)
-    assert found[0].seconds[found[0].decided] == 0.3
-    never, _ = growing(learner, learner.model(), unseen[:1], streams, decided=lambda prediction, columns: False)
-    assert never[0].decided is None
-    assert len({touch.material for touch in unseen}) == len(NAMES)
+    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
+    said = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, strange=0.0), 0.05)
+    assert said.decided == (1.0,) * len(said.seconds)
+    assert said.median == said.seconds[0]
+    assert len(set(said.wrong)) == 1
+    assert said.wrong[0] >= 1 - said.right[0]
+    never = soon(model, extractor, DecisionRule((1,), 0.0, sure=1.1, strange=1e9), 0.05)
+    assert never.decided == never.wrong == (0.0,) * len(said.seconds)
+    assert never.median is None
+    assert never.right == said.right
 
 
 def test_separations_are_the_log_odds_between_means(learner):

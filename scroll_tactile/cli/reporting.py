@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from scroll_tactile.cli.terminal import opened_for_upkeep, say, shown
+from scroll_tactile.cli.terminal import opened_for_upkeep, progress_bar, say, shown
 from scroll_tactile.errors import InputError
 from store import NotAStoreError
 
@@ -37,8 +37,8 @@ def report(
             raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
         from scroll_tactile.report.memory_page import memory_page
 
-        with opened_for_upkeep(source, mode="read") as learner:
-            html = memory_page(learner)
+        with opened_for_upkeep(source, mode="read") as learner, progress_bar() as progress:
+            html = memory_page(learner, progress=progress)
     else:
         from scroll_tactile.recordings import read_intervals
         from scroll_tactile.report.recording_page import recording_page

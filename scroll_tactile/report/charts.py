@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.report.drawing import LEFT, LETTER, WIDTH, Axis, Drawing, clipped_name
+from scroll_tactile.report.drawing import LEFT, WIDTH, Axis, Drawing, clipped_name
 
 __all__ = [
     "Bin",
@@ -26,7 +26,9 @@ __all__ = [
 ]
 
 ROW = 15.0  # units a row of names
+LETTER = 7.0  # a letter's width, about
 RIGHT = WIDTH - 15.0
+FIRST_DATE = 1e8  # seconds since 1970: less are counted from some other moment
 COLUMNS = 256  # places along a time axis that are told apart
 
 
@@ -49,10 +51,11 @@ def timeline(rows: Sequence[tuple[str, Sequence[float], Sequence[float]]], begin
         for times, kind in ((kept, "tick"), (retracted, "tick gone")):
             places = sorted({round(axis(time) * COLUMNS / WIDTH) * WIDTH / COLUMNS for time in times})
             drawing.ticks(places, top + 2, ROW - 4, kind)
-    drawing.text(LEFT, bottom + 13, dated(begin), "small")
+    of_day = begin > FIRST_DATE
+    drawing.text(LEFT, bottom + 13, dated(begin) if of_day else f"{begin:.4g} s", "small")
     if end > begin:
-        drawing.text(RIGHT, bottom + 13, dated(end), "small", "end")
-    drawing.text((LEFT + RIGHT) / 2, bottom + 27, "time of observation (UTC)", "small", "middle")
+        drawing.text(RIGHT, bottom + 13, dated(end) if of_day else f"{end:.4g} s", "small", "end")
+    drawing.text((LEFT + RIGHT) / 2, bottom + 27, "time (UTC)" if of_day else "time", "small", "middle")
     return drawing.svg()
 
 
@@ -207,9 +210,9 @@ def answers(
         drawing.text(x + (-4 if late else 4), 11, words, "small", "end" if late else "start")
     drawing.across(axis, 140, 140, "seconds of touch")
     drawing.line([(40, 184), (60, 184)], "own")
-    drawing.text(64, 188, clipped_name(own, 18), title=own)
+    drawing.text(64, 188, clipped_name(own, 120), title=own)
     if rival is not None:
-        x = 64 + LETTER * len(clipped_name(own, 18)) + 16
+        x = 80 + min(120.0, LETTER * len(own))
         drawing.line([(x, 184), (x + 20, 184)], "rival")
-        drawing.text(x + 24, 188, clipped_name(rival, 18), title=rival)
+        drawing.text(x + 24, 188, clipped_name(rival, 120), title=rival)
     return drawing.svg()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import math
 import re
 import struct
+import unicodedata
 import zlib
 from collections.abc import Sequence
 from html import escape
@@ -19,8 +21,8 @@ __all__ = ["LEFT", "WIDTH", "Axis", "Drawing", "as_counted", "brief", "clipped_n
 
 WIDTH = 360.0  # of every drawing, in its units: a phone's width, so that text stays as large as it is written
 LEFT = 92.0  # of it, for names
-LETTER = 6.2  # the width of a letter, about
-LONGEST_NAME = 15  # letters
+TINY = 1e-300
+ROOM = LEFT - 8.0  # for a name
 
 # Cividis by nine of its colours: as even for eyes that tell few colours apart (Nuñez, Anderton and Renslow 2018).
 COLOURS = ((0, 32, 76), (0, 52, 110), (54, 70, 108), (87, 93, 109), (112, 113, 115), (138, 134, 120), (171, 159, 112), (214, 189, 84), (255, 233, 69))  # fmt: skip  # noqa: E501
@@ -33,10 +35,22 @@ def shown(text: object) -> str:
     return escape(printable(str(text)))
 
 
-def clipped_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """A name, not yet escaped, cut to what there is room for."""
+def clipped_name(name: str, room: float = ROOM) -> str:
+    """A name, not yet escaped, cut to the units that there are for it."""
     name = printable(name)
-    return name if len(name) <= longest else name[: longest - 1] + "…"
+    sizes = [_size(letter) for letter in name]
+    if sum(sizes) <= room:
+        return name
+    reach = room - _size("…")
+    kept = sum(total <= reach for total in itertools.accumulate(sizes))
+    return name[:kept] + "…"
+
+
+def _size(letter: str) -> float:
+    """About how wide a letter is, in units: more where a font is not known than in most."""
+    if unicodedata.east_asian_width(letter) in "WF":
+        return 11.0
+    return 10.0 if letter in "mwMW@%…" else 8.2 if letter.isupper() else 3.6 if letter in "iljt.,:;!'| " else 7.0
 
 
 def brief(value: float) -> str:
@@ -73,13 +87,13 @@ def tinted(shares: npt.NDArray[np.floating]) -> ByteArray:
 
 def steps(low: float, high: float, count: int = 5) -> list[float]:
     """About so many round numbers from low to high."""
-    if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+    if not math.isfinite(high - low) or high - low < TINY:
         return [low]
     rough = (high - low) / count
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
     first = math.ceil(low / step - 1e-9)
-    return [round(i * step, 12) for i in range(first, math.floor(high / step + 1e-9) + 1)]
+    return [float(f"{i * step:.12g}") for i in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
 class Axis:

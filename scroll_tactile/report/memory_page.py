@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 import numpy as np
@@ -22,13 +24,21 @@ FEW = 30  # touches left out: with fewer, nothing said of them is certain
 FEW_TOUCHES = 3  # of a material
 RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
 BARS = 60
+STEPS = 3
 
 
-def memory_page(learner: TactileLearner, *, risk: float = 0.05, name: str | None = None) -> str:
+def memory_page(
+    learner: TactileLearner,
+    *,
+    risk: float = 0.05,
+    name: str | None = None,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> str:
     """One HTML page that shows what a memory knows; it needs no network and no script.
 
     risk: the share of wrong answers among those that are decided, as of `TactileLearner.live`. name: what stands above
-    it; the folder's unless given. Nothing should be observed meanwhile: of a learner that goes
+    it; the folder's unless given. progress: called with (what is being done, steps done, steps in
+    all). Nothing should be observed meanwhile: of a learner that goes
     on, give a `copy.deepcopy`, which is a snapshot.
 
     Where something is not there, such as readings in a compacted memory, the page says so, and why.
@@ -37,22 +47,29 @@ def memory_page(learner: TactileLearner, *, risk: float = 0.05, name: str | None
     """
     facts = MemoryFacts(learner, risk)
     title = name or ("A memory without a path" if learner.path is None else learner.path.name)
+    show = progress or (lambda what, done, of: None)
+    show("touches left out", 0, STEPS)
     near, order = alike(facts)
+    known, mixed, calibrated = _known(facts), mixed_up(facts, order), trusted(facts)
+    show("beginnings of touches", 1, STEPS)
+    grown = growing_answers(facts)
+    show("channels", 2, STEPS)
     sensor = learner.sensor
     sections = [
-        ("known", "What it knows", _known(facts)),
+        ("known", "What it knows", known),
         ("alike", "Who is near whom", near),
-        ("mixed", "What it mixes up", mixed_up(facts, order)),
-        ("trust", "Whether to trust it", trusted(facts)),
+        ("mixed", "What it mixes up", mixed),
+        ("trust", "Whether to trust it", calibrated),
+        ("growing", "How answers grow", grown),
         ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
         ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
     ]
-    sections.insert(4, ("growing", "How answers grow", growing_answers(facts)))
+    channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
+    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels])
     if facts.missing:
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
         sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))
-    channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
-    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels])
+    show("written", STEPS, STEPS)
     return page(title, _under(learner), summary, sections, _foot(learner))
 
 
@@ -76,17 +93,17 @@ def _foot(learner: TactileLearner) -> str:
 def _knows(facts: MemoryFacts) -> Card:
     count = sum(facts.counts.values())
     if not count:
-        return "none", "What it knows", "nothing yet", "Teach a touch: scroll-tactile observe."
+        return "none", "It knows", "nothing yet", "Teach a touch: scroll-tactile observe."
     least = min(facts.counts, key=lambda name: facts.counts[name])
     last = max((row.time for row in facts.journal if row.state != "retracted"), default=None)
     few = f"Fewest touches: {facts.counts[least]}, of {least}." if len(facts.counts) > 1 else ""
     when = "" if last is None else f" Last touch {dated(last)} UTC."
     answer = f"{len(facts.counts)} material{'s' * (len(facts.counts) > 1)}, {count} touch{'es' * (count > 1)}"
-    return "look" if facts.counts[least] < FEW_TOUCHES else "good", "What it knows", answer, few + when
+    return "look" if facts.counts[least] < FEW_TOUCHES else "good", "It knows", answer, few + when
 
 
 def _mixes(facts: MemoryFacts) -> Card:
-    trust, heading = facts.trust, "What it mixes up"
+    trust, heading = facts.trust, "It mixes up"
     if trust is None:
         return "none", heading, "not known", _sentence(facts.nothing_left_out)
     wrong = round((1 - trust.right) * trust.count)
@@ -98,7 +115,7 @@ def _mixes(facts: MemoryFacts) -> Card:
 
 
 def _trusts(facts: MemoryFacts) -> Card:
-    trust, heading = facts.trust, "Whether to trust it"
+    trust, heading = facts.trust, "Its answers are"
     if trust is None:
         return "none", heading, "not known", _sentence(facts.nothing_left_out)
     more = (
@@ -114,14 +131,14 @@ def _trusts(facts: MemoryFacts) -> Card:
 
 
 def _soon(facts: MemoryFacts) -> Card:
-    said, heading = facts.soon, "How soon it answers"
+    said, heading = facts.soon, "It answers"
     if said is None:
         return "none", heading, "not known", "Too few touches are kept to measure it."
     wrong = said.wrong[-1] / said.decided[-1] if said.decided[-1] else 0.0
     more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these not rightly."
     if said.median is None:
         return "look", heading, "not before the end", more
-    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {said.median:.3g} s", more
+    return "good" if wrong <= 2 * facts.risk else "look", heading, f"in {said.median:.2g} s, half of touches", more
 
 
 def _state(right: float) -> State:
@@ -166,14 +183,15 @@ def _over_time(facts: MemoryFacts) -> str:
         alone = facts.learner.path is None
         why = "this memory has no path, so that nobody noted when." if alone else "its journal names no touches."
         return facts.lacks("Touches over time", why)
-    times = [row.time for row in facts.journal]
+    times = [row.time for row in facts.journal if math.isfinite(row.time)] or [0.0]
     begin, end = min(times), max(times)
     gone = sum(row.state == "retracted" for row in facts.journal)
     also = f" {gone} of them were retracted: dashed." if gone else ""
     if len(facts.counts) <= ROWS:
         rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
         for row in facts.journal:
-            rows.setdefault(row.material, ([], []))[row.state == "retracted"].append(row.time)
+            if math.isfinite(row.time):
+                rows.setdefault(row.material, ([], []))[row.state == "retracted"].append(row.time)
         drawn = timeline([(name, *both) for name, both in rows.items()][: 2 * ROWS], begin, end)
         caption = f"Each upright line is a touch, or several at nearly one time; {len(times)} in all.{also}"
         return figure(drawn, caption)

@@ -52,7 +52,8 @@ padding:.15rem 0}
 padding:.6rem .8rem}.card b{display:block;font-size:1.25rem;line-height:1.25;margin:.1rem 0 .25rem}
 .card p{font-size:.88rem;margin:0}.card small{color:var(--soft)}.good{border-left-color:var(--green)}
 .look{border-left-style:double;border-left-color:var(--red)}.bad{border-left-color:var(--red)}
-.sign{float:right;font-size:.85rem;color:var(--soft)}.good .sign{color:var(--green)}
+.card div{display:flex;justify-content:space-between;gap:.4rem}
+.sign{font-size:.85rem;color:var(--soft);white-space:nowrap}.good .sign{color:var(--green)}
 .look .sign,.bad .sign{color:var(--red);font-weight:600}
 .pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(21rem,100%),1fr));gap:1rem 2rem}
 figure{margin:.8rem 0;max-width:34rem;break-inside:avoid}figcaption{font-size:.88rem;margin-top:.3rem}
@@ -118,8 +119,8 @@ def cards(found: Iterable[Card]) -> str:
     for state, heading, answer, more in found:
         sign, meaning = SIGNS[state]
         parts.append(
-            f'<div class="card {state}"><span class="sign">{sign} {meaning}</span><small>{shown(heading)}</small>'
-            f"<b>{name_of(answer)}</b><p>{shown(more)}</p></div>"
+            f'<div class="card {state}"><div><small>{shown(heading)}</small><span class="sign">{sign} {meaning}</span>'
+            f"</div><b>{name_of(answer)}</b><p>{shown(more)}</p></div>"
         )
     return f'<div class="cards">{"".join(parts)}</div>'
 

@@ -18,7 +18,7 @@ from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.recordings import Contents, Interval, Recording, describe, read, touches
 from scroll_tactile.recordings.presets import find
 from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, Channel, channels_of
-from scroll_tactile.report.charts import dated, histogram, timeline
+from scroll_tactile.report.charts import FIRST_DATE, dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.page import Card, State, cards, figure, note, page, table
 from scroll_tactile.report.sensing import card_of, level_picture, state_rows
@@ -75,8 +75,9 @@ def _shape(recording: Recording) -> str:
 
 
 def _seconds(recording: Recording) -> float | None:
-    times = recording.times[np.isfinite(recording.times)]
-    return float(times.max() - times.min()) if len(times) > 1 else None
+    steps = np.diff(recording.times)
+    steps = steps[np.isfinite(steps)]
+    return float(steps[steps > 0].sum()) if len(steps) else None  # of an episode each, where they begin anew
 
 
 def _length(recording: Recording) -> Card:
@@ -199,7 +200,7 @@ def _time(recording: Recording) -> str:
     rows = [[gap.index, f"{recording.times[gap.index - 1] - begin:.3f}", gap.seconds] for gap in longest_first]
     gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
     more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
-    first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > 1e8 else ""
+    first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > FIRST_DATE else ""
     said = "".join(note(text) for text in recording.report.notes)
     return (
         figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + said
@@ -223,7 +224,8 @@ def _touches(recording: Recording, intervals: Sequence[Interval] | None) -> str:
         if start is not None:
             spans.setdefault(touch.material or "no name", ([], []))[0].append(float(touch.times[0]))
     drawn = ""
-    if begin is not None and len(spans) <= MOST_NAMES and len(found) > 1:
+    anew = bool((np.diff(recording.times) < 0).any())  # each episode counts from its own begin
+    if begin is not None and not anew and len(spans) <= MOST_NAMES and len(found) > 1:
         every = [(name, *both) for name, both in spans.items()]
         drawn = figure(timeline(every, begin, float(recording.times[-1])), "Each upright line is the begin of a touch.")
     listed = table(["material", "readings", "begins (s)", "lasts (s)"], rows[:1000], "touches")

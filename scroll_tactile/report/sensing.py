@@ -183,7 +183,7 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[Kept], exemplars: Mapping[s
     more = f" {len(names) - len(found)} more are not shown." if len(names) > len(found) else ""
     items = "".join(
         f'<figure><img src="{data}" alt="a touch of {shown(name)}">'
-        f"<figcaption>{name_of(clipped_name(name, 40))}</figcaption></figure>"
+        f"<figcaption>{name_of(clipped_name(name, 260))}</figcaption></figure>"
         for name, data in sorted(found.items(), key=lambda pair: as_counted(pair[0]))
     )
     return note(what + more) + f'<div class="pictures{" frames" if sensor.camera else ""}">{items}</div>'

@@ -3,18 +3,21 @@
 import re
 import struct
 import zlib
+from html import unescape
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from browser import Browser
 from commands import refused, run
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from scroll_tactile import Frames, Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.errors import CapacityError, InputError, RecordingError
+from scroll_tactile.errors import CapacityError, InputError, RecordingError, printable
 from scroll_tactile.report import memory_page, recording_page, save
-from scroll_tactile.report.drawing import png, shown, steps, tinted
+from scroll_tactile.report.drawing import clipped_name, png, shown, steps, tinted
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 SMALL = Kernels(seed=0, dimension=64)
@@ -335,6 +338,52 @@ def _decoded(address):
     length = len(rows) // height
     assert all(rows[i * length] == 0 for i in range(height))
     return width, height, kind, b"".join(rows[i * length + 1 : (i + 1) * length] for i in range(height))
+
+
+@pytest.mark.parametrize(
+    "readings",
+    [
+        np.ones((1, 3)),
+        np.full((50, 3), np.nan),
+        np.full((50, 3), np.inf),
+        np.random.default_rng(0).normal(size=(50, 3)) * 1e300,
+        np.full((50, 2), 1e-310),
+        np.arange(600).reshape(-1, 3),
+        np.random.default_rng(0).normal(size=(20, 3000)),
+        np.zeros((5, 30, 40, 3), np.uint8),
+        np.zeros(100),
+    ],
+)
+@pytest.mark.parametrize("rate", [None, 100.0])
+def test_odd_readings_leave_a_page(tmp_path, readings, rate):
+    np.save(tmp_path / "odd.npy", readings)
+    text = words(recording_page(tmp_path / "odd.npy", rate=rate))
+    assert f"{len(readings)} readings" in text
+    assert "nan" not in text.split()
+
+
+@given(st.text(), st.floats(10, 300))
+def test_any_name_is_cut_to_the_room_that_there_is(name, room):
+    cut = clipped_name(name, room)
+    assert len(cut) <= room / 3.6
+    assert cut.removesuffix("…") == printable(name)[: len(cut.removesuffix("…"))]
+
+
+@given(st.text())
+def test_any_text_is_shown_as_text(text):
+    html = shown(text)
+    assert unescape(html) == printable(text)
+    assert not set(html) & set("<>\"'")
+
+
+@given(st.floats(allow_nan=False), st.floats(allow_nan=False))
+@example(-1.7e308, 1.7e308)
+@example(2.2250738585e-313, 2.2250738585072014e-308)
+def test_ticks_lie_in_their_range(low, high):
+    found = steps(low, high)
+    assert 1 <= len(found) <= 12
+    if len(found) > 1:
+        assert all(low - 1e-6 * (high - low) <= tick <= high + 1e-6 * (high - low) for tick in found)
 
 
 def test_names_and_axes():

@@ -60,7 +60,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     tested = {touch.material for touch in facts.unseen}
     words = (
         f"{trust.count} touches of {len(tested)} materials were left out one by one: {trust.right:.1%} right "
-        f"(95 % interval {trust.low:.1%} to {trust.high:.1%})."
+        f"(95% interval {trust.low:.1%} to {trust.high:.1%})."
     )
     if len(tested) < len(facts.counts):
         words += (
@@ -97,7 +97,7 @@ def trusted(facts: MemoryFacts) -> str:
     caption = (
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
         f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is usual of perfect answers. "
-        "Upright lines are 95 % intervals."
+        "Upright lines are 95% intervals."
     )
     drawn = reliability(bins_of(facts.unseen), [touch.confidence for touch in facts.unseen])
     strange = unknown_by(facts.unseen)

@@ -37,9 +37,8 @@ def memory_page(
     """One HTML page that shows what a memory knows; it needs no network and no script.
 
     risk: the share of wrong answers among those that are decided, as of `TactileLearner.live`. name: what stands above
-    it; the folder's unless given. progress: called with (what is being done, steps done, steps in
-    all). Nothing should be observed meanwhile: of a learner that goes
-    on, give a `copy.deepcopy`, which is a snapshot.
+    it; the folder's unless given. progress: called with (what is being done, steps done, steps in all). Nothing should
+    be observed meanwhile: of a learner that goes on, give a `copy.deepcopy`, which is a snapshot.
 
     Where something is not there, such as readings in a compacted memory, the page says so, and why.
 
@@ -110,8 +109,8 @@ def _mixes(facts: MemoryFacts) -> Card:
     if not wrong:
         return "good", heading, "nothing", f"All {trust.count} touches left out got their own name."
     worst = facts.mistakes[0]
-    more = f"Most often {worst.material}, called {worst.answer}: {worst.count} of {worst.tested} times."
-    return _state(trust.right), heading, f"{wrong} of {trust.count} touches left out", more
+    more = f"Left out one by one. Most often {worst.material}, called {worst.answer}: {worst.count} of {worst.tested}."
+    return _state(trust.right), heading, f"{wrong} of {trust.count} touches", more
 
 
 def _trusts(facts: MemoryFacts) -> Card:
@@ -119,26 +118,26 @@ def _trusts(facts: MemoryFacts) -> Card:
     if trust is None:
         return "none", heading, "not known", _sentence(facts.nothing_left_out)
     more = (
-        f"It says {trust.confidence:.1%} on average (ECE {trust.error:.3f}), and would call {trust.unknown:.0%} of its "
-        "own touches unknown."
+        f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}. It would call {trust.unknown:.0%} of its own "
+        "touches unknown."
     )
     if trust.count < FEW:
-        return "look", heading, f"right {trust.right:.0%}, by {trust.count} touches only", more
+        return "look", heading, f"{trust.right:.0%} right, by only {trust.count} touches", more
     if trust.miscalibrated:
         words = "overconfident" if trust.confidence > trust.right else "underconfident"
-        return "bad", heading, f"right {trust.right:.1%}, and {words}", more
-    return _state(trust.right), heading, f"right {trust.right:.1%}, and says so", more
+        return "bad", heading, f"{trust.right:.1%} right, {words}", more
+    return _state(trust.right), heading, f"{trust.right:.1%} right, calibrated", more
 
 
 def _soon(facts: MemoryFacts) -> Card:
-    said, heading = facts.soon, "It answers"
+    said, heading = facts.soon, "It decides"
     if said is None:
         return "none", heading, "not known", "Too few touches are kept to measure it."
     wrong = said.wrong[-1] / said.decided[-1] if said.decided[-1] else 0.0
-    more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these not rightly."
+    more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these wrongly."
     if said.median is None:
         return "look", heading, "not before the end", more
-    return "good" if wrong <= 2 * facts.risk else "look", heading, f"in {said.median:.2g} s, half of touches", more
+    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {said.median:.2g} s", more
 
 
 def _state(right: float) -> State:

@@ -92,15 +92,16 @@ def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> s
 
 
 def state_rows(found: Sequence[Channel], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str) -> str:
-    """The table of channels, whose range is from low to high, (C,) each; of very many those with a fault."""
-    chosen = found if len(found) <= MOST_ROWS else [channel for channel in found if channel.faults][:MOST_ROWS]
+    """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
+    faulty = [channel for channel in found if channel.faults]
+    others = [channel for channel in found if not channel.faults] if len(found) <= MOST_ROWS else []
     rows = []
-    for channel in chosen:
+    for channel in [*faulty, *others][:MOST_ROWS]:
         bottom, top = float(low[channel.number - 1]), float(high[channel.number - 1])
         median, least, most = (
             brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
         )
-        moved = "" if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f} %"
+        moved = "" if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
         rows.append(
             [
                 channel.number,
@@ -117,14 +118,16 @@ def state_rows(found: Sequence[Channel], low: npt.NDArray[np.float64], high: npt
         "channel",
         "state",
         f"median ({unit})" if unit else "median",
-        "90 % lie in",
+        "90% lie in",
         "never changes",
         "at bottom",
         "at top",
         "drift",
     ]
     left = len(found) - len(rows)
-    return table(header, rows, "channels") + (note(f"{left} others have no fault, and no row.") if left else "")
+    return table(header, rows, "channels") + (
+        note(f"{left} more channels have no row, those without a fault first.") if left else ""
+    )
 
 
 def _levels_mean(levels: LevelArray) -> npt.NDArray[np.float64]:

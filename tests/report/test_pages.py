@@ -205,8 +205,9 @@ def test_a_memory_of_an_own_embedding_is_shown_as_far_as_it_goes(tmp_path):
     assert result.exit_code == 0, result.output
     text = words((tmp_path / "page.html").read_text())
     assert "3 materials, 12 touches" in text
-    assert "How answers grow" in text
-    assert "Whether to trust it" in text
+    assert "12 touches of 3 materials were left out" in text
+    assert "the embedding is not at hand" in text
+    assert "When answers are decided: " in text
 
 
 def test_a_camera_memory_shows_frames(browser, tmp_path):

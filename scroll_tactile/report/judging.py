@@ -71,7 +71,8 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     rest = len(facts.mistakes) - len(rows)
     listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
     more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
-    found = f"<div><h3>Worst confusions</h3>{listed}{more}</div>" if rows else note("None was called another material.")
+    found = f"<div><h3>Worst confusions</h3>{listed}{more}{_by_name(facts)}</div>"
+    found = found if rows else note("None was called another material.")
     if len(tested) > SQUARE:
         return note(words) + found
     names = [name for name in order or facts.counts if name in tested]
@@ -86,6 +87,16 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
         "materials that feel alike stand side by side."
     )
     return note(words) + side_by_side(figure(confusions(names, counts), caption), found)
+
+
+def _by_name(facts: MemoryFacts) -> str:
+    """The touches that were called something else, by where they came from; nothing where nobody noted it."""
+    sources = {row.key: row.source for row in facts.journal if row.source is not None}
+    wrong = sorted((touch for touch in facts.unseen if touch.answer != touch.material), key=lambda touch: touch.key)
+    rows = [[sources[t.key], t.material, t.answer, f"{t.confidence:.0%}"] for t in wrong if t.key in sources]
+    if not rows:
+        return ""
+    return "<h3>Touches it got wrong</h3>" + table(["touch", "of", "called", "probability"], rows, "wrong touches")
 
 
 def trusted(facts: MemoryFacts) -> str:

@@ -160,6 +160,19 @@ def test_an_empty_memory_and_one_material_say_what_is_missing():
     assert "2 materials, 5 touches" in words(memory_page(learner))
 
 
+def test_touches_that_are_mixed_up_are_named_by_where_they_came_from(tmp_path):
+    random = np.random.default_rng(0)
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+        for i in range(10):
+            for name in "ab":
+                learner.observe(name, random.uniform(0, 255, (50, 6)), source=f"<{name}> {i}.csv")
+        html = memory_page(learner)
+    text = words(html)
+    assert "Touches it got wrong" in text
+    assert re.search(r"<[ab]> \d\.csv", text)
+    assert re.search(r"by only 20 touches|overconfident|underconfident|calibrated", text)
+
+
 def test_single_touches_leave_nothing_out():
     learner = TactileLearner(sensor=PAD, embedding=SMALL)
     scene = Scene(sensor=PAD)

@@ -121,6 +121,8 @@ def _trusts(facts: MemoryFacts) -> Card:
         f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}. It would call {trust.unknown:.0%} of its own "
         "touches unknown."
     )
+    tested = len({touch.material for touch in facts.unseen})
+    more += f" Measured among {tested} of {len(facts.counts)} materials." if tested < len(facts.counts) else ""
     if trust.count < FEW:
         return "look", heading, f"{trust.right:.0%} right, by only {trust.count} touches", more
     if trust.miscalibrated:

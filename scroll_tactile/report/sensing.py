@@ -69,8 +69,8 @@ def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> s
         return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
     if not kept:
         return note(
-            "Not shown: this memory keeps no readings. One that was compacted before version 0.3, or opened with "
-            "recall=0, has none."
+            "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
+            "made with recall=0, or compacted before version 0.3."
         )
     found = _channels(sensor, kept, ordered)
     means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.prediction.comparing import compared
-from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.features import FeatureExtractor, WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.deviation import spaced
 from scroll_tactile.readouts.early import Early, Heard, early_of, moments_of
@@ -32,7 +32,7 @@ __all__ = ["early_answers", "stream_of", "without"]
 
 FloatArray = npt.NDArray[np.float64]
 
-LEFT_OUT = 100  # touches, each judged at every moment
+LEFT_OUT = 64  # touches, each judged at every moment
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ def _said(
 ) -> dict[int, _Said]:
     """What is said of the beginnings of a touch that is left out, by their columns."""
     other, levels = without(model, touch.material, touch.sampled), pooled.recall.levels(touch.row)
-    whole, said = stream_of(levels, extractor.sensor), {}
+    whole, said, cache = stream_of(levels, extractor.sensor), {}, WindowCache()
     for columns in moments:
         if columns > levels.shape[1]:
             break
         encoded = extractor.encode(
-            whole.first(columns / whole.sensor.rate), model.longest, lambda reach: other.needed(names, reach)
+            whole.first(columns / whole.sensor.rate), model.longest, lambda reach: other.needed(names, reach), cache
         )
         judgement = other.judge(names, encoded.means, encoded.columns)
         way = compared(other, extractor, names, encoded, judgement, pooled, left_out=touch.row)[0]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.readouts.likelihood import LevelArray, levels_of
+from scroll_tactile.readouts.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.readouts.pooled import Pooled
 from scroll_tactile.readouts.recollection import Recollection
 from scroll_tactile.signals.stream import Stream
@@ -63,10 +63,11 @@ def compared(
 ) -> list[Compared]:
     """Compare an encoded touch, of which the model alone says `judgement`, in its own time and as a whole one.
 
-    left_out: the row of a kept touch that it is the beginning of: then in its own time only.
+    left_out: the row of a kept touch that it is the beginning of: then in its own time only, and nothing came over it.
     """
     levels = levels_seen(encoded.stream)
-    ways = [(pooled.recall.recollect(levels, left_out=left_out), True)]
+    noise = None if left_out is None else CLEAN
+    ways = [(pooled.recall.recollect(levels, left_out=left_out, noise=noise), True)]
     if left_out is None and levels.shape[1] != pooled.recall.longest and levels.shape[1] > 1:
         ways.append((pooled.recall.recollect(levels, whole=True), False))
     filled = _filled(model, extractor, encoded, max((way for way, _ in ways), key=lambda way: way.evidence))

@@ -29,6 +29,7 @@ __all__ = ["CurrentModel", "Snapshot"]
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
 FEW = 64  # touches: of a memory with no more the calibration is worth waiting for
+MEASURED = 1.5  # times as many touches as when beginnings were last measured: until then nobody waits for that
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
@@ -79,6 +80,7 @@ class CurrentModel:
         self._take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
+        before, measures = (None, None) if model is None else (model.beginnings, model.measures)
         if model is not None and (behind is None or self._due(model, memory)):
             model = None
         if model is not None and behind:
@@ -88,6 +90,10 @@ class CurrentModel:
                 model = None
         # The last one is let go first, and its memory given back: each is some tens of MB.
         present = self._adopted(memory) if model is None else model
+        if before is not None and not present.beginnings and MEASURED * before.touches >= memory.statistics.touches:
+            # Measuring takes seconds, and a call would wait for it.
+            present.judge_beginnings(before, measures)
+            self._exact = False
         self._model, self._behind = present, []
         self.prepare(ledger)
         return present

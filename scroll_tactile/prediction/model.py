@@ -25,10 +25,19 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "Judgement", "Measures", "Model", "enough_memory"]
+__all__ = ["Beginnings", "Draft", "Judgement", "Measures", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Measures = Callable[["Model"], Early | None]
+
+
+@dataclass(frozen=True)
+class Beginnings:
+    """How beginnings are judged, None where nothing could be measured; touches: of the memory when that was done."""
+
+    early: Early | None
+    touches: int
+
 
 # Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
 # less than that part of it. At 40 up to a thousand were solved for, and a touch took three to ten times as long.
@@ -195,15 +204,24 @@ class Model:
         self.conformal = Conformal(draft.kept) if pooled else None
         self.least = draft.memory.statistics.usual_least
         self.sample = draft.sample
-        self._early: list[Early | None] = []
+        self._early: list[Beginnings] = []
         self.measures: Measures | None = None
 
     def early(self, measures: Measures) -> Early | None:
         """How beginnings are judged: as it `measures` when it is first asked for, and the same from then on."""
         if not self._early:
-            self._early.append(measures(self))
+            self._early.append(Beginnings(measures(self), self.fitted_to))
             self.measures = measures
-        return self._early[0]
+        return self._early[0].early
+
+    @property
+    def beginnings(self) -> Beginnings | None:
+        """How beginnings are judged, once that was asked for."""
+        return self._early[0] if self._early else None
+
+    def judge_beginnings(self, by: Beginnings, measures: Measures | None) -> None:
+        """Judge beginnings as an earlier model of the same memory does, until they are measured anew."""
+        self._early, self.measures = [by], measures
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.

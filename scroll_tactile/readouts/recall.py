@@ -219,8 +219,12 @@ class Recall:
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
         self._brought: LevelArray | None = None
 
-    def recollect(self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None) -> Recollection:
+    def recollect(
+        self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None, noise: Noise | None = None
+    ) -> Recollection:
         """Compare a touch, levels of shape (C, T), with all that are kept, but for the row `left_out`.
+
+        noise: what came over it; the likeliest unless given.
 
         whole: with each of them brought to its length, and not with their beginnings; then what is beyond the longest
         is left out. Raises InputError for other channels.
@@ -228,12 +232,12 @@ class Recall:
         if levels.ndim != 2 or len(levels) != self.channels:
             raise InputError(f"expected levels of shape ({self.channels}, T); came {levels.shape}")
         asked = _Asked.of(levels, self.longest, whole)
-        noise = self._roughly(asked, left_out)
+        given, noise = noise, self._roughly(asked, left_out) if noise is None else noise
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
         pairs = self._pairs(beside, asked)
         logs = pairs.logs(self._table(noise))
-        for stride in () if noise == CLEAN else (1,) if noise.normal else (8, 2, 1):
+        for stride in () if given or noise == CLEAN else (1,) if noise.normal else (8, 2, 1):
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
                 noise, logs = finer, pairs.logs(self._table(finer))

@@ -27,6 +27,7 @@ from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exem
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
+from scroll_tactile.memory.partial import Joint
 from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
@@ -334,7 +335,7 @@ class TactileLearner:
 
     def merge(
         self,
-        other: TactileLearner | str | os.PathLike[str],
+        other: TactileLearner | str | os.PathLike[str] | Joint,
         *,
         shared: Literal["once", "twice"],
         descriptions: Choice = "same",
@@ -342,8 +343,9 @@ class TactileLearner:
     ) -> Merged:
         """Add everything that another memory observed; durable, as a whole, when this returns.
 
-        other: a memory with a path, or its path; it stays as it is. shared: whether a stream that both observed (one
-        material, one content hash) counts once or twice. Receipts of the other memory are not receipts of this one.
+        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. shared: whether a stream
+        that both observed (one material, one content hash) counts once or twice. Receipts of the other memory are not
+        receipts of this one.
         descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
 
         Raises MismatchError for a memory of another sensor, embedding or grid, and for a different description where
@@ -351,7 +353,8 @@ class TactileLearner:
         InputError, StoreError. Nothing was changed then.
         """
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
+        given = {} if isinstance(path, Joint) else {"other": path}
+        require_arguments({**given, "shared": shared, "descriptions": descriptions}, {"progress": progress})
         return self._ledger.merge(path, shared, descriptions, progress or _silent)
 
     def backup(
@@ -364,6 +367,24 @@ class TactileLearner:
         """
         require_arguments({"destination": destination}, {"progress": progress})
         self._ledger.require_store("be copied").backup(destination, progress=progress)
+
+    def pack(
+        self, path: str | os.PathLike[str], *, rows: bool = True, readings: bool = True, source: str | None = None
+    ) -> None:
+        """Write the memory as one file that travels, and that `merge` takes; whole and durable, or not there at all.
+
+        It holds what was learned: sums, sampled touches, kept touches and descriptions, and of each observation its
+        name, content hash, time and source. f* and retracted observations stay behind.
+        rows: also each observation's readings, or codes where the memory has no readings, so that it can be retracted
+        where the file is merged, and counted once where it is there already. They are left out of a memory of which any
+        were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
+        touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
+        exemplars=0 and recall=0. source: what is said of observations that have none.
+
+        Raises InputError in a memory without a path, and for a source that is none; StoreError.
+        """
+        require_arguments({"path": path})
+        self._ledger.pack(path, rows, readings, None if source is None else require_source(source))
 
     def compact(self, *, keep: int = 0) -> Compacted:
         """Give up the features and readings of old observations, for space; what was learned from them stays.

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, cast
+from typing import Annotated, Any, Literal, Protocol, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ __all__ = [
     "AbsentEmbedding",
     "EmbeddingIdentity",
     "Grid",
+    "Identified",
     "Identity",
     "usual_embedding",
     "usual_exemplars",
@@ -89,6 +90,18 @@ class EmbeddingIdentity(_Kept):
 
     def __str__(self) -> str:
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
+
+
+class Identified(Protocol):
+    """What says what it was made with: a store, or a partial of one."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """What it was made with, as JSON."""
 
 
 class Grid(_Kept):
@@ -156,7 +169,7 @@ class Identity(_Kept):
             raise InputError(f"no memory can be made with {_first(error)}") from None
 
     @classmethod
-    def read(cls, store: Store) -> Self:
+    def read(cls, store: Identified) -> Self:
         """The identity that a store was made with.
 
         Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.

@@ -6,7 +6,8 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy.typing as npt
@@ -18,6 +19,8 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
+from scroll_tactile.memory.packing import pack_memory
+from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.rows import (
     DESCRIBE,
     OBSERVE,
@@ -271,7 +274,7 @@ class Ledger:
 
     def merge(
         self,
-        path: str | os.PathLike[str],
+        other: str | os.PathLike[str] | Joint,
         shared: Literal["once", "twice"],
         descriptions: Choice,
         progress: Callable[[str, int, int], object],
@@ -280,7 +283,7 @@ class Ledger:
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
             self._require_no_batch("a merge")
-            with MemoryStore.open(path, mode="read") as source:
+            with _opened(other) as source:
                 source.read_with(memory.plan, thorough=True)
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
                 with self._mutation(), store.batch():
@@ -288,6 +291,12 @@ class Ledger:
             self._changed()
             self._snapshot_if_due()
         return Merged(added, incoming.shared, len(incoming.descriptions))
+
+    def pack(self, path: str | os.PathLike[str], rows: bool, readings: bool, source: str | None) -> None:
+        """As `TactileLearner.pack`."""
+        with self.lock:
+            store, memory = self.require_store("be packed"), self.memory
+            pack_memory(store, memory, Path(path), rows=rows, readings=readings, source=source)
 
     def compact(self, keep: int) -> Compacted:
         """As `TactileLearner.compact`."""
@@ -398,3 +407,10 @@ class Ledger:
 
 def _nothing() -> None:
     """Nothing to revert: the journal refused the row before the memory was changed."""
+
+
+def _opened(other: str | os.PathLike[str] | Joint) -> AbstractContextManager[MemoryStore | Partial | Joint]:
+    """A memory to be merged: in a folder, in a file, or partials that are open already."""
+    if isinstance(other, Joint):
+        return nullcontext(other)
+    return Partial(Path(other)) if Path(other).is_file() else MemoryStore.open(other, mode="read")

@@ -12,13 +12,23 @@ from scroll_tactile.errors import InputError, MismatchError, ObservationError, U
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import require_counted
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
+from scroll_tactile.memory.partial import Joint, Partial, sums_without
 from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, SOURCE, unspanned
 from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Generation, Head, Record, Store
 from store.files import same_folder
 
-__all__ = ["Choice", "Incoming", "compaction_point", "observation_of", "observations", "observations_of"]
+__all__ = [
+    "Choice",
+    "Incoming",
+    "Journal",
+    "compaction_point",
+    "observation_of",
+    "observations",
+    "observations_of",
+    "standing",
+]
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
@@ -97,6 +107,9 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
     return memory.base if len(sequences) <= keep else sequences[-keep] - 1
 
 
+Journal = Store | Partial | Joint
+"""What can be merged: a memory's folder, or partials of one."""
+
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
@@ -106,17 +119,19 @@ class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed.
-    descriptions: by material, those that we have not. Made by `Incoming.of`.
+    left_out: those of them that are counted once. descriptions: by material, those that we have not. Made by
+    `Incoming.of`.
     """
 
-    source: Store
+    source: Journal
     base: Generation | None
     rows: list[Head]
     shared: int
+    left_out: list[Head]
     descriptions: dict[str, Description]
 
     @classmethod
-    def of(cls, ours: Store, memory: Memory, theirs: Store, *, once: bool, descriptions: Choice) -> Incoming:
+    def of(cls, ours: Store, memory: Memory, theirs: Journal, *, once: bool, descriptions: Choice) -> Incoming:
         """Look through both journals.
 
         once: leave out streams that both observed, of one material with one content hash. Raises MismatchError where
@@ -127,8 +142,8 @@ class Incoming:
         base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
-        incoming = _standing(heads)
-        known = {(head.label, head.key) for head in _standing(ours.heads()) if head.kind != MERGE}
+        incoming = standing(heads)
+        known = {(head.label, head.key) for head in standing(ours.heads()) if head.kind != MERGE}
         both = [head for head in incoming if head.kind != MERGE and (head.label, head.key) in known]
         fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
@@ -144,7 +159,8 @@ class Incoming:
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
-        return cls(theirs, found, rows, len(both), _descriptions(ours, memory, theirs, found, descriptions))
+        described = _descriptions(ours, memory, theirs, found, descriptions)
+        return cls(theirs, found, rows, len(both), both if once else [], described)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -159,13 +175,27 @@ class Incoming:
         for material, description in self.descriptions.items():
             memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": description}).sequence
             memory.describe(material, description)
+        sums = self._sums(memory)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(base), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
-            if kind != MEMBER:
+            if kind != MEMBER and sums is None:
                 memory.replay(Record(**vars(head), arrays=arrays), ours)
+            elif memory.exemplars is not None and "nbytes" in attributes:
+                memory.exemplars.add(label, key, head.sequence)
             memory.sequence = head.sequence
             each(done, total)
+        if sums is not None:
+            memory.join(sums, exemplars=False)
         return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
+
+    def _sums(self, memory: Memory) -> Memory | None:
+        """What the rows taught, of those that are not left out; None where only replaying them tells."""
+        source = self.source
+        if not isinstance(source, Partial | Joint) or not source.has_rows:
+            return None
+        if memory.kept is not None and (Identity.read(source).recall or 0) != memory.kept.capacity:
+            return None
+        return sums_without(source, memory, [head.sequence for head in self.left_out])
 
     def _rows_to_append(self, base: Generation | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:
@@ -188,7 +218,7 @@ def _retracted_in(heads: Iterable[Head]) -> set[int]:
     return {row for head in heads if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
-def _standing(rows: Iterable[Head]) -> list[Head]:
+def standing(rows: Iterable[Head]) -> list[Head]:
     """The rows that something was learned from, compacted ones too, without the retracted ones."""
     heads = list(rows)
     retracted = _retracted_in(heads)
@@ -196,10 +226,13 @@ def _standing(rows: Iterable[Head]) -> list[Head]:
 
 
 def _descriptions(
-    ours: Store, memory: Memory, theirs: Store, base: Generation | None, choice: Choice
+    ours: Store, memory: Memory, theirs: Journal, base: Generation | None, choice: Choice
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
-    theirs_now = dict(cast(dict[str, Description], base.attributes.get("descriptions", {}))) if base is not None else {}
+    if isinstance(theirs, Partial | Joint):
+        theirs_now = dict(theirs.descriptions)
+    else:
+        theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes.get("descriptions", {})))
     for head in theirs.heads(0 if base is None else base.upto):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
@@ -214,7 +247,7 @@ def _descriptions(
     return {name: new[name] for name in new if choice != "ours" or name not in ours_now}
 
 
-def _require_mergeable(ours: Store, memory: Memory, theirs: Store) -> None:
+def _require_mergeable(ours: Store, memory: Memory, theirs: Journal) -> None:
     if same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)

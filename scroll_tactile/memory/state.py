@@ -260,13 +260,13 @@ class Memory:
         wanted = self.kept is not None and self.kept.wants(record.label, record.key)
         return unpack_readings(record.arrays) if wanted else None
 
-    def _empty(self) -> Memory:
+    def of_nothing(self) -> Memory:
         """Another memory of the same making."""
         return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode, self.keeping)
 
     def _base_samples(self, store: Store) -> Memory:
         """A memory with what the base holds; an empty one without a base."""
-        fresh = self._empty()
+        fresh = self.of_nothing()
         self.require_base(store)
         try:
             base = store.base()
@@ -304,13 +304,23 @@ class Memory:
 
     def _join(self, record: Record) -> None:
         """Add another memory of the same making: a row that holds the arrays and attributes of its base."""
-        other = self._empty()
+        other = self.of_nothing()
         other._take(record.arrays, record.attributes, record.sequence)
+        self.join(other, exemplars="exemplar-readings" in record.arrays)
+
+    def of_sums(self, arrays: Arrays, attributes: Any) -> Memory:
+        """Another memory of the same making, of what a partial holds; see `memory.partial`."""
+        other = self.of_nothing()
+        other._take(arrays, attributes, None)
+        return other
+
+    def join(self, other: Memory, *, exemplars: bool = True) -> None:
+        """Add another memory of the same making; descriptions and f* are left out."""
         self.statistics = self.statistics + other.statistics
         self.sample.update(other.sample)
         if self.kept is not None and other.kept is not None:
             self.kept.update(other.kept)
-        if self.exemplars is not None and other.exemplars is not None and "exemplar-readings" in record.arrays:
+        if exemplars and self.exemplars is not None and other.exemplars is not None:
             self.exemplars.update(other.exemplars)
 
     def to_arrays(
@@ -404,7 +414,7 @@ class Memory:
 
     def until(self, store: Store, upto: int) -> Memory:
         """The memory of the observations up to `upto` that are not retracted: what a base at `upto` holds."""
-        memory, later = self._chosen(store, upto), self._empty()
+        memory, later = self._chosen(store, upto), self.of_nothing()
         for head in store.heads(self.base):  # whoever compacts has read all
             if head.sequence <= upto:
                 apply_description(memory.descriptions, head)

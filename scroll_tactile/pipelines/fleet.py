@@ -1,0 +1,466 @@
+"""A fleet's memory: many recordings and memories, learned by many workers, become one, to the same bytes.
+
+Each worker learns some sources into a partial memory, a file; partials are summed up at the workers, as a tree; their
+touches and the sum of all become one memory in a folder. Sums of whole numbers are equal in any order, so the digest
+is that of one process which observed each touch once, whatever the workers, their number and their ends.
+
+Who runs the jobs is chosen by what is passed: processes on this machine, or a client of a cluster.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_all_start_methods, get_context, parent_process
+from multiprocessing.connection import wait as wait_for
+from pathlib import Path
+from typing import Any
+
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.errors import InputError, MismatchError, ObservationError, ScrollTactileError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.identity import usual_embedding
+from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.partial import Joint, Partial
+from scroll_tactile.pipelines.partials import (
+    LearnJob,
+    Made,
+    Making,
+    SumJob,
+    expand,
+    is_memory,
+    learn_partial,
+    sum_partials,
+)
+from scroll_tactile.pipelines.runfile import RunFile
+from scroll_tactile.pipelines.sources import Refused, SourceOptions
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.copies import Augmented
+from store import StoreError, StoreFullError
+
+__all__ = ["FleetReport", "learn"]
+
+logger = logging.getLogger(__name__)
+
+FAN = 16  # partials that are summed up by one job
+MOST_SOURCES = 1024  # of a job: of touches of 6 ms so many cost thirty times what writing and adding their sums does
+MOST_BYTES = 2**26  # of their files, where these are here
+JOBS_A_WORKER = 4  # at least, so that all have something to do to the end
+NOTES = "run.json"
+TRIES = 5  # of a job of one source whose worker died
+
+Progress = Callable[[str, int, int], object]
+
+
+@dataclass
+class FleetReport:
+    """What a run did.
+
+    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
+    those that had come before, by their names and contents. refused: what was not learned, and why. deaths: jobs whose
+    worker ended before them. seconds: of all, and of the merge at the end. processor: seconds of the workers' and of
+    this process, of learning, of sums and of the merge.
+    """
+
+    sources: int = 0
+    observations: int = 0
+    repeated: int = 0
+    refused: list[Refused] = field(default_factory=list)
+    deaths: int = 0
+    seconds: float = 0.0
+    merging: float = 0.0
+    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "sums": 0.0, "merge": 0.0})
+
+
+def learn(
+    destination: str | os.PathLike[str],
+    sources: Sequence[str | os.PathLike[str]],
+    options: SourceOptions | None = None,
+    *,
+    sensor: Sensor | None = None,
+    embedding: Embedding | None = None,
+    augmentation: Augmented | None = None,
+    exemplars: int | None = None,
+    recall: int | None = None,
+    workers: int | None = None,
+    client: Any = None,
+    add: bool = False,
+    descriptions: Choice = "same",
+    patience: float | None = None,
+    fan: int = FAN,
+    progress: Progress = lambda what, done, of: None,
+) -> FleetReport:
+    """Learn recordings and memories into the memory in folder `destination`, each touch once; durable at the end.
+
+    sources: files, folders and addresses that fsspec knows, of recordings (as `recordings.read` takes them) and of
+    memories, in folders or packed. options: how recordings are cut into touches and named.
+    sensor, embedding, augmentation, exemplars, recall: of the memory, as of `TactileLearner`; an existing one knows.
+    workers: processes on this machine; as many as it has cores unless given. client: of a `dask.distributed` cluster,
+    or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
+    the destination, where partials lie meanwhile.
+    add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
+    destination comes first, then the sources in their order. patience: seconds that a job may take before its worker is
+    given up. fan: how many partials are summed up at once. progress: called with (what is being done, sources done,
+    sources in all).
+
+    A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
+    the report, and so are those whose workers die again and again; all others are learned.
+
+    Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
+    for a destination of another sensor; StoreFullError and other StoreErrors: call again to go on.
+    """
+    begun = time.perf_counter()
+    place = Path(destination).absolute()
+    found, missing = expand([os.fspath(source) for source in sources])
+    report = FleetReport(refused=missing)
+    settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "recall": recall}
+    with ExitStack() as stack:
+        held = None
+        if place.exists():
+            held = stack.enter_context(TactileLearner.open(place, sensor=sensor, embedding=embedding, **settings))
+        making = _making(held, sensor, embedding, settings, options or SourceOptions(), patience)
+        folder = place.with_name(place.name + ".fleet")
+        if held is not None and held.observations() and not (folder / NOTES).exists() and not add:
+            raise InputError(
+                f"{place} is there already, and not by a run of this kind: take another folder, or say that it is to "
+                "be added to"
+            )
+        run = _Run(folder, making, report, fan, progress)
+        run.begin(found)
+        with stack.enter_context(_engine(client, workers)) as engine:
+            parts, sums = run.work(engine)
+        if held is None:
+            if not parts and not run.whole:
+                raise InputError(_nothing(report))
+            held = TactileLearner.open(place, sensor=making.sensor, embedding=making.embedding, **settings)
+            stack.enter_context(held)
+        run.merge(held, parts, sums, descriptions)
+        held.close()
+        run.end(found)
+    report.seconds = time.perf_counter() - begun
+    return report
+
+
+def _nothing(report: FleetReport) -> str:
+    first = f", such as {report.refused[0].source}: {report.refused[0].why}" if report.refused else ""
+    return f"nothing was learned, and no memory made: {len(report.refused)} sources were refused{first}"
+
+
+def _making(
+    held: TactileLearner | None,
+    sensor: Sensor | None,
+    embedding: Embedding | None,
+    settings: Mapping[str, Any],
+    options: SourceOptions,
+    patience: float | None,
+) -> Making:
+    if held is not None:
+        kept = held.settings
+        return Making(held.sensor, held.embedding, held.augmentation, kept.exemplars, kept.recall, options, patience)
+    if sensor is None:
+        raise InputError("a new memory takes a sensor: say whose readings the sources are")
+    chosen = usual_embedding(sensor) if embedding is None else embedding
+    return Making(sensor, chosen, **settings, options=options, patience=patience)
+
+
+class _Run:
+    """One run: what is to be done, what was done, and the folder where partials lie until they are merged."""
+
+    def __init__(self, folder: Path, making: Making, report: FleetReport, fan: int, progress: Progress) -> None:
+        self.folder, self.making, self.report = folder, making, report
+        self._fan, self._progress = fan, progress
+        plan = {"run": "fleet", "identity": making.identity.to_json(), "options": repr(making.options)}
+        self._notes = RunFile(folder / NOTES, plan)
+        self._waiting: deque[tuple[LearnJob | SumJob, int]] = deque()
+        self._order: dict[str, int] = {}
+        self._seen: set[bytes] = set()
+        self._parts: list[tuple[Made, tuple[int, ...]]] = []
+        self._ready: list[tuple[str, tuple[int, ...]]] = []
+        self._sums = 0
+        self._begun = time.perf_counter()
+        self.whole: list[Made] = []
+
+    def begin(self, found: Sequence[str]) -> None:
+        """Take what an earlier run left behind, and cut the rest into jobs."""
+        self._order = {source: place for place, source in enumerate(found)}
+        learned: set[str] = set(self._notes.notes.get("learned", []))
+        for path in sorted(self.folder.iterdir()):
+            if not path.name.startswith("learned-") or path.suffix != ".part":
+                continue
+            try:
+                made = Made.of(path)
+            except (StoreError, ScrollTactileError) as error:
+                logger.warning("%s; its sources are learned again", error)
+                continue
+            if learned.isdisjoint(made.sources) and set(made.sources) <= set(found):
+                learned |= set(made.sources)
+                self._take(made)
+        self.report.sources = len(learned & set(found))
+        self._total = len(found)
+        left = [source for source in found if source not in learned]
+        memories = [source for source in left if is_memory(source)]
+        one_by_one = set(memories)
+        self._left = [source for source in left if source not in one_by_one]
+        self._waiting.extend((self._job((source,), memory=True), 0) for source in memories)
+
+    def _job(self, sources: Sequence[str], *, memory: bool = False) -> LearnJob:
+        return LearnJob(self.making, tuple(sources), str(self.folder), memory)
+
+    def _cut(self, workers: int) -> None:
+        """Cut the recordings that are left into jobs."""
+        most = max(1, min(MOST_SOURCES, -(-len(self._left) // (JOBS_A_WORKER * workers))))
+        group: list[str] = []
+        size = 0
+        for source in self._left:
+            own = _bytes_of(source)
+            if group and (len(group) >= most or size + own > MOST_BYTES):
+                self._waiting.append((self._job(group), 0))
+                group, size = [], 0
+            group.append(source)
+            size += own
+        if group:
+            self._waiting.append((self._job(group), 0))
+
+    def work(self, engine: _Engine) -> tuple[list[tuple[Made, tuple[int, ...]]], str | None]:
+        """Have all jobs done; returns the partials with rows, in the order of the sources, and the sum of all."""
+        self._cut(engine.workers)
+        running: dict[Future[Made], tuple[LearnJob | SumJob, int]] = {}
+        try:
+            while self._waiting or running or len(self._ready) > 1 or self._alone():
+                self._sum_up(idle=not self._waiting and not running)
+                while self._waiting and len(running) < engine.room:
+                    job, tries = self._waiting.popleft()
+                    running[engine.submit(learn_partial if isinstance(job, LearnJob) else sum_partials, job)] = (
+                        job,
+                        tries,
+                    )
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    self._done(future, *running.pop(future))
+        except BaseException:
+            for future in running:
+                future.cancel()
+            raise
+        parts = sorted(self._parts, key=lambda part: self._order.get(part[0].sources[0], 0) if part[0].sources else 0)
+        return parts, self._ready[0][0] if self._ready else None
+
+    def _alone(self) -> bool:
+        """Whether the one partial that is left has touches to be left out, and is no sum yet."""
+        return len(self._ready) == 1 and bool(self._ready[0][1])
+
+    def _sum_up(self, idle: bool) -> None:
+        """Have partials summed up where there are enough of them, or nothing else is to be done."""
+        while len(self._ready) >= self._fan or (idle and (len(self._ready) > 1 or self._alone())):
+            parts, self._ready = self._ready[: self._fan], self._ready[self._fan :]
+            self._sums += 1
+            target = self.folder / f"sum-{os.getpid()}-{self._sums}.part"
+            self._waiting.appendleft((SumJob(self.making, tuple(parts), str(target)), 0))
+
+    def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int) -> None:
+        try:
+            made = future.result()
+        except (StoreFullError, KeyboardInterrupt):
+            raise
+        except Exception as error:
+            self._lost(job, tries, error)
+            return
+        if isinstance(job, SumJob):
+            self.report.processor["sums"] += made.processor
+            self._ready.append((made.path, ()))
+            for path, _ in job.parts:
+                if Path(path).name.startswith("sum-"):
+                    Path(path).unlink(missing_ok=True)
+            return
+        self.report.processor["learning"] += made.processor
+        self.report.refused += made.refused
+        self.report.sources += len(made.sources)
+        if made.path:
+            self._take(made)
+        seconds = time.perf_counter() - self._begun
+        count, done = len(self._seen), self.report.sources + len(self.report.refused)
+        left = f", {seconds / done * (self._total - done):.0f} s left" if 0 < done <= self._total else ""
+        failed = f", {len(self.report.refused)} refused" if self.report.refused else ""
+        self._progress(f"{count} touches, {count / seconds:.0f} a second{left}{failed}", done, self._total)
+
+    def _take(self, made: Made) -> None:
+        """Take a partial in: what came before is left out of it."""
+        if not made.has_rows:
+            self.whole.append(made)
+            return
+        left_out = []
+        for number, touch in enumerate(made.touches, start=1):
+            if touch in self._seen:
+                left_out.append(number)
+            self._seen.add(touch)
+        self.report.repeated += len(left_out)
+        made.touches = []
+        self._parts.append((made, tuple(left_out)))
+        self._ready.append((made.path, tuple(left_out)))
+
+    def _lost(self, job: LearnJob | SumJob, tries: int, error: Exception) -> None:
+        """A job ended without its partial: again, by halves, and in the end without the source that ends workers."""
+        self.report.deaths += 1
+        logger.info("a job of %s ended: %s: %s", job.making.sensor.name, type(error).__name__, error)
+        if isinstance(job, LearnJob) and len(job.sources) > 1:
+            self._waiting.extendleft((half, 0) for half in job.halves())
+        elif tries + 1 < TRIES:
+            self._waiting.appendleft((job, tries + 1))
+        elif isinstance(job, LearnJob):
+            why = f"{TRIES} workers ended while they learned it; the last: {type(error).__name__}: {error!s:.200}"
+            self.report.refused.append(Refused(job.sources[0], why))
+        else:
+            raise error
+
+    def merge(
+        self,
+        held: TactileLearner,
+        parts: Sequence[tuple[Made, tuple[int, ...]]],
+        sums: str | None,
+        descriptions: Choice,
+    ) -> None:
+        """Put everything into the memory; what is there already is left out."""
+        begun, processor = time.perf_counter(), time.process_time()
+
+        def progress(what: str, done: int, of: int) -> None:
+            self._progress(f"{what} {done} of {of} touches", self._total, self._total)
+
+        with ExitStack() as stack:
+            if sums is not None and parts:
+                opened = [(stack.enter_context(Partial(Path(made.path))), out) for made, out in parts]
+                described = _described([partial for partial, _ in opened], descriptions)
+                joint = Joint(opened, stack.enter_context(Partial(Path(sums))), described)
+                done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
+                self.report.observations += done.observations
+                self.report.repeated += done.shared
+        for made in self.whole:
+            try:
+                done = held.merge(made.path, shared="once", descriptions=descriptions, progress=progress)
+                self.report.observations += done.observations
+            except (MismatchError, ObservationError) as error:
+                self.report.refused.append(Refused(made.sources[0], str(error)))
+        self.report.merging = time.perf_counter() - begun
+        self.report.processor["merge"] += time.process_time() - processor
+
+    def end(self, found: Sequence[str]) -> None:
+        """Note what was learned, and remove the partials."""
+        refused = {each.source for each in self.report.refused}
+        learned = {*self._notes.notes.get("learned", []), *found} - refused
+        self._notes.note("learned", sorted(learned))
+        for path in self.folder.iterdir():
+            if path.suffix in (".part", ".partial"):
+                path.unlink()
+
+
+def _described(partials: Sequence[Partial], choice: Choice) -> dict[str, Description]:
+    """The descriptions of all; raises MismatchError where two differ and nobody chose."""
+    found: dict[str, tuple[Description, Path]] = {}
+    for partial in partials:
+        for material, description in partial.descriptions.items():
+            before = found.get(material)
+            if before is not None and repr(before[0]) != repr(description) and choice == "same":
+                raise MismatchError(
+                    f"{before[1]} and {partial.path} describe {material!r} differently: as {before[0]}, and as "
+                    f"{description}. Choose with descriptions='ours' (the first) or 'theirs' (the last)"
+                )
+            if before is None or choice == "theirs":
+                found[material] = description, partial.path
+    return {material: description for material, (description, _) in found.items()}
+
+
+def _bytes_of(source: str) -> int:
+    with suppress(OSError):
+        return Path(source).stat().st_size
+    return 0
+
+
+class _Engine:
+    """Who runs the jobs: an Executor of the caller's.
+
+    workers: how many jobs run at once, as far as is known. room: how many are handed over at once.
+    """
+
+    def __init__(self, executor: Executor, workers: int) -> None:
+        self._executor, self.workers, self.room = executor, workers, 2 * workers
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+        """Have a job done; the future raises where it could not be."""
+        return self._executor.submit(what, job)
+
+    def __enter__(self) -> _Engine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """The executor is the caller's."""
+
+
+class _Processes(_Engine):
+    """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = self.room = workers
+        self._free: list[ProcessPoolExecutor] = []
+        self._all: set[ProcessPoolExecutor] = set()
+        method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
+        self._context: Any = get_context(method)
+        if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
+            self._context.set_forkserver_preload([learn_partial.__module__])
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+        """As `_Engine.submit`, by a process that has nothing else to do."""
+        pool = self._free.pop() if self._free else self._new()
+        try:
+            future = pool.submit(what, job)
+        except BrokenProcessPool:  # it died while it waited
+            self._all.discard(pool)
+            pool = self._new()
+            future = pool.submit(what, job)
+        future.add_done_callback(lambda done: self._back(pool, done))
+        return future
+
+    def _new(self) -> ProcessPoolExecutor:
+        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
+        self._all.add(pool)
+        return pool
+
+    def _back(self, pool: ProcessPoolExecutor, done: Future[Made]) -> None:
+        broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
+        if broken:
+            self._all.discard(pool)
+        else:
+            self._free.append(pool)
+
+    def __exit__(self, *_: object) -> None:
+        for pool in list(self._all):
+            pool.shutdown(wait=sys.exc_info()[0] is None, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed ends, too, and leaves arithmetic to one thread: there are others beside it."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
+
+
+def _engine(client: Any, workers: int | None) -> _Engine:
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
+        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
+    if client is None:
+        return _Processes(workers or os.cpu_count() or 1)
+    executor = client.get_executor() if hasattr(client, "get_executor") else client
+    if not isinstance(executor, Executor):
+        raise InputError(f"expected a dask.distributed.Client or an Executor; came {type(client).__name__}")
+    cores = getattr(client, "ncores", None)
+    known = sum(cores().values()) if callable(cores) else getattr(executor, "_max_workers", 0)
+    return _Engine(executor, workers or known or os.cpu_count() or 1)

@@ -324,14 +324,21 @@ class TactileLearner:
         """
         return self._ledger.relabel(receipt, require_name(material))
 
-    def forget(self, material: str) -> int:
-        """Retract all observations of a material, as `retract` does one, and its description; returns how many.
+    def forget(self, material: str | None = None, *, source: str | None = None) -> int:
+        """Retract all observations of a material, or from a source, as `retract` does one; returns how many.
+
+        A forgotten material loses its description, too. source: a file, as `observations` names it, or a folder or
+        address that files lie in, such as a robot's day.
 
         Raises UnknownMaterialError for a material never observed, and ObservationError (nothing was changed) where some
-        of them were compacted; InputError in a memory without a path; StoreError.
+        of them were compacted, or a source has none; InputError for both or neither, and in a memory without a path;
+        StoreError.
         """
-        require_text(material)
-        return self._ledger.forget(material)
+        if (material is None) == (source is None):
+            raise InputError("say what is to be forgotten: a material, or a source")
+        if material is not None:
+            require_text(material)
+        return self._ledger.forget(material, None if source is None else require_source(source))
 
     def merge(
         self,

@@ -7,6 +7,7 @@ import typer
 from scroll_tactile.cli.bulk import evaluate, learn
 from scroll_tactile.cli.demonstration import demo
 from scroll_tactile.cli.everyday import inspect, observe, predict
+from scroll_tactile.cli.fleet import fleet
 from scroll_tactile.cli.makeup import compose, describe
 from scroll_tactile.cli.replay import live
 from scroll_tactile.cli.reporting import report
@@ -23,6 +24,6 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
-for command in (demo, observe, learn, predict, evaluate, live, inspect, describe, compose, report):
+for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report):
     app.command()(command)
 app.add_typer(memory, name="memory")

@@ -30,7 +30,17 @@ if TYPE_CHECKING:
     from scroll_tactile.pipelines.learning import Evaluation, Learned
     from scroll_tactile.pipelines.sources import Refused, SourceOptions
 
-__all__ = ["evaluate", "learn"]
+__all__ = [
+    "AsJson",
+    "CutBy",
+    "Label",
+    "LabelBy",
+    "LabelTopic",
+    "Labels",
+    "evaluate",
+    "learn",
+    "source_options",
+]
 
 MOST_SHOWN = 20  # mistakes; JSON and CSV have all
 MOST_NAMES = 40  # of a table of confusions
@@ -96,7 +106,7 @@ def learn(
     from scroll_tactile.sensors import read_sensor
 
     found, missing = find_sources(sources)
-    options = _options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
+    options = source_options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
     chosen = None if sensor is None else read_sensor(sensor)
     if chosen is None and preset is not None and not memory.exists():
         chosen = presets.find(preset).sensor
@@ -115,7 +125,7 @@ def learn(
         raise typer.Exit(1)
 
 
-def _options(
+def source_options(
     found: Sequence[str],
     preset: str | None,
     topic: str | None,
@@ -127,6 +137,7 @@ def _options(
     label_topic: str | None,
     cut: Cut | None,
 ) -> SourceOptions:
+    """How these recordings are cut and named, by the options of a command."""
     from scroll_tactile.pipelines.sources import SourceOptions
     from scroll_tactile.recordings import read_intervals
 
@@ -193,7 +204,7 @@ def evaluate(
     from scroll_tactile.pipelines.sources import find_sources
 
     found, missing = find_sources(sources)
-    options = _options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
+    options = source_options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
         done = evaluate_sources(learner, found, options, progress)
     refused = [*missing, *done.refused]

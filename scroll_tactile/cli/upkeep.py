@@ -195,19 +195,42 @@ def list_observations(
 @memory.command()
 def forget(
     folder: MemoryFolder,
-    material: Annotated[str, typer.Argument(help="Its name.", show_default=False)],
+    material: Annotated[str | None, typer.Argument(help="Its name.", show_default=False)] = None,
+    source: Annotated[
+        str | None, typer.Option(help="In place of a material: a file, or a folder or address of files, as list shows.")
+    ] = None,
 ) -> None:
-    """Retract all observations of a material, exactly, as if it had never been touched."""
+    """Retract all observations of a material, or from a source, exactly, as if they had never been made."""
     with opened_for_upkeep(folder) as learner:
-        count = learner.forget(material)
+        count = learner.forget(material, source=source)
         left = len(learner.materials)
-    say(f"{shown(material)}: {count} observations were retracted; {left} materials are left")
+    say(f"{shown(material or source)}: {count} observations were retracted; {left} materials are left")
+
+
+@memory.command()
+def pack(
+    folder: MemoryFolder,
+    target: Annotated[Path, typer.Argument(help="The file; one that is there is replaced.", show_default=False)],
+    rows: Annotated[
+        bool, typer.Option(help="With each touch's readings, so that it can be retracted where the file is merged.")
+    ] = True,
+    readings: Annotated[bool, typer.Option(help="With anything that shows a touch as it was read.")] = True,
+    source: Annotated[str | None, typer.Option(help="What is said of touches that say no source.")] = None,
+) -> None:
+    """Write a memory as one file that travels, and that merge takes."""
+    with opened_for_upkeep(folder, mode="read") as learner:
+        learner.pack(target, rows=rows, readings=readings, source=source)
+        count = sum(learner.materials.values())
+    say(f"written: {shown(target)}, {count} observations in {target.stat().st_size / 2**20:.1f} MB")
 
 
 @memory.command()
 def merge(
     folder: MemoryFolder,
-    other: Annotated[Path, typer.Argument(help="The memory that comes in; it stays as it is.", show_default=False)],
+    other: Annotated[
+        Path,
+        typer.Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
+    ],
     shared: Annotated[Shared, typer.Option(help="How a stream that both observed is counted.", show_default=False)],
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""

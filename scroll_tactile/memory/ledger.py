@@ -18,7 +18,14 @@ from scroll_tactile.memory.changes import apply_appended, relabel
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.merge import Choice, Incoming, compaction_point, observation_of, observations_of
+from scroll_tactile.memory.merge import (
+    Choice,
+    Incoming,
+    compaction_point,
+    observation_of,
+    observations_from,
+    observations_of,
+)
 from scroll_tactile.memory.packing import pack_memory
 from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.rows import (
@@ -204,12 +211,15 @@ class Ledger:
             store = self.require_store("retract anything")
             self._retract(store, [observation_of(store, self.memory, receipt)], "")
 
-    def forget(self, material: str) -> int:
+    def forget(self, material: str | None, source: str | None) -> int:
         """As `TactileLearner.forget`."""
         with self.lock:
             store = self.require_store("forget anything")
-            found = observations_of(store, self.memory, material)
-            self._retract(store, [store.record(sequence) for sequence in found], material)
+            if material is not None:
+                found = observations_of(store, self.memory, material)
+            else:
+                found = observations_from(store, self.memory, source or "")
+            self._retract(store, [store.record(sequence) for sequence in found], material or "")
         return len(found)
 
     def _retract(self, store: Store, records: list[Record], material: str) -> None:

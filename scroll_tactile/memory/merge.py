@@ -26,6 +26,7 @@ __all__ = [
     "compaction_point",
     "observation_of",
     "observations",
+    "observations_from",
     "observations_of",
     "standing",
 ]
@@ -74,6 +75,35 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
             "compacted, and their features given up. Retract the others one by one, by their receipts"
         )
     return found
+
+
+def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
+    """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
+
+    Raises ObservationError where there are none, and where some were compacted.
+    """
+    mine = [
+        head for head in standing(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
+    ]
+    held = {head.sequence for head in memory.retractable(store)}
+    if not mine:
+        raise ObservationError(
+            f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
+        )
+    if gone := [head for head in mine if head.sequence not in held]:
+        raise ObservationError(
+            f"what comes from {source!r} cannot be forgotten: {len(gone)} of its {len(mine)} observations in "
+            f"{store.path} were compacted, there or before they were merged, and their features given up"
+        )
+    return [head.sequence for head in mine]
+
+
+def is_from(said: str | None, source: str) -> bool:
+    """Whether an observation that says where it comes from comes from there: a file, or what it lies in."""
+    place = source.rstrip("/")
+    # Behind a file's name come readings in brackets, or a topic; behind a folder's a file.
+    ends = "/[ " if "." in place.rpartition("/")[2] else "/"
+    return said is not None and (said == source or said.startswith(tuple(place + end for end in ends)))
 
 
 def observations(store: Store) -> list[Observation]:
@@ -195,7 +225,7 @@ class Incoming:
             return None
         if memory.kept is not None and (Identity.read(source).recall or 0) != memory.kept.capacity:
             return None
-        return sums_without(source, memory, [head.sequence for head in self.left_out])
+        return sums_without(source, memory, {head.sequence for head in self.left_out})
 
     def _rows_to_append(self, base: Generation | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:

@@ -274,20 +274,27 @@ class Joint:
         return found
 
 
-def sums_without(source: Partial | Joint, memory: Memory, left_out: Iterable[int]) -> Memory:
+def sums_without(source: Partial | Joint, memory: Memory, left_out: Collection[int]) -> Memory:
     """What the touches of a source taught, without some of them, whose rows it must have, exactly.
 
-    memory: any of that making. Raises DamageError.
+    memory: any of that making. What is left out must be somewhere else: no other touch takes its place in the samples.
+    Raises DamageError.
     """
     found = source.sums()
     sums, gone = memory.of_sums(found.arrays, found.attributes), memory.of_nothing()
+    if not left_out:
+        return sums
     for sequence in left_out:
         record = source.record(sequence)
         columns, codes = memory.codes(record)
         gone.statistics.add(record.label, codes, columns)
-    if gone.statistics.touches:
-        sums.statistics = sums.statistics - gone.statistics
-    return sums
+    stays = {(head.label, head.key) for head in source.heads() if head.sequence not in left_out}
+    rest = memory.of_nothing()
+    rest.statistics = sums.statistics - gone.statistics
+    rest.sample.update(item for item in sums.sample if item[:2] in stays)
+    if rest.kept is not None and sums.kept is not None:
+        rest.kept.update(item for item in sums.kept if item[:2] in stays)
+    return rest
 
 
 def _mapping(field: str, value: object) -> object:

@@ -69,7 +69,7 @@ class FleetReport:
     sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
     those that had come before, by their names and contents. refused: what was not learned, and why. deaths: jobs whose
     worker ended before them. seconds: of all, and of the merge at the end. processor: seconds of the workers' and of
-    this process, of learning, of sums and of the merge.
+    this process, of learning, of sums and of the merge. held, digest: of the memory that came out.
     """
 
     sources: int = 0
@@ -79,6 +79,8 @@ class FleetReport:
     deaths: int = 0
     seconds: float = 0.0
     merging: float = 0.0
+    held: int = 0
+    digest: str = ""
     processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "sums": 0.0, "merge": 0.0})
 
 
@@ -137,7 +139,7 @@ def learn(
             )
         run = _Run(folder, making, report, fan, progress)
         run.begin(found)
-        with stack.enter_context(_engine(client, workers)) as engine:
+        with _engine(client, workers) as engine:
             parts, sums = run.work(engine)
         if held is None:
             if not parts and not run.whole:
@@ -145,6 +147,7 @@ def learn(
             held = TactileLearner.open(place, sensor=making.sensor, embedding=making.embedding, **settings)
             stack.enter_context(held)
         run.merge(held, parts, sums, descriptions)
+        report.held, report.digest = sum(held.materials.values()), held.digest()
         held.close()
         run.end(found)
     report.seconds = time.perf_counter() - begun

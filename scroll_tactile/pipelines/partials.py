@@ -224,7 +224,11 @@ def _pack(job: LearnJob, address: str) -> Made:
                 shutil.copyfile(place, path)
             else:
                 path = place
-        return Made.of(path, (address,))
+        made = Made.of(path, (address,))
+        with Partial(path) as partial:
+            # Of other settings it is merged by itself, or refused there by what differs.
+            made.has_rows = made.has_rows and partial.identity == job.making.identity.to_json()
+        return made
     except StoreFullError:
         raise
     except (ScrollTactileError, StoreError, OSError) as error:

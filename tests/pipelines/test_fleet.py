@@ -1,0 +1,313 @@
+"""Many workers, one memory: the bytes of one process that observed each touch once, whatever happened meanwhile."""
+
+import os
+import random
+import shutil
+import signal
+import socket
+import threading
+import time
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pytest
+from touches import PAD, SETTINGS, SMALL, contents, fed, filled, stream
+
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.pipelines import fleet, partials
+from scroll_tactile.pipelines.fleet import learn
+from scroll_tactile.pipelines.sources import SourceOptions
+from store import StoreFullError
+
+BY_FOLDER = SourceOptions(by="folder")
+
+
+class Inline(Executor):
+    """Runs jobs here and now. ends: of so many jobs a share ends without an answer, before or after they ran."""
+
+    def __init__(self, ends=0.0, seed=0):
+        self._ends, self._random = ends, random.Random(seed)
+        self._max_workers = 1 + self._random.randrange(4)
+
+    def submit(self, what, *words):
+        future = Future()
+        ends = self._random.random() < self._ends
+        try:
+            made = None if ends and self._random.random() < 0.5 else what(*words)
+            if ends:
+                raise BrokenProcessPool("a worker died")
+            future.set_result(made)
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def touch_files(folder, touches):
+    """Recordings of one touch each, by the folder that names it; their paths."""
+    paths = []
+    for number, (name, touch) in enumerate(touches):
+        path = folder / name / f"{number}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, stream(touch).astype(np.float32))
+        paths.append(path)
+    return paths
+
+
+TOUCHES = [(name, (seed, 40 + 5 * seed)) for seed in range(4) for name in "abc"]
+
+
+def expected(touches=TOUCHES, **settings):
+    """What one learner holds that observed each touch once."""
+    learner = TactileLearner(**SETTINGS | settings)
+    for name, touch in sorted(set(touches)):
+        learner.observe(name, stream(touch).astype(np.float32))
+    return learner
+
+
+def run(destination, sources, options=BY_FOLDER, client=None, **settings):
+    return learn(destination, sources, options, client=client or Inline(), **SETTINGS | settings)
+
+
+def require_learned(destination, touches=TOUCHES, **settings):
+    """The memory is that of one process, to the byte, now and when its generation is lost; each touch says its file."""
+    with TactileLearner.open(destination) as learner:
+        assert contents(learner) == contents(expected(touches, **settings))
+        assert sum(learner.materials.values()) == len(set(touches))
+    return learner
+
+
+class TestSameBytes:
+    def test_it_is_the_memory_of_one_process_with_the_source_of_every_touch(self, tmp_path):
+        paths = touch_files(tmp_path / "in", TOUCHES)
+        done = run(tmp_path / "m", [tmp_path / "in"])
+        assert (done.sources, done.observations, done.repeated, done.refused) == (12, 12, 0, [])
+        require_learned(tmp_path / "m")
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert {row.source for row in learner.observations()} == set(map(str, paths))
+            assert {row.state for row in learner.observations()} == {"kept"}
+            assert done.digest == learner.digest() and done.held == 12
+
+    @pytest.mark.parametrize("seed", range(12))
+    def test_random_workers_trees_ends_and_duplicates_change_no_byte(self, tmp_path, seed, monkeypatch):
+        draw = random.Random(seed)
+        touches = [draw.choice(TOUCHES) for _ in range(draw.randrange(1, 20))]
+        touch_files(tmp_path / "in", touches)
+        monkeypatch.setattr(fleet, "MOST_SOURCES", draw.randrange(1, 6))
+        monkeypatch.setattr(fleet, "TRIES", 50)
+        ends = Inline(draw.choice([0.0, 0.3, 0.6]), seed)
+        done = run(tmp_path / "m", [tmp_path / "in"], client=ends, fan=draw.randrange(2, 6))
+        assert done.observations == len(set(touches)) and not done.refused
+        assert done.digest == expected(touches).digest()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.exemplars == expected(touches).exemplars
+
+    def test_an_embedding_that_is_not_exact_keeps_its_codes_and_a_memory_without_readings_none(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES + TOUCHES[:3])
+        for name, settings in {"codes": {"exemplars": 0, "recall": 0}, "kept": {"exemplars": 0}}.items():
+            done = run(tmp_path / name, [tmp_path / "in"], **settings)
+            assert done.observations == 12
+            require_learned(tmp_path / name, **settings)
+
+    def test_memories_are_sources_too_in_folders_and_packed_with_rows_or_without(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES[:4])
+        for name, part, rows in (("folder", TOUCHES[2:6], None), ("rows", TOUCHES[5:9], True), ("sums", TOUCHES[9:], False)):
+            with TactileLearner.open(tmp_path / f"{name}.memory", **SETTINGS) as learner:
+                for material, touch in part:
+                    learner.observe(material, stream(touch).astype(np.float32))
+                if rows is not None:
+                    learner.pack(tmp_path / name, rows=rows)
+        sources = [tmp_path / "in", tmp_path / "folder.memory", tmp_path / "rows", tmp_path / "sums"]
+        done = run(tmp_path / "m", sources)
+        assert done.refused == [] and done.repeated == 3
+        require_learned(tmp_path / "m")
+        with TactileLearner.open(tmp_path / "m") as learner:
+            said = [row.source for row in learner.observations()]
+            assert str(tmp_path / "folder.memory") in said
+
+
+class TestGoingOn:
+    def test_a_run_that_was_killed_goes_on_where_it_was(self, tmp_path, monkeypatch):
+        touch_files(tmp_path / "in", TOUCHES)
+        monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
+
+        class Killed(Inline):
+            jobs = 0
+
+            def submit(self, what, *words):
+                self.jobs += 1
+                if self.jobs > 2:
+                    raise KeyboardInterrupt
+                return super().submit(what, *words)
+
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "m", [tmp_path / "in"], client=Killed())
+        assert not (tmp_path / "m").exists()
+        learned = []
+        learn_again = partials._learn
+        monkeypatch.setattr(partials, "_learn", lambda job: learned.extend(job.sources) or learn_again(job))
+        done = run(tmp_path / "m", [tmp_path / "in"])
+        assert 0 < len(learned) < 12 and done.observations == 12
+        require_learned(tmp_path / "m")
+        assert [path.name for path in (tmp_path / "m.fleet").iterdir()] == ["run.json"]
+
+    def test_a_partial_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, monkeypatch):
+        touch_files(tmp_path / "in", TOUCHES)
+        merge = TactileLearner.merge
+        monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+        with pytest.raises(StoreFullError):
+            run(tmp_path / "m", [tmp_path / "in"])
+        monkeypatch.setattr(TactileLearner, "merge", merge)
+        path = next((tmp_path / "m.fleet").glob("learned-*.part"))
+        path.write_bytes(path.read_bytes()[:-9] + b"X" * 9)
+        assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
+        require_learned(tmp_path / "m")
+
+    def test_more_sources_go_into_the_memory_of_an_earlier_run_and_nothing_twice(self, tmp_path):
+        touch_files(tmp_path / "one", TOUCHES[:7])
+        touch_files(tmp_path / "two", TOUCHES[5:])
+        run(tmp_path / "m", [tmp_path / "one"])
+        done = run(tmp_path / "m", [tmp_path / "one", tmp_path / "two", tmp_path / "two"])
+        assert (done.observations, done.repeated, done.sources) == (5, 2, 14)
+        require_learned(tmp_path / "m")
+
+    def test_a_destination_that_was_made_from_others_is_refused_unless_it_is_added_to(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES[3:])
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+            for material, touch in TOUCHES[:5]:
+                learner.observe(material, stream(touch).astype(np.float32))
+        with pytest.raises(InputError, match="not by a run of this kind"):
+            run(tmp_path / "m", [tmp_path / "in"])
+        done = run(tmp_path / "m", [tmp_path / "in"], add=True)
+        assert (done.observations, done.repeated) == (7, 2)
+        require_learned(tmp_path / "m")
+
+    def test_other_settings_than_those_of_the_run_before_are_refused(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES)
+        run(tmp_path / "m", [tmp_path / "in"])
+        with pytest.raises(InputError, match="belongs to another run"):
+            run(tmp_path / "m", [tmp_path / "in"], SourceOptions(material="a"))
+
+
+class TestForgetting:
+    def test_a_robots_day_is_taken_back_as_if_it_had_never_been(self, tmp_path):
+        touch_files(tmp_path / "robot 1", TOUCHES[:6])
+        touch_files(tmp_path / "robot 10", TOUCHES[6:])
+        run(tmp_path / "m", [tmp_path / "robot 1", tmp_path / "robot 10"])
+        with TactileLearner.open(tmp_path / "m") as learner:
+            with pytest.raises(KeyError, match="comes from"):
+                learner.forget(source=str(tmp_path / "robot"))
+            assert learner.forget(source=str(tmp_path / "robot 1")) == 6
+        require_learned(tmp_path / "m", TOUCHES[6:])
+
+    def test_what_was_compacted_cannot_be_forgotten_and_neither_or_both_is_no_question(self, tmp_path):
+        with TactileLearner.open(tmp_path / "r", **SETTINGS) as robot:
+            robot.observe("a", stream((0, 60)), source="s3://day/1.npy")
+            robot.pack(tmp_path / "p", rows=False)
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+            learner.merge(tmp_path / "p", shared="once")
+            with pytest.raises(KeyError, match="were compacted"):
+                learner.forget(source="s3://day")
+            for words in ({}, {"material": "a", "source": "x"}):
+                with pytest.raises(InputError, match="a material, or a source"):
+                    learner.forget(**words)
+            assert learner.digest() == fed([("a", (0, 60))]).digest()
+
+
+class TestWhatCannotBeLearned:
+    def test_half_of_the_sources_are_unreadable(self, tmp_path):
+        paths = touch_files(tmp_path / "in", TOUCHES)
+        for path in paths[::2]:
+            path.write_bytes(path.read_bytes()[:90])
+        done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "gone"])
+        assert {each.source for each in done.refused} == {*map(str, paths[::2]), str(tmp_path / "gone")}
+        assert done.observations == 6
+        require_learned(tmp_path / "m", TOUCHES[1::2])
+
+    def test_they_are_learned_once_they_can_be_read(self, tmp_path):
+        paths = touch_files(tmp_path / "in", TOUCHES)
+        whole = paths[3].read_bytes()
+        paths[3].write_bytes(b"")
+        assert len(run(tmp_path / "m", [tmp_path / "in"]).refused) == 1
+        paths[3].write_bytes(whole)
+        assert run(tmp_path / "m", [tmp_path / "in"]).observations == 1
+        require_learned(tmp_path / "m")
+
+    def test_nothing_at_all_makes_no_memory(self, tmp_path):
+        (tmp_path / "in").mkdir()
+        with pytest.raises(InputError, match="nothing was learned, and no memory made: 1 sources were refused"):
+            run(tmp_path / "m", [tmp_path / "in"])
+        assert not (tmp_path / "m").exists()
+
+    def test_a_source_that_ends_every_worker_is_named_and_the_others_are_learned(self, tmp_path, monkeypatch):
+        paths = touch_files(tmp_path / "in", TOUCHES)
+
+        class Poisoned(Inline):
+            def submit(self, what, job):
+                if str(paths[4]) in getattr(job, "sources", ()):
+                    future = Future()
+                    future.set_exception(BrokenProcessPool("died"))
+                    return future
+                return super().submit(what, job)
+
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Poisoned())
+        assert [each.source for each in done.refused] == [str(paths[4])]
+        assert "5 workers ended while they learned it" in done.refused[0].why
+        require_learned(tmp_path / "m", TOUCHES[:4] + TOUCHES[5:])
+
+    def test_memories_of_another_sensor_or_embedding_are_refused_by_name(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES)
+        other = PAD.model_copy(update={"name": "other pad", "rate": 60.0})
+        for name, settings in {"s": {"sensor": other}, "e": {"embedding": Kernels(seed=1, dimension=64)}}.items():
+            with TactileLearner.open(tmp_path / name, **SETTINGS | settings) as learner:
+                learner.observe("a", stream((9, 60)))
+                learner.pack(tmp_path / f"{name}.part")
+        wrong = [tmp_path / name for name in ("s", "e", "s.part", "e.part")]
+        done = run(tmp_path / "m", [tmp_path / "in", *wrong])
+        assert {each.source for each in done.refused} == set(map(str, wrong))
+        assert all("other pad" in each.why or "embedding" in each.why for each in done.refused)
+        require_learned(tmp_path / "m")
+
+    def test_descriptions_that_differ_are_refused_or_chosen_by_the_rule_of_merge(self, tmp_path):
+        for name, share in (("x", 1.0), ("y", 0.5)):
+            with TactileLearner.open(tmp_path / name, **SETTINGS) as learner:
+                learner.observe("a", stream((ord(name), 60)))
+                learner.describe("a", {"cotton": share, "wool": 1 - share})
+        with pytest.raises(MismatchError, match="describe 'a' differently"):
+            run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"])
+        run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"], descriptions="theirs")
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.descriptions["a"]["cotton"] == 0.5
+
+    @pytest.mark.parametrize("wrong", [0, -1, True, 1.5, "2"])
+    def test_workers_that_are_no_number(self, tmp_path, wrong):
+        with pytest.raises(InputError, match="workers as a whole number"):
+            learn(tmp_path / "m", [tmp_path], sensor=PAD, workers=wrong)
+
+
+class TestProcesses:
+    def test_workers_that_are_killed_again_and_again_change_nothing(self, tmp_path, monkeypatch):
+        touch_files(tmp_path / "in", TOUCHES)
+        monkeypatch.setattr(fleet, "TRIES", 50)
+        killed = []
+
+        def kill(what, done, of):
+            if len(killed) < 3:
+                workers = [process for pool in engines[0]._all for process in pool._processes.values()]
+                if workers:
+                    killed.append(workers[0].pid)
+                    os.kill(workers[0].pid, signal.SIGKILL)
+
+        engines = []
+        made = fleet._Processes.__init__
+        monkeypatch.setattr(fleet._Processes, "__init__", lambda self, n: engines.append(self) or made(self, n))
+        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=2, progress=kill, **SETTINGS)
+        assert len(killed) == 3 and done.observations == 12
+        require_learned(tmp_path / "m")
+
+    def test_a_job_that_takes_too_long_is_given_up(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES[:2])
+        os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
+        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=3.0, **SETTINGS)
+        assert done.observations == 2

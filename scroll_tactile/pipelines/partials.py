@@ -253,6 +253,8 @@ def is_memory(address: str) -> bool:
             path = Path(address)
             if path.is_dir():
                 return holds_store(path)
+            if not path.is_file():  # a pipe would be waited for
+                return False
             with path.open("rb") as file:
                 return file.read(len(BEGIN)) == BEGIN
         files, path_there = _file_system(address)

@@ -306,8 +306,10 @@ class TestProcesses:
         assert len(killed) == 3 and done.observations == 12
         require_learned(tmp_path / "m")
 
-    def test_a_job_that_takes_too_long_is_given_up(self, tmp_path):
+    def test_a_job_that_takes_too_long_is_given_up(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(fleet, "TRIES", 1)
         touch_files(tmp_path / "in", TOUCHES[:2])
         os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
         done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=3.0, **SETTINGS)
+        assert [each.source for each in done.refused] == [str(tmp_path / "in" / "a" / "stuck.csv")]
         assert done.observations == 2

@@ -1,0 +1,147 @@
+"""A fleet whose recordings lie in a bucket, and whose workers are a cluster's: moto's server, and a real one of Dask."""
+
+import importlib.util
+import logging
+import os
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from commands import refused
+from commands import run as command
+from test_fleet import BY_FOLDER, TOUCHES, Inline, expected, run, touch_files
+from touches import PAD, SETTINGS, stream
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.fleet import learn
+
+BUCKETS = pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("moto", "flask", "s3fs"))), reason="moto[server] and s3fs are not installed"
+)
+CLUSTER = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask[distributed] is missing")
+
+
+@pytest.fixture(scope="module")
+def bucket():
+    """An empty bucket of a real S3 interface: its address begins here."""
+    import s3fs
+    from moto.server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    before = dict(os.environ)
+    os.environ |= {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    files = s3fs.S3FileSystem()
+    files.mkdir("touches")
+    yield files
+    server.stop()
+    os.environ.clear()
+    os.environ.update(before)
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@BUCKETS
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+class TestBucket:
+    def test_recordings_and_packed_memories_in_a_bucket_are_one_memory(self, tmp_path, bucket):
+        for path in touch_files(tmp_path / "in", TOUCHES[:9]):
+            bucket.put_file(str(path), f"touches/day/{path.parent.name}/{path.name}")
+        with TactileLearner.open(tmp_path / "robot", **SETTINGS) as learner:
+            for name, touch in TOUCHES[7:]:
+                learner.observe(name, stream(touch).astype(np.float32))
+            learner.pack(tmp_path / "robot.part", source="robot 7")
+        bucket.put_file(str(tmp_path / "robot.part"), "touches/robot.part")
+        done = run(tmp_path / "m", ["s3://touches/day", "s3://touches/robot.part", "s3://touches/nothing"])
+        assert [each.source for each in done.refused] == ["s3://touches/nothing"]
+        assert done.observations == 12 and done.repeated == 2
+        assert done.digest == expected().digest()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.forget(source="s3://touches/day") + learner.forget(source="robot 7") == 12
+
+    def test_a_bucket_that_denies_or_is_not_there_is_listed(self, tmp_path, bucket, monkeypatch):
+        touch_files(tmp_path / "in", TOUCHES)
+        import s3fs
+
+        def denied(*_, **__):
+            raise PermissionError("Access Denied")
+
+        monkeypatch.setattr(s3fs.S3FileSystem, "isdir", denied)
+        done = run(tmp_path / "m", [tmp_path / "in", "s3://secret/day", "nosuch://bucket/day"])
+        assert {each.source for each in done.refused} == {"s3://secret/day", "nosuch://bucket/day"}
+        assert "Access Denied" in "".join(each.why for each in done.refused)
+        assert done.digest == expected().digest()
+
+
+@CLUSTER
+@pytest.mark.filterwarnings("ignore")  # those of the cluster's libraries
+class TestCluster:
+    def test_a_clusters_workers_learn_the_same_bytes_also_where_one_is_lost(self, tmp_path):
+        from distributed import Client, LocalCluster
+
+        touch_files(tmp_path / "in", TOUCHES + TOUCHES[:4])
+        quiet = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
+        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster, Client(cluster) as client:
+            killed = []
+
+            def kill(what, done, of):
+                if not killed:
+                    killed.append(client.run(os.getpid))
+                    worker = next(iter(killed[0]))
+                    os.kill(killed[0][worker], 9)
+
+            done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, client=client, progress=kill, **SETTINGS)
+            command_line = command(
+                "fleet", tmp_path / "by command", tmp_path / "m", "--scheduler", cluster.scheduler_address, "--json",
+                "--sensor", _described(tmp_path),
+            )  # fmt: skip
+        assert killed and done.observations == 12 and not done.refused
+        assert done.digest == expected().digest()
+        assert command_line.exit_code == 1, command_line.output  # the command's embedding is the default one
+        assert "refused" in command_line.output
+
+
+def _described(folder):
+    path = folder / "pad.json"
+    path.write_text(PAD.model_dump_json())
+    return path
+
+
+class TestRefused:
+    @CLUSTER
+    @pytest.mark.filterwarnings("ignore")
+    def test_a_scheduler_that_is_not_there(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("scroll_tactile.cli.fleet.SECONDS", 1)
+        touch_files(tmp_path / "in", TOUCHES[:1])
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+        line = refused("fleet", tmp_path / "m", tmp_path / "in", "--scheduler", f"tcp://127.0.0.1:{port}")
+        assert "no scheduler answers at" in line
+        assert not (tmp_path / "m").exists()
+
+    def test_what_is_no_client_and_what_does_not_fit_together(self, tmp_path):
+        with pytest.raises(InputError, match=r"expected a dask\.distributed\.Client or an Executor; came str"):
+            learn(tmp_path / "m", [tmp_path], sensor=PAD, client="tcp://127.0.0.1:1")
+        line = refused("fleet", tmp_path / "m", tmp_path, "--scheduler", "tcp://x:1", "--workers", "2")
+        assert "--workers or --scheduler" in line
+
+    def test_the_command_says_what_it_did_and_ends_with_1_where_something_was_refused(self, tmp_path):
+        paths = touch_files(tmp_path / "in", TOUCHES[:4])
+        words = ["--sensor", _described(tmp_path), "--label-by", "folder", "--workers", "1"]
+        done = command("fleet", tmp_path / "m", tmp_path / "in", *words)
+        assert done.exit_code == 0, done.output
+        assert "4 touches from 4 sources" in done.output
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.digest() in done.output and sum(learner.materials.values()) == 4
+        paths[0].with_name("bad.npy").write_bytes(b"")
+        again = command("fleet", tmp_path / "m", tmp_path / "in", *words)
+        assert again.exit_code == 1 and "bad.npy" in again.stderr and "0 touches from 4 sources" in again.output

@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 
 from examples.benchmarks.buffers import run_buffers
+from examples.benchmarks.fleet import run_fleet
 from examples.benchmarks.interleaved import run_interleaved
 from examples.benchmarks.live_decision import RECORDED, run_decisions, show_decisions
 from examples.benchmarks.live_shift import run_shifts, show_shifts
@@ -195,6 +196,27 @@ def interleaved(
             note=lambda what: progress(what, 0, 1),
         )
     show_interleaved(result)
+    _written(context, json, result)
+
+
+@app.command()
+def fleet(
+    context: typer.Context,
+    touches: Annotated[int, typer.Option(min=20, help="Recordings, simulated, learned three times.")] = 20_000,
+    partials: Annotated[int, typer.Option(min=2, help="Of a default memory, summed up.")] = 1000,
+    runs: Annotated[int, typer.Option(min=1, help="With workers that die and touches that come twice.")] = 200,
+    flips: Annotated[int, typer.Option(min=1, help="Of one bit of a partial.")] = 500,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
+    json: Json = None,
+) -> None:
+    """Measure a fleet's memory: workers against a plain loop, sums of partials, and what thousands would take."""
+    require_folders(json)
+    with progress_bar() as progress:
+        result = run_fleet(touches, partials, runs, flips, seed, note=lambda what: progress(what, 0, 1))
+    shares = {name: result[name] for name in ("overhead", "speed_up", "speed_up_wall", "merge_share")}
+    for name, value in {**shares, **result["sums"]}.items():
+        say(f"{name.replace('_', ' ')}: {value:.4g}")
+    say(f"equal: {result['equal_runs']} of {result['runs']} runs; refused: {result['refused_flips']} of {flips} flips")
     _written(context, json, result)
 
 

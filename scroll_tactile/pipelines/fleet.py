@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import InputError, MismatchError, ObservationError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, ObservationError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import usual_embedding
@@ -119,7 +119,7 @@ def learn(
     the report, and so are those whose workers die again and again; all others are learned.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
-    for a destination of another sensor; StoreFullError and other StoreErrors: call again to go on.
+    for a destination of another sensor; CapacityError beyond what exact sums hold; StoreFullError and other StoreErrors: call again to go on.
     """
     begun = time.perf_counter()
     place = Path(destination).absolute()
@@ -271,7 +271,7 @@ class _Run:
     def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int) -> None:
         try:
             made = future.result()
-        except (StoreFullError, KeyboardInterrupt):
+        except (CapacityError, StoreFullError, KeyboardInterrupt):
             raise
         except Exception as error:
             self._lost(job, tries, error)

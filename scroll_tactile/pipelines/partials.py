@@ -260,7 +260,8 @@ def is_memory(address: str) -> bool:
         files, path_there = _file_system(address)
         if files.isdir(path_there):
             return bool(files.exists(f"{path_there.rstrip('/')}/{JOURNAL}"))
-        return bool(files.cat_file(path_there, 0, len(BEGIN)) == BEGIN)
+        with files.open(path_there, "rb", cache_type="none") as file:
+            return bool(file.read(len(BEGIN)) == BEGIN)
     except Exception:  # each file system has errors of its own; reading it tells what is wrong
         return False
 

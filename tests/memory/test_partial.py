@@ -5,11 +5,11 @@ import pytest
 from touches import OBSERVED, PAD, SETTINGS, SMALL, contents, fed, filled, require_same, spoil, stream
 
 from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.errors import MismatchError, ObservationError
 from scroll_tactile.memory.packing import reduce_partials
 from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.embeddings.protocol import window_plan
 from store import DamageError, NotAStoreError, StoreError, VersionError
 
 HALVES = OBSERVED[:6], OBSERVED[6:]
@@ -106,7 +106,9 @@ class TestMerging:
             require_same(learner, HALVES[1])
             assert [row.state for row in learner.observations()] == ["compacted"] * 6
 
-    @pytest.mark.parametrize("settings", [{"sensor": PAD.model_copy(update={"name": "q"})}, {"embedding": Kernels(seed=3)}])
+    @pytest.mark.parametrize(
+        "settings", [{"sensor": PAD.model_copy(update={"name": "q"})}, {"embedding": Kernels(seed=3)}]
+    )
     def test_another_making_is_refused_by_name(self, tmp_path, settings):
         file = packed(tmp_path, OBSERVED[:2], **settings)
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
@@ -189,7 +191,9 @@ class TestSums:
         files = [packed(tmp_path, OBSERVED[i : i + 3], f"p{i}", pack={"rows": False}) for i in range(0, 12, 3)]
 
         def added(paths, name):
-            reduce_partials([(path, ()) for path in paths], tmp_path / name, Memory(64, window_plan(PAD, SMALL), 4, None, keeping))
+            reduce_partials(
+                [(path, ()) for path in paths], tmp_path / name, Memory(64, window_plan(PAD, SMALL), 4, None, keeping)
+            )
             return tmp_path / name
 
         with TactileLearner.open(tmp_path / "p0.memory", **SETTINGS) as learner:

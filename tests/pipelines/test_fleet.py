@@ -2,18 +2,15 @@
 
 import os
 import random
-import shutil
 import signal
-import socket
-import threading
-import time
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
-from touches import PAD, SETTINGS, SMALL, contents, fed, filled, stream
+from touches import PAD, SETTINGS, contents, fed, stream
 
+from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines import fleet, partials
@@ -22,26 +19,6 @@ from scroll_tactile.pipelines.sources import SourceOptions
 from store import StoreFullError
 
 BY_FOLDER = SourceOptions(by="folder")
-
-
-class Inline(Executor):
-    """Runs jobs here and now. ends: of so many jobs a share ends without an answer, before or after they ran."""
-
-    def __init__(self, ends=0.0, seed=0):
-        self._ends, self._random = ends, random.Random(seed)
-        self._max_workers = 1 + self._random.randrange(4)
-
-    def submit(self, what, *words):
-        future = Future()
-        ends = self._random.random() < self._ends
-        try:
-            made = None if ends and self._random.random() < 0.5 else what(*words)
-            if ends:
-                raise BrokenProcessPool("a worker died")
-            future.set_result(made)
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 def touch_files(folder, touches):
@@ -67,7 +44,7 @@ def expected(touches=TOUCHES, **settings):
 
 
 def run(destination, sources, options=BY_FOLDER, client=None, **settings):
-    return learn(destination, sources, options, client=client or Inline(), **SETTINGS | settings)
+    return learn(destination, sources, options, client=client or DyingExecutor(), **SETTINGS | settings)
 
 
 def require_learned(destination, touches=TOUCHES, **settings):
@@ -96,7 +73,7 @@ class TestSameBytes:
         touch_files(tmp_path / "in", touches)
         monkeypatch.setattr(fleet, "MOST_SOURCES", draw.randrange(1, 6))
         monkeypatch.setattr(fleet, "TRIES", 50)
-        ends = Inline(draw.choice([0.0, 0.3, 0.6]), seed)
+        ends = DyingExecutor(draw.choice([0.0, 0.3, 0.6]), seed)
         done = run(tmp_path / "m", [tmp_path / "in"], client=ends, fan=draw.randrange(2, 6))
         assert done.observations == len(set(touches)) and not done.refused
         assert done.digest == expected(touches).digest()
@@ -112,7 +89,11 @@ class TestSameBytes:
 
     def test_memories_are_sources_too_in_folders_and_packed_with_rows_or_without(self, tmp_path):
         touch_files(tmp_path / "in", TOUCHES[:4])
-        for name, part, rows in (("folder", TOUCHES[2:6], None), ("rows", TOUCHES[5:9], True), ("sums", TOUCHES[9:], False)):
+        for name, part, rows in (
+            ("folder", TOUCHES[2:6], None),
+            ("rows", TOUCHES[5:9], True),
+            ("sums", TOUCHES[9:], False),
+        ):
             with TactileLearner.open(tmp_path / f"{name}.memory", **SETTINGS) as learner:
                 for material, touch in part:
                     learner.observe(material, stream(touch).astype(np.float32))
@@ -132,7 +113,7 @@ class TestGoingOn:
         touch_files(tmp_path / "in", TOUCHES)
         monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
 
-        class Killed(Inline):
+        class Killed(DyingExecutor):
             jobs = 0
 
             def submit(self, what, *words):
@@ -243,7 +224,7 @@ class TestWhatCannotBeLearned:
     def test_a_source_that_ends_every_worker_is_named_and_the_others_are_learned(self, tmp_path, monkeypatch):
         paths = touch_files(tmp_path / "in", TOUCHES)
 
-        class Poisoned(Inline):
+        class Poisoned(DyingExecutor):
             def submit(self, what, job):
                 if str(paths[4]) in getattr(job, "sources", ()):
                     future = Future()

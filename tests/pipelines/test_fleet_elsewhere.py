@@ -4,14 +4,12 @@ import importlib.util
 import logging
 import os
 import socket
-import threading
-import time
 
 import numpy as np
 import pytest
 from commands import refused
 from commands import run as command
-from test_fleet import BY_FOLDER, TOUCHES, Inline, expected, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, expected, run, touch_files
 from touches import PAD, SETTINGS, stream
 
 from scroll_tactile import TactileLearner
@@ -90,7 +88,10 @@ class TestCluster:
 
         touch_files(tmp_path / "in", TOUCHES + TOUCHES[:4])
         quiet = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
-        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster, Client(cluster) as client:
+        with (
+            LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster,
+            Client(cluster) as client,
+        ):
             killed = []
 
             def kill(what, done, of):

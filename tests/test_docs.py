@@ -40,6 +40,7 @@ SHOWN = {
     "own_embedding": "right: 5 of 5",
     "camera": "refused: expected frames",
     "live": "10 of 10 touches found",
+    "fleet": "the bytes of one process: True",
     "two_robots": "a slip retracted, the same bytes: True",
 }
 

@@ -11,17 +11,12 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from multiprocessing import get_all_start_methods, get_context, parent_process
-from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +27,7 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import usual_embedding
 from scroll_tactile.memory.merge import Choice
 from scroll_tactile.memory.partial import Joint, Partial
+from scroll_tactile.pipelines.engines import Engine, engine
 from scroll_tactile.pipelines.partials import (
     LearnJob,
     Made,
@@ -111,19 +107,20 @@ def learn(
     or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
     the destination, where partials lie meanwhile.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
-    destination comes first, then the sources in their order. patience: seconds that a job may take before its worker is
-    given up. fan: how many partials are summed up at once. progress: called with (what is being done, sources done,
-    sources in all).
+    destination comes first, then the sources in their order. patience: seconds that a job, or listing an address, may
+    take before it is given up. fan: how many partials are summed up at once. progress: called with (what is being done,
+    sources done, sources in all).
 
     A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
     the report, and so are those whose workers die again and again; all others are learned.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
-    for a destination of another sensor; CapacityError beyond what exact sums hold; StoreFullError and other StoreErrors: call again to go on.
+    for a destination of another sensor; CapacityError beyond what exact sums hold; StoreFullError and other
+    StoreErrors: call again to go on.
     """
     begun = time.perf_counter()
     place = Path(destination).absolute()
-    found, missing = expand([os.fspath(source) for source in sources])
+    found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
     settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "recall": recall}
     with ExitStack() as stack:
@@ -139,8 +136,8 @@ def learn(
             )
         run = _Run(folder, making, report, fan, progress)
         run.begin(found)
-        with _engine(client, workers) as engine:
-            parts, sums = run.work(engine)
+        with engine(client, workers) as chosen:
+            parts, sums = run.work(chosen)
         if held is None:
             if not parts and not run.whole:
                 raise InputError(_nothing(report))
@@ -149,7 +146,7 @@ def learn(
         run.merge(held, parts, sums, descriptions)
         report.held, report.digest = sum(held.materials.values()), held.digest()
         held.close()
-        run.end(found)
+        run.end()
     report.seconds = time.perf_counter() - begun
     return report
 
@@ -191,12 +188,13 @@ class _Run:
         self._ready: list[tuple[str, tuple[int, ...]]] = []
         self._sums = 0
         self._begun = time.perf_counter()
+        self._learned: set[str] = set(self._notes.notes.get("learned", []))
         self.whole: list[Made] = []
 
     def begin(self, found: Sequence[str]) -> None:
         """Take what an earlier run left behind, and cut the rest into jobs."""
         self._order = {source: place for place, source in enumerate(found)}
-        learned: set[str] = set(self._notes.notes.get("learned", []))
+        learned = self._learned
         for path in sorted(self.folder.iterdir()):
             if not path.name.startswith("learned-") or path.suffix != ".part":
                 continue
@@ -206,7 +204,6 @@ class _Run:
                 logger.warning("%s; its sources are learned again", error)
                 continue
             if learned.isdisjoint(made.sources) and set(made.sources) <= set(found):
-                learned |= set(made.sources)
                 self._take(made)
         self.report.sources = len(learned & set(found))
         self._total = len(found)
@@ -234,7 +231,7 @@ class _Run:
         if group:
             self._waiting.append((self._job(group), 0))
 
-    def work(self, engine: _Engine) -> tuple[list[tuple[Made, tuple[int, ...]]], str | None]:
+    def work(self, engine: Engine) -> tuple[list[tuple[Made, tuple[int, ...]]], str | None]:
         """Have all jobs done; returns the partials with rows, in the order of the sources, and the sum of all."""
         self._cut(engine.workers)
         running: dict[Future[Made], tuple[LearnJob | SumJob, int]] = {}
@@ -296,6 +293,7 @@ class _Run:
 
     def _take(self, made: Made) -> None:
         """Take a partial in: what came before is left out of it."""
+        self._learned.update(made.sources)
         if not made.has_rows:
             self.whole.append(made)
             return
@@ -350,14 +348,13 @@ class _Run:
                 self.report.observations += done.observations
             except (MismatchError, ObservationError) as error:
                 self.report.refused.append(Refused(made.sources[0], str(error)))
+                self._learned.difference_update(made.sources)
         self.report.merging = time.perf_counter() - begun
         self.report.processor["merge"] += time.process_time() - processor
 
-    def end(self, found: Sequence[str]) -> None:
+    def end(self) -> None:
         """Note what was learned, and remove the partials."""
-        refused = {each.source for each in self.report.refused}
-        learned = {*self._notes.notes.get("learned", []), *found} - refused
-        self._notes.note("learned", sorted(learned))
+        self._notes.note("learned", sorted(self._learned))
         for path in self.folder.iterdir():
             if path.suffix in (".part", ".partial"):
                 path.unlink()
@@ -383,87 +380,3 @@ def _bytes_of(source: str) -> int:
     with suppress(OSError):
         return Path(source).stat().st_size
     return 0
-
-
-class _Engine:
-    """Who runs the jobs: an Executor of the caller's.
-
-    workers: how many jobs run at once, as far as is known. room: how many are handed over at once.
-    """
-
-    def __init__(self, executor: Executor, workers: int) -> None:
-        self._executor, self.workers, self.room = executor, workers, 2 * workers
-
-    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
-        """Have a job done; the future raises where it could not be."""
-        return self._executor.submit(what, job)
-
-    def __enter__(self) -> _Engine:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The executor is the caller's."""
-
-
-class _Processes(_Engine):
-    """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
-
-    def __init__(self, workers: int) -> None:
-        self.workers = self.room = workers
-        self._free: list[ProcessPoolExecutor] = []
-        self._all: set[ProcessPoolExecutor] = set()
-        method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
-        self._context: Any = get_context(method)
-        if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
-            self._context.set_forkserver_preload([learn_partial.__module__])
-
-    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
-        """As `_Engine.submit`, by a process that has nothing else to do."""
-        pool = self._free.pop() if self._free else self._new()
-        try:
-            future = pool.submit(what, job)
-        except BrokenProcessPool:  # it died while it waited
-            self._all.discard(pool)
-            pool = self._new()
-            future = pool.submit(what, job)
-        future.add_done_callback(lambda done: self._back(pool, done))
-        return future
-
-    def _new(self) -> ProcessPoolExecutor:
-        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
-        self._all.add(pool)
-        return pool
-
-    def _back(self, pool: ProcessPoolExecutor, done: Future[Made]) -> None:
-        broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
-        if broken:
-            self._all.discard(pool)
-        else:
-            self._free.append(pool)
-
-    def __exit__(self, *_: object) -> None:
-        for pool in list(self._all):
-            pool.shutdown(wait=sys.exc_info()[0] is None, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """A worker whose parent was killed ends, too, and leaves arithmetic to one thread: there are others beside it."""
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
-    parent = parent_process()
-    if parent is not None:
-        threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
-
-
-def _engine(client: Any, workers: int | None) -> _Engine:
-    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
-        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
-    if client is None:
-        return _Processes(workers or os.cpu_count() or 1)
-    executor = client.get_executor() if hasattr(client, "get_executor") else client
-    if not isinstance(executor, Executor):
-        raise InputError(f"expected a dask.distributed.Client or an Executor; came {type(client).__name__}")
-    cores = getattr(client, "ncores", None)
-    known = sum(cores().values()) if callable(cores) else getattr(executor, "_max_workers", 0)
-    return _Engine(executor, workers or known or os.cpu_count() or 1)

@@ -7,11 +7,14 @@ import hashlib
 import json
 import os
 import shutil
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from queue import Empty, Queue
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
@@ -35,7 +38,8 @@ from store.packed import BEGIN
 
 __all__ = ["LearnJob", "Made", "Making", "SumJob", "expand", "is_memory", "learn_partial", "sum_partials"]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet", ".part", ".partial")
+RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
+PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual names of packed memories
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 JOURNAL = "journal.sqlite"
 
@@ -138,13 +142,14 @@ class Made:
 
         Raises StoreError, MismatchError.
         """
-        with Partial(path) as partial:
-            named = partial.note.get("sources") if sources is None else list(sources)
+        with Partial(path) as packed:
+            named = packed.note.get("sources") if sources is None else list(sources)
             if not isinstance(named, list) or not all(isinstance(source, str) for source in named):
                 raise MismatchError(f"{path} is a partial, but none of a fleet's run")
-            touches = [touch_hash(head.label, head.key) for head in partial.named]
-            described = dict(partial.descriptions)
-            return cls(str(path), tuple(named), partial.has_rows, touches=touches, descriptions=described)
+            packed.verify()
+            touches = [touch_hash(head.label, head.key) for head in packed.named]
+            described = dict(packed.descriptions)
+            return cls(str(path), tuple(named), packed.has_rows, touches=touches, descriptions=described)
 
 
 def touch_hash(material: str, key: bytes) -> bytes:
@@ -186,7 +191,7 @@ def _learn(job: LearnJob) -> Made:
     failed: set[str] = set()
     touches: list[bytes] = []
     seen: set[bytes] = set()
-    with write_partial(job.target) as partial:
+    with write_partial(job.target) as written:
         for address in job.sources:
             for touch in source_touches(learner, address, making.options):
                 if isinstance(touch, Refused):
@@ -205,10 +210,10 @@ def _learn(job: LearnJob) -> Made:
                 said |= {"nbytes": touch.stream.readings.nbytes} if reads else {}
                 arrays = pack_readings(touch.stream.readings) if reads else {}
                 arrays |= {} if identity.embedding.bare else pack_codes(codes)
-                partial.touch(Head(len(seen), OBSERVE, material, key, time.time(), said, 0), arrays)
+                written.touch(Head(len(seen), OBSERVE, material, key, time.time(), said, 0), arrays)
                 touches.append(name)
         learned = tuple(source for source in job.sources if source not in failed)
-        partial.finish(identity.to_json(), memory, None, note={"sources": list(learned)})
+        written.finish(identity.to_json(), memory, None, note={"sources": list(learned)})
     return Made(str(job.target), learned, refused=refused, touches=touches)
 
 
@@ -225,9 +230,9 @@ def _pack(job: LearnJob, address: str) -> Made:
             else:
                 path = place
         made = Made.of(path, (address,))
-        with Partial(path) as partial:
+        with Partial(path) as packed:
             # Of other settings it is merged by itself, or refused there by what differs.
-            made.has_rows = made.has_rows and partial.identity == job.making.identity.to_json()
+            made.has_rows = made.has_rows and packed.identity == job.making.identity.to_json()
         return made
     except StoreFullError:
         raise
@@ -249,21 +254,28 @@ def sum_partials(job: SumJob) -> Made:
 def is_memory(address: str) -> bool:
     """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none."""
     try:
-        if not is_remote(address):
-            path = Path(address)
-            if path.is_dir():
-                return holds_store(path)
-            if not path.is_file():  # a pipe would be waited for
-                return False
-            with path.open("rb") as file:
-                return file.read(len(BEGIN)) == BEGIN
-        files, path_there = _file_system(address)
-        if files.isdir(path_there):
-            return bool(files.exists(f"{path_there.rstrip('/')}/{JOURNAL}"))
-        with files.open(path_there, "rb", cache_type="none") as file:
-            return bool(file.read(len(BEGIN)) == BEGIN)
+        return _is_remote_memory(address) if is_remote(address) else _is_local_memory(Path(address))
     except Exception:  # each file system has errors of its own; reading it tells what is wrong
         return False
+
+
+def _is_local_memory(path: Path) -> bool:
+    if path.is_dir():
+        return holds_store(path)
+    if not path.is_file():  # a pipe would be waited for
+        return False
+    with path.open("rb") as file:
+        return file.read(len(BEGIN)) == BEGIN
+
+
+def _is_remote_memory(address: str) -> bool:
+    if address.lower().endswith(RECORDINGS):
+        return False
+    files, path = _file_system(address)
+    if files.isdir(path):
+        return bool(files.exists(f"{path.rstrip('/')}/{JOURNAL}"))
+    with files.open(path, "rb", cache_type="none") as file:
+        return bool(file.read(len(BEGIN)) == BEGIN)
 
 
 def _file_system(address: str) -> tuple[Any, str]:
@@ -273,27 +285,50 @@ def _file_system(address: str) -> tuple[Any, str]:
     return found
 
 
-def expand(paths: Sequence[str]) -> tuple[list[str], list[Refused]]:
-    """The recordings and memories at some paths and addresses, each once, in order; and where there is none."""
+def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[str], list[Refused]]:
+    """The recordings and memories at some paths and addresses, each once, in order; and where there is none.
+
+    patience: seconds in which an address must answer.
+    """
     found: dict[str, None] = {}
     refused: list[Refused] = []
     for path in paths:
         inside: Sequence[str]
-        if is_memory(path):
-            inside = [path]
-        elif is_remote(path):
+        if is_remote(path):
             try:
-                inside = _listed(path)
+                inside = _answered(partial(_listed, path), patience)
             except Exception as error:  # each file system has errors of its own
                 refused.append(Refused(path, f"it cannot be listed: {type(error).__name__}: {error!s:.300}"))
                 continue
             if not inside:
                 refused.append(Refused(path, "expected recordings or memories; nothing is there"))
+        elif is_memory(path):
+            inside = [path]
         else:
             inside, missing = find_sources([path])
             refused += missing
         found |= dict.fromkeys(inside)
     return list(found), refused
+
+
+def _answered(ask: Callable[[], list[str]], patience: float | None) -> list[str]:
+    """The answer of a call. Raises what it raises, and TimeoutError where it takes longer; it is left alone then."""
+    answers: Queue[list[str] | Exception] = Queue()
+
+    def call() -> None:
+        try:
+            answers.put(ask())
+        except Exception as error:  # raised below
+            answers.put(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    try:
+        answer = answers.get(timeout=patience)
+    except Empty:
+        raise TimeoutError(f"no answer in {patience:g} s") from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _listed(address: str) -> list[str]:
@@ -308,5 +343,7 @@ def _listed(address: str) -> list[str]:
     if inside & {*WHOLE, JOURNAL}:
         return [address]
     folders = {name.rpartition("/")[0] for name in names if name.endswith((f"/{JOURNAL}", "/metadata.yaml"))}
-    alone = [name for name in names if name.lower().endswith(RECORDINGS) and not name.startswith(tuple(folders))]
+    alone = [
+        name for name in names if name.lower().endswith(RECORDINGS + PACKED) and not name.startswith(tuple(folders))
+    ]
     return [f"{scheme}://{name}" for name in sorted({*folders, *alone})]

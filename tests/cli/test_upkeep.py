@@ -98,6 +98,28 @@ class TestCheckAndRepair:
 
 
 class TestRetracting:
+    def test_a_packed_memory_is_merged_and_its_source_is_forgotten(self, path, tmp_path):
+        packed = run("memory", "pack", path, tmp_path / "p", "--source", "robot 7")
+        assert packed.exit_code == 0 and "12 observations" in packed.output
+        with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
+            learner.observe("d", stream((9, 60)))
+            before = learner.digest()
+        merged = run("memory", "merge", tmp_path / "other", tmp_path / "p", "--shared", "once")
+        assert merged.exit_code == 0 and "12 observations came in" in merged.output
+        assert "no observation" in refused("memory", "forget", tmp_path / "other", "--source", "robot")
+        forgotten = run("memory", "forget", tmp_path / "other", "--source", "robot 7")
+        assert forgotten.exit_code == 0 and "12 observations were retracted" in forgotten.output
+        with TactileLearner.open(tmp_path / "other") as learner:
+            assert learner.digest() == before
+        assert "a material, or a source" in refused("memory", "forget", tmp_path / "other")
+
+    def test_a_memory_is_packed_without_its_rows_or_any_readings(self, path, tmp_path):
+        sizes = []
+        for words in ([], ["--no-rows"], ["--no-readings"]):
+            assert run("memory", "pack", path, tmp_path / "p", *words).exit_code == 0
+            sizes.append((tmp_path / "p").stat().st_size)
+        assert sizes[2] < sizes[1]
+
     def test_retract_and_forget(self, path):
         assert "observation 2 was retracted; 11 are left" in words(run("memory", "retract", path, 2))
         assert "b/ü: 3 observations were retracted; 2 materials are left" in words(run("memory", "forget", path, "b/ü"))

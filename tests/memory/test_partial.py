@@ -149,7 +149,7 @@ class TestDamage:
         file = packed(tmp_path, OBSERVED[:2])
         whole = file.read_bytes()
         file.write_bytes(whole[: int(size * len(whole)) if isinstance(size, float) else size])
-        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:  # noqa: SIM117
             with pytest.raises((DamageError, NotAStoreError), match=r"/p is no"):
                 learner.merge(file, shared="once")
 
@@ -157,7 +157,7 @@ class TestDamage:
         monkeypatch.setattr("store.packed.VERSION", 9)
         file = packed(tmp_path, OBSERVED[:2])
         monkeypatch.undo()
-        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:  # noqa: SIM117
             with pytest.raises(VersionError, match="format 9; this release reads 1"):
                 learner.merge(file, shared="once")
 

@@ -13,7 +13,7 @@ from touches import PAD, SETTINGS, contents, fed, stream
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.pipelines import fleet, partials
+from scroll_tactile.pipelines import engines, fleet, partials
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import SourceOptions
 from store import StoreFullError
@@ -133,7 +133,8 @@ class TestGoingOn:
         require_learned(tmp_path / "m")
         assert [path.name for path in (tmp_path / "m.fleet").iterdir()] == ["run.json"]
 
-    def test_a_partial_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("place", [100, -9000, -9])
+    def test_a_partial_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, monkeypatch, place):
         touch_files(tmp_path / "in", TOUCHES)
         merge = TactileLearner.merge
         monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
@@ -141,7 +142,9 @@ class TestGoingOn:
             run(tmp_path / "m", [tmp_path / "in"])
         monkeypatch.setattr(TactileLearner, "merge", merge)
         path = next((tmp_path / "m.fleet").glob("learned-*.part"))
-        path.write_bytes(path.read_bytes()[:-9] + b"X" * 9)
+        whole = bytearray(path.read_bytes())
+        whole[place] ^= 1
+        path.write_bytes(bytes(whole))
         assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
         require_learned(tmp_path / "m")
 
@@ -275,14 +278,14 @@ class TestProcesses:
 
         def kill(what, done, of):
             if len(killed) < 3:
-                workers = [process for pool in engines[0]._all for process in pool._processes.values()]
+                workers = [process for pool in running[0]._all for process in pool._processes.values()]
                 if workers:
                     killed.append(workers[0].pid)
                     os.kill(workers[0].pid, signal.SIGKILL)
 
-        engines = []
-        made = fleet._Processes.__init__
-        monkeypatch.setattr(fleet._Processes, "__init__", lambda self, n: engines.append(self) or made(self, n))
+        running = []
+        made = engines.Processes.__init__
+        monkeypatch.setattr(engines.Processes, "__init__", lambda self, n: running.append(self) or made(self, n))
         done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=2, progress=kill, **SETTINGS)
         assert len(killed) == 3 and done.observations == 12
         require_learned(tmp_path / "m")

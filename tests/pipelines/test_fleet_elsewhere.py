@@ -1,4 +1,4 @@
-"""A fleet whose recordings lie in a bucket, and whose workers are a cluster's: moto's server, and a real one of Dask."""
+"""A fleet whose recordings lie in a bucket, or whose workers are a cluster: moto's server, and a real one of Dask."""
 
 import importlib.util
 import logging
@@ -77,6 +77,16 @@ class TestBucket:
         done = run(tmp_path / "m", [tmp_path / "in", "s3://secret/day", "nosuch://bucket/day"])
         assert {each.source for each in done.refused} == {"s3://secret/day", "nosuch://bucket/day"}
         assert "Access Denied" in "".join(each.why for each in done.refused)
+        assert done.digest == expected().digest()
+
+    def test_a_bucket_that_never_answers_is_given_up(self, tmp_path, bucket):
+        touch_files(tmp_path / "in", TOUCHES)
+        with socket.create_server(("127.0.0.1", 0)) as silent:
+            os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{silent.getsockname()[1]}"
+            type(bucket).clear_instance_cache()
+            done = run(tmp_path / "m", [tmp_path / "in", "s3://touches/day"], patience=0.5)
+        assert [each.source for each in done.refused] == ["s3://touches/day"]
+        assert "no answer in 0.5 s" in done.refused[0].why
         assert done.digest == expected().digest()
 
 

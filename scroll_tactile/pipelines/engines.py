@@ -1,0 +1,106 @@
+"""Who runs a fleet's jobs: processes of our own, or an Executor of the caller's, such as a cluster's client gives."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_all_start_methods, get_context, parent_process
+from multiprocessing.connection import wait as wait_for
+from typing import Any
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.partials import LearnJob, Made, SumJob, learn_partial
+
+__all__ = ["Engine", "Processes", "engine"]
+
+
+class Engine:
+    """Who runs the jobs: an Executor of the caller's.
+
+    workers: how many jobs run at once, as far as is known. room: how many are handed over at once.
+    """
+
+    def __init__(self, executor: Executor, workers: int) -> None:
+        self._executor, self.workers, self.room = executor, workers, 2 * workers
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+        """Have a job done; the future raises where it could not be."""
+        return self._executor.submit(what, job)
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """The executor is the caller's."""
+
+
+class Processes(Engine):
+    """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = self.room = workers
+        self._free: list[ProcessPoolExecutor] = []
+        self._all: set[ProcessPoolExecutor] = set()
+        method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
+        self._context: Any = get_context(method)
+        if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
+            self._context.set_forkserver_preload([learn_partial.__module__])
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+        """As `Engine.submit`, by a process that has nothing else to do."""
+        pool = self._free.pop() if self._free else self._new()
+        try:
+            future = pool.submit(what, job)
+        except BrokenProcessPool:  # it died while it waited
+            self._all.discard(pool)
+            pool = self._new()
+            future = pool.submit(what, job)
+        future.add_done_callback(lambda done: self._back(pool, done))
+        return future
+
+    def _new(self) -> ProcessPoolExecutor:
+        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
+        self._all.add(pool)
+        return pool
+
+    def _back(self, pool: ProcessPoolExecutor, done: Future[Made]) -> None:
+        broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
+        if broken:
+            self._all.discard(pool)
+        else:
+            self._free.append(pool)
+
+    def __exit__(self, *_: object) -> None:
+        for pool in list(self._all):
+            pool.shutdown(wait=sys.exc_info()[0] is None, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed ends, too, and leaves arithmetic to one thread: there are others beside it."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
+
+
+def engine(client: Any, workers: int | None) -> Engine:
+    """Who runs the jobs: the caller's client or Executor, or so many processes.
+
+    Raises InputError for what is no client, and for workers that are no number.
+    """
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
+        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
+    if client is None:
+        return Processes(workers or os.cpu_count() or 1)
+    executor = client.get_executor() if hasattr(client, "get_executor") else client
+    if not isinstance(executor, Executor):
+        raise InputError(f"expected a dask.distributed.Client or an Executor; came {type(client).__name__}")
+    cores = getattr(client, "ncores", None)
+    known = sum(cores().values()) if callable(cores) else getattr(executor, "_max_workers", 0)
+    return Engine(executor, workers or known or os.cpu_count() or 1)

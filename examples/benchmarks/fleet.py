@@ -7,8 +7,9 @@ import random
 import resource
 import tempfile
 import time
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -77,12 +78,6 @@ def _recordings(folder: Path, count: int, seed: int) -> None:
         np.save(path, np.asarray(scene.touch(material, number // 20).readings, np.float32))
 
 
-def _processor() -> float:
-    """Seconds of this process and of its children that ended."""
-    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
-
-
 def _speed(folder: Path, note: Any) -> dict[str, Any]:
     paths = sorted(map(str, (folder / "in").rglob("*.npy")))
     note("a plain loop")
@@ -128,26 +123,31 @@ def _sums(folder: Path, count: int, note: Any) -> dict[str, Any]:
             robot.pack(files[-1], rows=False)
             settings = robot.settings
             making = Making(sensors.BIOTAC, robot.embedding, None, settings.exemplars, settings.recall, BY_FOLDER)
-    waiting = [str(files[i % len(files)]) for i in range(count)]
-    begun, processor, jobs = time.perf_counter(), 0.0, 0
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:  # whose memory is that of the sums
+        found = alone.submit(_sum_all, making, [str(files[i % len(files)]) for i in range(count)], folder).result()
+    return {"partials": count, "bytes": files[0].stat().st_size, **found}
+
+
+def _sum_all(making: Making, waiting: list[str], folder: Path) -> dict[str, float]:
+    """Sum up partials, one job after another, and what it took."""
+    begun, processor, jobs, count = time.perf_counter(), time.process_time(), 0, len(waiting)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     while len(waiting) > 1:
-        note(f"{len(waiting)} partials")
         parts, waiting = waiting[:FAN], waiting[FAN:]
         jobs += 1
-        made = sum_partials(SumJob(making, tuple((path, ()) for path in parts), str(folder / f"sum {jobs}")))
-        processor += made.processor
-        waiting.append(made.path)
+        waiting.append(
+            sum_partials(SumJob(making, tuple((path, ()) for path in parts), str(folder / f"sum {jobs}"))).path
+        )
         for path in parts:
             if Path(path).name.startswith("sum"):
                 Path(path).unlink()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    took = time.process_time() - processor
     return {
-        "partials": count,
-        "bytes": files[0].stat().st_size,
         "seconds": time.perf_counter() - begun,
-        "processor": processor,
-        "each": processor / max(count + jobs - 1, 1),
-        "peak_megabytes_of_the_process": peak,
+        "processor": took,
+        "each": took / max(count + jobs - 1, 1),
+        "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "megabytes_before": before / 1024,
     }
 
 

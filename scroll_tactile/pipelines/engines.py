@@ -71,6 +71,7 @@ class Processes(Engine):
         broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
         if broken:
             self._all.discard(pool)
+            pool.shutdown(wait=False)
         else:
             self._free.append(pool)
 

@@ -53,7 +53,8 @@ MOST_SOURCES = 1024  # of a job: of touches of 6 ms so many cost thirty times wh
 MOST_BYTES = 2**26  # of their files, where these are here
 JOBS_A_WORKER = 4  # at least, so that all have something to do to the end
 NOTES = "run.json"
-TRIES = 5  # of a job of one source whose worker died
+TRIES = 20  # of a job of one source whose worker died: on a machine that kills a worker a second, nearly all end sooner
+SLOW = 5  # tries that one counts for which took all the patience that there is
 
 Progress = Callable[[str, int, int], object]
 
@@ -234,16 +235,14 @@ class _Run:
     def work(self, engine: Engine) -> tuple[list[tuple[Made, tuple[int, ...]]], str | None]:
         """Have all jobs done; returns the partials with rows, in the order of the sources, and the sum of all."""
         self._cut(engine.workers)
-        running: dict[Future[Made], tuple[LearnJob | SumJob, int]] = {}
+        running: dict[Future[Made], tuple[LearnJob | SumJob, int, float]] = {}
         try:
             while self._waiting or running or len(self._ready) > 1 or self._alone():
                 self._sum_up(idle=not self._waiting and not running)
                 while self._waiting and len(running) < engine.room:
                     job, tries = self._waiting.popleft()
-                    running[engine.submit(learn_partial if isinstance(job, LearnJob) else sum_partials, job)] = (
-                        job,
-                        tries,
-                    )
+                    what = learn_partial if isinstance(job, LearnJob) else sum_partials
+                    running[engine.submit(what, job)] = job, tries, time.monotonic()
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     self._done(future, *running.pop(future))
         except BaseException:
@@ -265,20 +264,18 @@ class _Run:
             target = self.folder / f"sum-{os.getpid()}-{self._sums}.part"
             self._waiting.appendleft((SumJob(self.making, tuple(parts), str(target)), 0))
 
-    def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int) -> None:
+    def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int, begun: float) -> None:
         try:
             made = future.result()
         except (CapacityError, StoreFullError, KeyboardInterrupt):
             raise
         except Exception as error:
-            self._lost(job, tries, error)
+            patience = self.making.patience
+            slow = patience is not None and time.monotonic() - begun >= patience
+            self._lost(job, tries + (SLOW if slow else 1), error)
             return
         if isinstance(job, SumJob):
-            self.report.processor["sums"] += made.processor
-            self._ready.append((made.path, ()))
-            for path, _ in job.parts:
-                if Path(path).name.startswith("sum-"):
-                    Path(path).unlink(missing_ok=True)
+            self._summed(job, made)
             return
         self.report.processor["learning"] += made.processor
         self.report.refused += made.refused
@@ -311,15 +308,23 @@ class _Run:
         """A job ended without its partial: again, by halves, and in the end without the source that ends workers."""
         self.report.deaths += 1
         logger.info("a job of %s ended: %s: %s", job.making.sensor.name, type(error).__name__, error)
-        if isinstance(job, LearnJob) and len(job.sources) > 1:
-            self._waiting.extendleft((half, 0) for half in job.halves())
-        elif tries + 1 < TRIES:
-            self._waiting.appendleft((job, tries + 1))
+        if halves := job.halves():
+            self._waiting.extendleft((half, 0) for half in halves)
+        elif tries < TRIES:
+            self._waiting.appendleft((job, tries))
         elif isinstance(job, LearnJob):
-            why = f"{TRIES} workers ended while they learned it; the last: {type(error).__name__}: {error!s:.200}"
+            last = f"{type(error).__name__}: {error!s:.200}"
+            why = f"workers ended while they learned it, again and again; the last: {last}"
             self.report.refused.append(Refused(job.sources[0], why))
-        else:
-            raise error
+        else:  # nobody's data but ours: what is wrong with it is raised here
+            self._summed(job, sum_partials(job))
+
+    def _summed(self, job: SumJob, made: Made) -> None:
+        self.report.processor["sums"] += made.processor
+        self._ready.append((made.path, ()))
+        for path, _ in job.parts:
+            if Path(path).name.startswith("sum-"):
+                Path(path).unlink(missing_ok=True)
 
     def merge(
         self,

@@ -105,9 +105,10 @@ class LearnJob:
         return Path(self.folder) / f"learned-{digest[:24]}.part"
 
     def halves(self) -> list[LearnJob]:
-        """Two jobs in place of this one."""
+        """Two jobs in place of this one; none of a single source."""
         middle = len(self.sources) // 2
-        return [LearnJob(self.making, part, self.folder) for part in (self.sources[:middle], self.sources[middle:])]
+        parts = (self.sources[:middle], self.sources[middle:])
+        return [LearnJob(self.making, part, self.folder) for part in parts] if middle else []
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,14 @@ class SumJob:
     making: Making
     parts: tuple[tuple[str, tuple[int, ...]], ...]
     target: str
+
+    def halves(self) -> list[SumJob]:
+        """Two jobs in place of this one; none of two partials."""
+        middle = len(self.parts) // 2
+        parts = (self.parts[:middle], self.parts[middle:])
+        return (
+            [SumJob(self.making, part, f"{self.target}-{i}.part") for i, part in enumerate(parts)] if middle > 1 else []
+        )
 
 
 @dataclass

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -347,15 +347,30 @@ class _Run:
                 done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
                 self.report.observations += done.observations
                 self.report.repeated += done.shared
-        for made in self.whole:
+        for made in self._whole_sums():
             try:
                 done = held.merge(made.path, shared="once", descriptions=descriptions, progress=progress)
                 self.report.observations += done.observations
             except (MismatchError, ObservationError) as error:
-                self.report.refused.append(Refused(made.sources[0], str(error)))
+                self.report.refused += [Refused(source, str(error)) for source in made.sources]
                 self._learned.difference_update(made.sources)
         self.report.merging = time.perf_counter() - begun
         self.report.processor["merge"] += time.process_time() - processor
+
+    def _whole_sums(self) -> list[Made]:
+        """The partials without rows, as one where they add up and share no touch; each of the others by itself."""
+        together: list[Made] = []
+        alone: list[Made] = []
+        for made in sorted(self.whole, key=lambda made: self._order[made.sources[0]]):
+            adds_up = made.adds_up and not made.descriptions and self._seen.isdisjoint(made.touches)
+            (together if adds_up else alone).append(made)
+            self._seen.update(made.touches if adds_up else ())
+        if len(together) > 1:
+            target = self.folder / f"sum-{os.getpid()}-whole.part"
+            done = sum_partials(SumJob(self.making, tuple((made.path, ()) for made in together), str(target)))
+            self.report.processor["sums"] += done.processor
+            together = [Made(done.path, tuple(made.sources[0] for made in together), False)]
+        return [*together, *alone]
 
     def end(self) -> None:
         """Note what was learned, and remove the partials."""
@@ -382,6 +397,4 @@ def _described(partials: Sequence[Partial], choice: Choice) -> dict[str, Descrip
 
 
 def _bytes_of(source: str) -> int:
-    with suppress(OSError):
-        return Path(source).stat().st_size
-    return 0
+    return Path(source).stat().st_size if Path(source).exists() else 0

@@ -132,13 +132,15 @@ class SumJob:
 class Made:
     """A partial that a job made.
 
-    path: its file, sources: those in it, with rows or without. refused: what was not learned. touches: a hash of each
+    path: its file, sources: those in it, with rows or without. adds_up: whether it is of the run's making.
+    refused: what was not learned. touches: a hash of each
     touch's name and content, in the order of the file. descriptions: by material. seconds, processor: what it took.
     """
 
     path: str
     sources: tuple[str, ...]
     has_rows: bool = True
+    adds_up: bool = True
     refused: list[Refused] = field(default_factory=list)
     touches: list[bytes] = field(default_factory=list)
     descriptions: dict[str, Any] = field(default_factory=dict)
@@ -241,7 +243,8 @@ def _pack(job: LearnJob, address: str) -> Made:
         made = Made.of(path, (address,))
         with Partial(path) as packed:
             # Of other settings it is merged by itself, or refused there by what differs.
-            made.has_rows = made.has_rows and packed.identity == job.making.identity.to_json()
+            made.adds_up = packed.identity == job.making.identity.to_json()
+            made.has_rows = made.has_rows and made.adds_up
         return made
     except StoreFullError:
         raise

@@ -107,6 +107,17 @@ class TestSameBytes:
             said = [row.source for row in learner.observations()]
             assert str(tmp_path / "folder.memory") in said
 
+    def test_partials_without_rows_come_in_as_one_and_one_that_shares_a_touch_is_refused(self, tmp_path):
+        for name, part in {"x": TOUCHES[:4], "y": TOUCHES[4:9], "z": TOUCHES[8:], "w": TOUCHES[9:]}.items():
+            with TactileLearner.open(tmp_path / f"{name}.memory", **SETTINGS) as learner:
+                for material, touch in part:
+                    learner.observe(material, stream(touch).astype(np.float32))
+                learner.pack(tmp_path / name, rows=False)
+        done = run(tmp_path / "m", [tmp_path / name for name in "xyzw"])
+        assert [each.source for each in done.refused] == [str(tmp_path / "z")]
+        assert "cannot be counted once" in done.refused[0].why
+        require_learned(tmp_path / "m")
+
 
 class TestGoingOn:
     def test_a_run_that_was_killed_goes_on_where_it_was(self, tmp_path, monkeypatch):

@@ -329,8 +329,9 @@ class LiveSession:
         self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end))
 
     def _break(self, why: str) -> None:
-        """Time begins anew."""
-        self._end("gap" if why == "gap" else "time went back")
+        """Time begins anew; a touch that has no reading yet begins after it."""
+        if self._under_way is None or self._under_way.rows.came:
+            self._end("gap" if why == "gap" else "time went back")
         self._recent.clear()
         if self._detector is not None:
             self._detector.interrupt()

@@ -364,3 +364,15 @@ def test_what_a_session_holds_is_bounded():
         gc.collect()
         assert len(gc.get_objects()) - before < 100
         assert [len(part._ring) for part in (live._recent,)] == sizes
+
+
+def test_a_gap_before_the_first_reading_of_a_touch_does_not_end_it():
+    rows, [(begin, end)] = shift("b")
+    session = learner().live(contact="manual")
+    session.push(rows[0], 0.0)
+    session.begin()
+    for i, row in enumerate(rows[begin:end]):
+        session.push(row, 50.0 + i / PAD.rate)
+    [touch] = session.end().touches
+    assert touch.end == "end" and len(touch.stream) == end - begin
+    assert session.report.gaps == 1

@@ -6,8 +6,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from live.live_touches import GEL, frames, gel_learner, shift
-from live.live_touches import learner as live_learner
+from live_touches import GEL, frames, gel_learner, shift
+from live_touches import learner as live_learner
 from recordings.bags import START, biotac, typestore, write
 from touches import PAD, SETTINGS, fed, filled, require_same, stream
 

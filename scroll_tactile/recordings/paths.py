@@ -7,6 +7,7 @@ are compared as written, then without regard to case, since ROS 2 writes in lowe
 
 from __future__ import annotations
 
+import array
 import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ __all__ = ["FieldPath", "fields_of", "nearest", "select"]
 _Collect = Callable[[Any, list[Any]], None]
 _Step = str | int | slice | list["list[_Step]"]
 _TOKEN = re.compile(r"\s*([A-Za-z_]\w*|-?\d+|[.{},*:\[\]])\s*")
+_ARRAYS = (list, tuple, np.ndarray, array.array)  # rclpy has the last
 _DEEPEST = 32  # no message is nested as deep; a path of a million brackets is no path
 
 
@@ -107,7 +109,10 @@ def fields_of(message: object) -> tuple[str, ...]:
     """The names of a message's fields, or a dictionary's keys; none for anything else."""
     if isinstance(message, Mapping):
         return tuple(str(key) for key in message)
-    names = getattr(message, "__dataclass_fields__", None) or ()
+    names = getattr(message, "__dataclass_fields__", None)
+    if names is None:
+        described = getattr(message, "get_fields_and_field_types", None)  # rclpy's messages
+        names = () if described is None else described()
     return tuple(name for name in names if name != "__msgtype__")
 
 
@@ -243,7 +248,7 @@ def _actual(message: Any, name: str) -> str:
     alike = [other for other in names if other.lower() == name.lower()]
     if len(alike) == 1:
         return alike[0]
-    if isinstance(message, list | tuple | np.ndarray):
+    if isinstance(message, _ARRAYS):
         raise FieldError(f"an array of {len(message)} stands before {name!r}: write [0] or [*] between them")
     if not names:
         raise FieldError(f"{name!r} is asked of a {type(message).__name__}, which has no fields")
@@ -266,7 +271,7 @@ def _several(paths: list[_Collect], rest: _Collect) -> _Collect:
 
 def _element(step: int | slice, rest: _Collect) -> _Collect:
     def collect(message: Any, found: list[Any]) -> None:
-        if not isinstance(message, list | tuple | np.ndarray):
+        if not isinstance(message, _ARRAYS):
             raise FieldError(f"{_shown(step)} is asked of a {type(message).__name__}, which is no array")
         if isinstance(step, slice) and (rest is not _append or _messages(message)):
             for value in message[step]:

@@ -25,7 +25,7 @@ from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
 from scroll_tactile.recordings.sqlitefile import scan_db3
 
-__all__ = ["SUFFIXES", "RosBag", "is_rosbag"]
+__all__ = ["SUFFIXES", "RosBag", "is_rosbag", "picture"]
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """What ROS's recordings end in."""
@@ -94,7 +94,7 @@ class RosBag(Source):
         rows: list[npt.NDArray[Any]] = []
         width, most = -1, 1
         for i, (message, decoded) in enumerate(self._decoded(topic)):
-            row = _picture(decoded) if path.text == "data" else None
+            row = picture(decoded) if path.text == "data" else None
             row = path.reading(decoded) if row is None else row
             if width < 0:
                 width, most = row.size, rows_of(max(row.nbytes, 4 * row.size))
@@ -325,7 +325,7 @@ def _text_in(message: object, channel: Channel) -> str:
 _ORDERS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0], "mono8": [0, 0, 0]}
 
 
-def _picture(message: Any) -> npt.NDArray[np.uint8] | None:
+def picture(message: Any) -> npt.NDArray[np.uint8] | None:
     """The pixels of a sensor_msgs Image or CompressedImage, (height, width, 3) in red, green, blue; None otherwise."""
     fields = set(fields_of(message))
     if fields == {"header", "format", "data"}:

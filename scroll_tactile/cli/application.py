@@ -11,6 +11,7 @@ from scroll_tactile.cli.fleet import fleet
 from scroll_tactile.cli.makeup import compose, describe
 from scroll_tactile.cli.replay import live
 from scroll_tactile.cli.reporting import report
+from scroll_tactile.cli.robot import PASSED_ON, ros2
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
 
@@ -26,4 +27,5 @@ app = typer.Typer(
 )
 for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report):
     app.command()(command)
+app.command(context_settings=PASSED_ON)(ros2)
 app.add_typer(memory, name="memory")

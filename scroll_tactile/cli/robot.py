@@ -1,0 +1,81 @@
+"""`scroll-tactile ros2`: a memory as a ROS 2 node."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, cast
+
+import typer
+
+from scroll_tactile.cli.terminal import opened, say, shown
+from scroll_tactile.errors import InputError
+
+__all__ = ["PASSED_ON", "ros2"]
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""What the command is made with, so that --ros-args and what follows reach ROS."""
+
+
+def ros2(
+    context: typer.Context,
+    memory: Annotated[Path, typer.Option(help="The folder of the memory.", show_default=False)],
+    topic: Annotated[str | None, typer.Option(help="Where the readings are sent; a preset may know it.")] = None,
+    field: Annotated[
+        str | None, typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="A known sensor, which gives topic and field: biotac, xela-uskin, anyskin, …")
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
+    ] = None,
+    risk: Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")] = 0.05,
+    contact: Annotated[
+        str, typer.Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
+    ] = "auto",
+    sensor: Annotated[
+        str | None, typer.Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
+    ] = None,
+) -> None:
+    """Run the ROS 2 node scroll_tactile until ctrl-C: readings from a topic, answers on ~/answer as they change.
+
+    To learn the last touch: ros2 param set /scroll_tactile material silk, then ros2 service call /scroll_tactile/learn
+    std_srvs/srv/Trigger; likewise forget, and begin and end with --contact manual. Options of ROS follow --ros-args.
+    """
+    if context.args and context.args[0] != "--ros-args":
+        raise InputError(f"there is no option {context.args[0]!r}: see --help. Options of ROS follow --ros-args")
+    topic, field = _place(topic, field, preset)
+    if contact not in ("auto", "manual"):
+        raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
+    from scroll_tactile.recordings.paths import FieldPath
+    from scroll_tactile.ros2.interfaces import interface, require_rclpy
+    from scroll_tactile.ros2.node import serve
+    from scroll_tactile.sensors import read_sensor
+
+    FieldPath(field)
+    require_rclpy()
+    if kind is not None:
+        interface(kind)
+    chosen = None if sensor is None else read_sensor(sensor)  # what is refused makes no memory
+    with opened(memory, sensor=chosen) as learner:
+        way = cast(Literal["auto", "manual"], contact)
+        met = serve(learner, topic, field, kind=kind, risk=risk, contact=way, arguments=context.args)
+        count = len(learner.materials)
+    counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
+    say(f"{shown(memory)}: {count} materials. {counted}")
+
+
+def _place(topic: str | None, field: str | None, preset: str | None) -> tuple[str, str]:
+    """Topic and field, of a preset where they were not given."""
+    from scroll_tactile.recordings import presets
+
+    known = None if preset is None else presets.find(preset)
+    if known is not None:
+        topic, field = topic or known.topic, field or known.field
+    if not topic or not field:
+        what = " and ".join(name for name, given in (("--topic", topic), ("--field", field)) if not given)
+        raise InputError(
+            f"expected {what}: where the readings are, such as --topic /rh/tactile --field tactiles[0].electrodes"
+            + (f". Preset {preset!r} leaves the topic to the robot" if known else "; or --preset of a known sensor")
+        )
+    return topic, field

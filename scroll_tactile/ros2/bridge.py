@@ -1,0 +1,210 @@
+"""Between messages and a live session: a reading and its time out of each, and what there is to say after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.live.answers import LiveState, LiveTouch
+from scroll_tactile.recordings.paths import FieldPath
+from scroll_tactile.recordings.rosbag import picture
+from scroll_tactile.results import Prediction
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["Answer", "Bridge", "BridgeReport"]
+
+Answer = Mapping[str, Any]
+"""What JSON can hold; see `Bridge`."""
+
+RANKED = 5  # materials of an answer's ranking
+
+
+@dataclass
+class BridgeReport:
+    """What came, counted from the beginning.
+
+    messages: that were received. dropped: that were lost on their way, where the transport counts them. refused:
+    without a reading of the sensor, or not finite. unstamped: whose header's stamp was zero.
+    """
+
+    messages: int = 0
+    dropped: int = 0
+    refused: int = 0
+    unstamped: int = 0
+
+
+class Bridge:
+    """A live session of a learner, fed with messages.
+
+    field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact: see
+    `learner.live`. answer: called with each answer, when something changed. warn: called with each kind of fault once.
+
+    An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
+    stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
+    probability, known, novelty (None where nothing was ever observed), candidates and ranking (the five likeliest);
+    "ended" also has end, why it did. All but event, stamp and contact may be missing where nothing was predicted yet.
+
+    A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
+    the clock of the stamps before it.
+
+    Raises FieldError for a field that is no path, and InputError as `learner.live` does. Not for several threads at
+    once.
+    """
+
+    def __init__(
+        self,
+        learner: TactileLearner,
+        field: str,
+        *,
+        risk: float = 0.05,
+        contact: Literal["auto", "manual"] = "auto",
+        answer: Callable[[Answer], object],
+        warn: Callable[[str], object],
+    ) -> None:
+        self.field = FieldPath(field)
+        self.learner = learner
+        self.session = learner.live(risk=risk, contact=contact)
+        self.report = BridgeReport()
+        self.state = LiveState()
+        self.stamp = 0.0
+        self._answer, self._warn = answer, warn
+        self._pictures = learner.sensor.camera and self.field.text == "data"
+        self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
+        self._ahead = 0.0  # of when a message is published, by its stamp
+        self._learned: tuple[Stream, str] | None = None
+        self._warned: set[type[Exception]] = set()
+
+    def receive(self, message: object, published: float) -> LiveState:
+        """Take the reading of a message, published at this time in seconds, and say where the session stands.
+
+        A message without a reading of the sensor is refused and counted, and the session goes on.
+        Raises FieldError where it is the first and has no such field.
+        """
+        self.report.messages += 1
+        try:
+            reading = self._reading(message)
+            stamp = self._time(message, published)
+            state = self.session.push(reading, stamp)
+        except InputError as error:
+            if isinstance(error, FieldError) and self.report.messages == 1:
+                raise
+            self._refuse(error)
+            return self.state
+        self.stamp = stamp
+        self._tell(state)
+        return state
+
+    def learn(self, material: str) -> str:
+        """Learn the last touch that ended under this name; durable when this returns. Says what was done.
+
+        Raises InputError where no touch ended since the last was learned, and what `learner.observe` raises.
+        """
+        touch = self.session.touch
+        if touch is None:
+            raise InputError("expected a touch to learn; none has ended yet")
+        if self._learned is not None and touch is self._learned[0]:
+            raise InputError(f"the last touch was learned already, as {self._learned[1]!r}: touch it again")
+        receipt = self.learner.observe(material, touch)
+        self._learned = (touch, receipt.material)
+        count = self.learner.materials[receipt.material]
+        return (
+            f"{receipt.material}: {receipt.seconds:g} s learned as observation {receipt.sequence}; "
+            f"observed {count} time{'s' * (count != 1)}"
+        )
+
+    def forget(self, material: str) -> str:
+        """Forget a material; durable when this returns. Says what was done; raises what `learner.forget` raises."""
+        count = self.learner.forget(material)
+        return f"{material}: {count} observation{'s' * (count != 1)} forgotten"
+
+    def begin(self) -> str:
+        """A touch begins. Raises InputError in a session that finds contacts itself."""
+        self._tell(self.session.begin())
+        return "a touch begins with the next reading"
+
+    def end(self) -> str:
+        """The touch is over. Raises InputError in a session that finds contacts itself."""
+        touching = self.state.contact
+        state = self.session.end()
+        self._tell(state)
+        if not state.touches:
+            return "the touch was too short to be one" if touching else "no touch was under way"
+        touch = state.touches[-1]
+        return f"touched for {touch.stream.seconds:g} s: {touch.prediction.material or 'nothing was ever observed'}"
+
+    def status(self) -> dict[str, int | bool]:
+        """What the bridge and its session met, by name."""
+        return {**asdict(self.report), **asdict(self.session.report)}
+
+    def close(self) -> None:
+        """End the touch under way, if any; the learner stays open."""
+        self.session.close()
+
+    def _reading(self, message: object) -> npt.NDArray[Any]:
+        found = picture(message) if self._pictures else None
+        if found is not None:
+            return found
+        reading = self.field.reading(message)
+        return reading if self.learner.sensor.camera else reading.astype(np.float64, copy=False)
+
+    def _time(self, message: object, published: float) -> float:
+        if self._header is None:
+            return published
+        try:
+            seconds, nanoseconds = self._header.values(message)
+        except FieldError:
+            self._header = None
+            return published
+        if seconds == 0 == nanoseconds:
+            self.report.unstamped += 1
+            return published + self._ahead
+        stamp = float(seconds + nanoseconds / 1e9)
+        self._ahead = stamp - published
+        return stamp
+
+    def _refuse(self, error: InputError) -> None:
+        self.report.refused += 1
+        if type(error) not in self._warned:
+            self._warned.add(type(error))
+            self._warn(f"{error}. Further messages like it are left out and counted, without a word")
+
+    def _tell(self, now: LiveState) -> None:
+        """Answer what is new."""
+        before, self.state = self.state, now
+        for touch in now.touches:
+            self._answer(self._ended(touch))
+        if now.contact:
+            fresh = not before.contact or bool(now.touches)
+            if now.decided and (fresh or not before.decided):
+                self._answer(self._now("decided", now))
+            elif fresh or now.prediction is not before.prediction:
+                self._answer(self._now("began" if fresh else "prediction", now))
+        elif before.contact and not now.touches:
+            self._answer(self._now("brief", now))
+
+    def _now(self, event: str, now: LiveState) -> Answer:
+        said = {} if now.prediction is None else _said(now.prediction)
+        here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
+        return {"event": event, "stamp": self.stamp, **here, **said}
+
+    def _ended(self, touch: LiveTouch) -> Answer:
+        over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
+        return {"event": "ended", "stamp": self.stamp, **over, **_said(touch.prediction)}
+
+
+def _said(prediction: Prediction) -> dict[str, Any]:
+    infinite = prediction.novelty == float("inf")  # JSON has no infinity
+    return {
+        "material": prediction.material,
+        "probability": prediction.probability,
+        "known": prediction.known,
+        "novelty": None if infinite else prediction.novelty,
+        "candidates": prediction.candidates(),
+        "ranking": prediction.ranking[:RANKED],
+    }

@@ -1,0 +1,62 @@
+"""ROS 2's interfaces by name: rclpy, messages and services, imported when they are asked for."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.recordings.paths import nearest
+
+__all__ = ["interface", "kind_of", "require_rclpy"]
+
+_NAME = re.compile(r"([A-Za-z]\w*)/(msg|srv)/([A-Za-z]\w*)")
+
+
+def require_rclpy() -> Any:
+    """Python's client of ROS 2. Raises RecordingError, with how to get it, where it cannot be imported."""
+    try:
+        return importlib.import_module("rclpy")
+    except ImportError as error:
+        raise RecordingError(
+            f"a ROS 2 node needs rclpy, which cannot be imported here ({error}): source the robot's own ROS 2 "
+            "(source /opt/ros/DISTRIBUTION/setup.bash) in the shell that starts this, with a Python of the same version"
+        ) from error
+
+
+def interface(name: str) -> Any:
+    """The class of a message or service, such as std_msgs/msg/String.
+
+    Raises InputError for a name that is none, RecordingError where its package is not installed, with the line that
+    installs it, and FieldError, with those nearest, where the package has none of this name.
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise InputError(f"expected a type as package/msg/Name, such as sensor_msgs/msg/JointState; came {name!r}")
+    package, group, short = match.groups()
+    try:
+        module = importlib.import_module(f"{package}.{group}")
+    except ImportError as error:
+        distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
+        raise RecordingError(
+            f"type {name} needs the Python package {package!r}, which cannot be imported ({error}): "
+            f"sudo apt install ros-{distribution}-{package.replace('_', '-')}, or source the workspace it is built in"
+        ) from error
+    if not hasattr(module, short):
+        names = [other for other in dir(module) if other[0].isupper() and "_" not in other]
+        raise FieldError(f"package {package!r} has no {group} {short!r}{nearest(short, names)}")
+    return getattr(module, short)
+
+
+def kind_of(topic: str, topics: Mapping[str, Sequence[str]]) -> str | None:
+    """The type of a topic among those there are, by name; None where it is not there yet.
+
+    Raises InputError where it is sent in several types: one of them has to be asked for.
+    """
+    kinds = topics.get(topic, ())
+    if len(kinds) > 1:
+        raise InputError(f"topic {topic!r} is sent as {' and as '.join(kinds)}: say which, with --type")
+    return kinds[0] if kinds else None

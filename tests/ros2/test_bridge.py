@@ -1,0 +1,168 @@
+"""From messages to answers; nothing of ROS is needed for it."""
+
+import array
+import itertools
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from live_touches import GEL, frames, gel_learner, learner, shift
+from robot import Bare, stamped, taught
+from touches import PAD, SMALL
+
+from scroll_tactile import TactileLearner, errors
+from scroll_tactile.ros2 import Bridge
+
+ROWS, PLACES = shift("ab")
+
+
+def bridge(field="values", source=None, **how):
+    answers, warnings = [], []
+    made = Bridge(source or learner(), field, answer=answers.append, warn=warnings.append, **how)
+    return made, answers, warnings
+
+
+def run(made, rows=ROWS, start=1000.0, rate=50.0):
+    for i, row in enumerate(rows):
+        made.receive(stamped(row, start + i / rate), 5.0 + i / rate)
+
+
+def test_answers_are_those_of_a_live_session():
+    made, answers, warnings = bridge()
+    run(made)
+    session = learner().live()
+    ended = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
+    told = [answer for answer in answers if answer["event"] == "ended"]
+    assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in ended]
+    assert [answer["probability"] for answer in told] == [touch.prediction.probability for touch in ended]
+    assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in ended]
+    assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in ended]
+    assert not warnings
+    assert made.status()["messages"] == made.status()["readings"] == len(ROWS)
+    json.dumps(answers, allow_nan=False)
+
+
+def test_an_answer_is_given_only_when_something_changed():
+    made, answers, _ = bridge()
+    run(made)
+    assert answers[0]["event"] == "began" and answers[0]["contact"]
+    assert len(answers) < len(ROWS) / 10
+    for answer, after in itertools.pairwise(answers):
+        changing = [
+            {key: value for key, value in said.items() if key not in ("stamp", "seconds")} for said in (answer, after)
+        ]
+        assert changing[0] != changing[1]
+    for event in ("began", "ended"):
+        assert sum(answer["event"] == event for answer in answers) + (event == "began") >= 2
+
+
+def test_the_first_message_without_the_field_says_what_there_is():
+    made, _, _ = bridge("value")
+    with pytest.raises(errors.FieldError, match="nearest is 'values'"):
+        made.receive(stamped(ROWS[0], 1.0), 1.0)
+
+
+def test_later_messages_without_the_field_are_counted_and_said_once():
+    made, _, warnings = bridge("data[0:2]")
+    made.receive(Bare([0.1, 0.1]), 1.0)
+    for i in range(3):
+        made.receive(stamped(ROWS[0], 2.0), 1.02 + i / 50)
+    assert made.report.refused == 3 and len(warnings) == 1
+
+
+@pytest.mark.parametrize("values", [[0.1], [0.1] * 3, [], [np.nan, 0.1], [np.inf, 0.1]], ids=str)
+def test_messages_without_a_reading_are_left_out_and_said_once(values):
+    made, answers, warnings = bridge()
+    for i, row in enumerate(ROWS):
+        made.receive(stamped(row, 1000 + i / 50), i / 50)
+        made.receive(stamped(values, 1000 + i / 50), i / 50)
+    assert made.report.refused == len(ROWS) and len(warnings) == 1
+    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
+
+
+def test_text_is_no_reading():
+    made, _, _ = bridge("header")
+    with pytest.raises(errors.FieldError, match="leads to a message"):
+        made.receive(stamped(ROWS[0], 1.0), 1.0)
+
+
+def test_without_a_stamp_the_time_of_publishing_counts():
+    bare, answers, _ = bridge("data")
+    for i, row in enumerate(ROWS):
+        bare.receive(Bare(array.array("d", row)), i / 50)
+    zero, others, _ = bridge()
+    for i, row in enumerate(ROWS):
+        zero.receive(stamped(row, 0), i / 50)
+    assert zero.report.unstamped == len(ROWS)
+    assert answers == others
+    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
+
+
+def test_a_stamp_of_zero_between_others_breaks_nothing():
+    made, answers, _ = bridge()
+    for i, row in enumerate(ROWS):
+        made.receive(stamped(row, 0 if i % 10 == 7 else 1000 + i / 50), 5 + i / 50)
+    status = made.status()
+    assert status["unstamped"] == sum(i % 10 == 7 for i in range(len(ROWS)))
+    assert status["gaps"] == status["steps_back"] == status["lost"] == 0
+    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
+
+
+def test_time_that_goes_back_ends_a_touch():
+    made, answers, _ = bridge()
+    middle = sum(PLACES[0]) // 2
+    run(made, ROWS[:middle])
+    run(made, ROWS[middle:], start=10.0)
+    assert next(answer["end"] for answer in answers if answer["event"] == "ended") == "time went back"
+    assert made.status()["steps_back"] == 1
+
+
+def test_a_touch_is_learned_once_and_forgotten(tmp_path):
+    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
+        made, _, _ = bridge(source=own)
+        with pytest.raises(errors.InputError, match="none has ended"):
+            made.learn("felt")
+        run(made)
+        assert made.learn("felt").startswith("felt: ")
+        assert own.materials["felt"] == 1
+        with pytest.raises(errors.InputError, match="learned already, as 'felt'"):
+            made.learn("felt")
+        assert made.forget("felt") == "felt: 1 observation forgotten"
+        with pytest.raises(errors.UnknownMaterialError):
+            made.forget("felt")
+        with pytest.raises(errors.InputError, match="manual"):
+            made.begin()
+
+
+def test_touches_that_somebody_else_begins_and_ends():
+    made, answers, _ = bridge(contact="manual")
+    rows = ROWS[slice(*PLACES[1])]
+    assert made.end() == "no touch was under way"
+    made.begin()
+    run(made, rows[:1])
+    assert made.end() == "the touch was too short to be one"
+    assert answers[-1]["event"] == "brief" and not answers[-1]["contact"]
+    made.begin()
+    run(made, rows, start=2000.0)
+    assert made.end().endswith(": b")
+    assert answers[-1]["event"] == "ended" and answers[-1]["end"] == "end"
+
+
+def test_pictures_are_readings_of_a_camera():
+
+    @dataclass
+    class Image:
+        height: int
+        width: int
+        step: int
+        encoding: str
+        data: object
+
+    made, answers, _ = bridge("data", gel_learner())
+    sensor = gel_learner().sensor
+    for i, frame in enumerate(frames(GEL.materials[1], 5, 8)):
+        pixels = np.round(np.asarray(frame) * (255 / sensor.limits[1]).max()).astype(np.uint8)[..., ::-1]
+        height, width, _ = pixels.shape
+        made.receive(Image(height, width, 3 * width, "bgr8", array.array("B", pixels.tobytes())), i / sensor.rate)
+    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == [GEL.materials[1]]

@@ -1,0 +1,240 @@
+"""The node over a real ROS 2: Fast DDS on this machine, publishers in other processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from commands import refused
+from live_touches import shift
+from robot import TOPIC, taught
+from touches import PAD, SMALL
+
+from scroll_tactile import TactileLearner, errors
+
+rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
+
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float32MultiArray, String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from scroll_tactile.ros2 import TactileNode  # noqa: E402
+
+# Of the parser that rosidl imports with the first message.
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+ROBOT = Path(__file__).with_name("robot.py")
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch):
+    """A domain of this process's own, and no other machine."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(10 + os.getpid() % 90))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory):
+    return taught(tmp_path_factory.mktemp("ros2") / "memory", PAD, SMALL)
+
+
+@pytest.fixture
+def learner(memory, tmp_path):
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(tmp_path / "own")
+    with TactileLearner.open(tmp_path / "own") as made:
+        yield made
+
+
+@pytest.fixture
+def spinning(alone):
+    """A context; gives nodes in it, and spins all until something is there."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+
+    class Nodes:
+        def node(self, name):
+            made = rclpy.create_node(name, context=context)
+            executor.add_node(made)
+            return made
+
+        def until(self, there, seconds=20.0):
+            end = time.monotonic() + seconds
+            while not there():
+                assert time.monotonic() < end, "it never came"
+                executor.spin_once(timeout_sec=0.05)
+
+        def call(self, node, name):
+            client = node.create_client(Trigger, name)
+            self.until(client.service_is_ready)
+            future = client.call_async(Trigger.Request())
+            self.until(future.done)
+            return future.result()
+
+    yield Nodes()
+    rclpy.try_shutdown(context=context)
+
+
+@contextmanager
+def publishing(count, rate, every=1):
+    words = [sys.executable, ROBOT, TOPIC, str(count), str(rate), str(every)]
+    paths = os.pathsep.join([str(ROBOT.parents[1]), *sys.path])
+    with subprocess.Popen(list(map(str, words)), env=os.environ | {"PYTHONPATH": paths}) as process:
+        yield process
+        process.wait(60)
+    assert process.returncode == 0
+
+
+def feed(node, rows, start=0.0):
+    for i, row in enumerate(rows):
+        stamp = 1000 + start + i / PAD.rate
+        message = JointState(position=row.tolist())
+        message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
+        node.receive(message, {})
+
+
+def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, learner):
+    """250 readings a second and, at its worst, 50 at once; all of them count."""
+    count = 1000
+    answers, texts = [], []
+    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", answered=answers.append)
+    listener = spinning.node("arm")
+    listener.create_subscription(String, "/scroll_tactile/answer", lambda text: texts.append(json.loads(text.data)), 50)
+    with publishing(count, 250, every=50):
+        spinning.until(lambda: served.bridge.report.messages == count, 40)
+    status = served.bridge.status()
+    assert (status["readings"], status["ticks"], status["lost"], status["dropped"]) == (count, count, 0, 0)
+    ended = [answer for answer in answers if answer["event"] == "ended"]
+    assert [answer["material"] for answer in ended][:5] == list("abcab")
+    spinning.until(lambda: len(texts) == len(answers))
+    assert texts == json.loads(json.dumps(answers))
+
+
+def test_learning_by_services_and_by_the_parameter(spinning, learner):
+    node = spinning.node("scroll_tactile")
+    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    arm = spinning.node("arm")
+    assert "ros2 param set /scroll_tactile material NAME" in spinning.call(arm, "/scroll_tactile/learn").message
+    node.set_parameters([rclpy.Parameter("material", value="felt")])
+    assert "none has ended" in spinning.call(arm, "/scroll_tactile/learn").message
+    feed(served, shift("a")[0])
+    reply = spinning.call(arm, "/scroll_tactile/learn")
+    assert reply.success and reply.message.startswith("felt: ")
+    assert learner.materials["felt"] == 1
+    assert not spinning.call(arm, "/scroll_tactile/learn").success
+    assert spinning.call(arm, "/scroll_tactile/forget").success
+    assert "felt" not in learner.materials
+    assert "manual" in spinning.call(arm, "/scroll_tactile/begin").message
+
+
+def test_a_touch_between_the_services_begin_and_end(spinning, learner):
+    node = spinning.node("scroll_tactile")
+    kind = "sensor_msgs/msg/JointState"
+    served = TactileNode(node, learner, TOPIC, "position", kind=kind, contact="manual")
+    rows, [place] = shift("b")
+    assert spinning.call(node, "/scroll_tactile/begin").success
+    feed(served, rows[slice(*place)])
+    reply = spinning.call(node, "/scroll_tactile/end")
+    assert reply.success and reply.message.endswith(": b")
+
+
+def test_diagnostics_say_what_was_met(spinning, learner):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+    node = spinning.node("scroll_tactile")
+    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    heard = []
+    spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    feed(served, shift("a")[0])
+    served.receive(JointState(position=[1.0]), {})
+    spinning.until(lambda: any(array.status[0].level == DiagnosticStatus.STALE for array in heard))
+    last = {pair.key: pair.value for pair in heard[-1].status[0].values}
+    assert last["refused"] == "1" and last["readings"] == str(len(shift("a")[0]))
+    assert last["touches"] == "1"
+    assert heard[-1].header.stamp.sec > 0
+
+
+def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, learner):
+    node = spinning.node("scroll_tactile")
+    with pytest.raises(errors.RecordingError, match="sr-robot-msgs"):
+        TactileNode(node, learner, TOPIC, "position", kind="sr_robot_msgs/msg/BiotacAll")
+    TactileNode(node, learner, "/other", "position")
+    other = spinning.node("other")
+    publisher = other.create_publisher(Float32MultiArray, "/other", 10)
+
+    def refusing():
+        publisher.publish(Float32MultiArray(data=[0.1, 0.1]))
+        return False
+
+    with pytest.raises(errors.FieldError, match=r"'/other', std_msgs/msg/Float32MultiArray.*layout, data"):
+        spinning.until(refusing)
+
+
+def test_messages_that_were_lost_on_their_way_are_counted(spinning, learner):
+    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    for publisher, number in ((b"a", 7), (b"a", 8), (b"b", 1), (b"a", 11), (b"b", 2), (b"a", 12)):
+        about = {"publication_sequence_number": number, "publisher_gid": {"data": publisher}}
+        served.receive(JointState(position=[0.1, 0.1]), about)
+    assert served.bridge.report.dropped == 2
+
+
+def test_a_topic_that_never_comes_is_said_with_those_nearest(spinning, learner):
+    node = spinning.node("scroll_tactile")
+    served = TactileNode(node, learner, "/finger/tactil", "position")
+    assert "nobody publishes /finger/tactil" in served._absent(5.0)
+    other = spinning.node("finger")
+    other.create_publisher(JointState, TOPIC, 10)
+    spinning.until(lambda: f"nearest is {TOPIC!r}" in served._absent(5.0))
+
+
+def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
+    """A name is learned, ctrl-C ends it in order, a second node is refused, and the memory has it."""
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(tmp_path / "own")
+    words = ["ros2", "--memory", tmp_path / "own", "--topic", TOPIC, "--field", "position"]
+    line = [sys.executable, "-m", "scroll_tactile.cli", *words, "--ros-args", "-r", "__ns:=/left"]
+    ended = []
+    arm = spinning.node("arm")
+    arm.create_subscription(String, "/left/scroll_tactile/answer", lambda text: ended.append(json.loads(text.data)), 50)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(list(map(str, line)), env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            client = arm.create_client(Trigger, "/left/scroll_tactile/learn")
+            spinning.until(client.service_is_ready, 60)
+            assert f"is being written by process {process.pid}" in refused(*words)
+            with publishing(500, 250):
+                spinning.until(lambda: sum(answer["event"] == "ended" for answer in ended) == 2, 60)
+            set_material(spinning, arm, "felt")
+            assert spinning.call(arm, "/left/scroll_tactile/learn").success
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert "4 materials" in output and "readings: 500" in output
+    with TactileLearner.open(tmp_path / "own", mode="read") as kept:
+        assert kept.materials["felt"] == 1
+
+
+def set_material(spinning, node, name):
+    from rcl_interfaces.srv import SetParameters
+
+    client = node.create_client(SetParameters, "/left/scroll_tactile/set_parameters")
+    spinning.until(client.service_is_ready)
+    value = rclpy.Parameter("material", value=name).to_parameter_msg()
+    future = client.call_async(SetParameters.Request(parameters=[value]))
+    spinning.until(future.done)
+    assert future.result().results[0].successful
+
+
+def test_a_memory_that_is_not_there(tmp_path):
+    said = refused("ros2", "--memory", tmp_path / "none", "--topic", TOPIC, "--field", "position")
+    assert "there is no memory" in said

@@ -17,6 +17,7 @@ from examples.benchmarks.fleet import run_fleet
 from examples.benchmarks.interleaved import run_interleaved
 from examples.benchmarks.live_decision import RECORDED, run_decisions, show_decisions
 from examples.benchmarks.live_shift import run_shifts, show_shifts
+from examples.benchmarks.node_latency import run_node, show_node
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.vision_speed import run_vision
@@ -132,6 +133,20 @@ def decisions(
             results.append(run_decisions(recordings, chosen, every=every, folder=folder, progress=progress))
     show_decisions(results)
     _written(context, json, {"sets": results, "recorded": RECORDED})
+
+
+@app.command()
+def ros2(
+    context: typer.Context,
+    seconds: Annotated[float, typer.Option(min=10.0, help="How long readings are sent.")] = 60.0,
+    json: Json = None,
+) -> None:
+    """Send BioTac's readings at 100 Hz from another process to the ROS 2 node."""
+    require_folders(json)
+    with progress_bar() as progress:
+        record = run_node(seconds, note=lambda what: progress(what, 0, 1))
+    show_node(record)
+    _written(context, json, {"records": [record]})
 
 
 @app.command()

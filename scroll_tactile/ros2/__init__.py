@@ -6,7 +6,7 @@ with TactileLearner.open("memory") as learner:
 `TactileNode` does the same within a node of one's own. `Bridge` is what both do with a message, and needs no ROS.
 """
 
-from scroll_tactile.ros2.bridge import Bridge, BridgeReport
+from scroll_tactile.ros2.bridge import Answer, Bridge, BridgeReport
 from scroll_tactile.ros2.node import TactileNode, serve
 
-__all__ = ["Bridge", "BridgeReport", "TactileNode", "serve"]
+__all__ = ["Answer", "Bridge", "BridgeReport", "TactileNode", "serve"]

@@ -43,11 +43,12 @@ def memory(tmp_path_factory):
     return taught(tmp_path_factory.mktemp("ros2") / "memory", PAD, SMALL)
 
 
-@pytest.fixture
-def learner(memory, tmp_path):
+@pytest.fixture(scope="module")
+def learner(memory, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learning") / "own"
     with TactileLearner.open(memory, mode="read") as source:
-        source.backup(tmp_path / "own")
-    with TactileLearner.open(tmp_path / "own") as made:
+        source.backup(folder)
+    with TactileLearner.open(folder) as made:
         yield made
 
 
@@ -222,6 +223,23 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
     assert "4 materials" in output and "readings: 500" in output
     with TactileLearner.open(tmp_path / "own", mode="read") as kept:
         assert kept.materials["felt"] == 1
+
+
+def test_the_example_acts_on_what_it_feels(memory, tmp_path):
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(tmp_path / "own")
+    script = ROBOT.parents[2] / "examples" / "ros2_node.py"
+    line = [sys.executable, script, tmp_path / "own", TOPIC, "position"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROBOT.parents[2]), *sys.path])}
+    with subprocess.Popen(list(map(str, line)), env=environment, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            with publishing(360, 250):
+                said = [next(text for text in process.stderr if f"{name} after" in text) for name in "ab"]
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0 and len(said) == 2
 
 
 def set_material(spinning, node, name):

@@ -10,6 +10,7 @@ import argparse
 import json
 import warnings
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
@@ -69,6 +70,8 @@ def _main() -> None:
     packages = {name: version(name) for name in ("aeon", "numpy", "scikit-learn")}
     result = {
         "command": "python -m examples.benchmarks.aeon_checks",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seed": 0,
         "versions": {"scroll-tactile": __version__, **packages},
         "checks": len(results),
         "failed": failed,

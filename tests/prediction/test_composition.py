@@ -85,7 +85,7 @@ class TestCompose:
         assert part.constituents == (whole["linen"], whole["wool"])
         with pytest.raises(KeyError):
             part["silk"]
-        for wrong, said in ((["jute"], "'jute'"), ([], "none"), ("wool", "came the string")):
+        for wrong, said in ((["jute"], "'jute'"), ([], "none"), ("wool", "came str")):
             with pytest.raises(DescriptionError, match=said):
                 learner.compose(stream, constituents=wrong)
 

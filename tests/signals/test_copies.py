@@ -125,5 +125,5 @@ class TestIdentity:
     def test_cameras_and_other_things_are_refused(self):
         with pytest.raises(InputError, match="whole frames"):
             TactileLearner(sensor=sensors.GELSIGHT, augmentation=THREE)
-        with pytest.raises(InputError, match="came 3"):
+        with pytest.raises(InputError, match="came int 3"):
             TactileLearner(sensor=PAD, augmentation=3)

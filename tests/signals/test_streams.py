@@ -401,7 +401,7 @@ def test_first_takes_a_prefix():
     for seconds in (0.07, 0, -1, -np.inf):
         with pytest.raises(StreamTooShortError, match="at least 2 readings"):
             stream.first(seconds)
-    with pytest.raises(InputError, match="came NaN"):
+    with pytest.raises(InputError, match="came nan"):
         stream.first(np.nan)
 
 

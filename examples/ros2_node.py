@@ -16,7 +16,7 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.ros2 import Answer, TactileNode
 
 
-class Hand(Node):
+class Hand(Node):  # type: ignore[misc]  # of ROS 2, which may not be here
     """A node of one's own with a memory in it."""
 
     def __init__(self, learner: TactileLearner, topic: str, field: str) -> None:

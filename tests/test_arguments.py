@@ -106,13 +106,12 @@ def test_probabilities(learner, unfamiliar):
 
 @pytest.mark.parametrize("name", [5, None, ["a"], {}])
 def test_names(learner, name):
-    for call in (
-        learner.forget,
-        lambda name: learner.describe(name, None),
-        lambda name: learner.observe(name, stream((2, 60))),
-    ):
+    calls = [lambda name: learner.describe(name, None), lambda name: learner.observe(name, stream((2, 60)))]
+    for call in calls if name is None else [*calls, learner.forget]:
         with pytest.raises(MaterialError, match="expected a material's name as a string; came"):
             call(name)
+    with pytest.raises(InputError, match="a material, or a source"):
+        learner.forget()
     assert learner.materials == {"a": 1, "b": 1}
 
 

@@ -5,6 +5,7 @@ import random
 import signal
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -292,7 +293,8 @@ class TestProcesses:
                 workers = [process for pool in running[0]._all for process in pool._processes.values()]
                 if workers:
                     killed.append(workers[0].pid)
-                    os.kill(workers[0].pid, signal.SIGKILL)
+                    with suppress(ProcessLookupError):  # it has ended meanwhile
+                        os.kill(workers[0].pid, signal.SIGKILL)
 
         running = []
         made = engines.Processes.__init__

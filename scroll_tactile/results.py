@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -117,6 +118,15 @@ class Prediction:
         names = [material for material, _ in self.ranking]
         typical = self.typicality or (1.0,) * len(names)
         return tuple(name for name, share in zip(names, typical, strict=True) if share > error)
+
+    def as_json(self) -> dict[str, str | float | bool | None]:
+        """Material, probability, known and novelty in JSON's types, which have no infinity: None stands for it."""
+        return {
+            "material": self.material,
+            "probability": self.probability,
+            "known": self.known,
+            "novelty": None if math.isinf(self.novelty) else self.novelty,
+        }
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -155,25 +154,13 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
 
 
 def _answer(prediction: Prediction) -> dict[str, Any]:
-    return {
-        "material": prediction.material,
-        "probability": prediction.probability,
-        "known": prediction.known,
-        "novelty": finite(prediction.novelty),
-        "seconds": prediction.seconds,
-        "ranking": prediction.ranking,
-    }
+    return prediction.as_json() | {"seconds": prediction.seconds, "ranking": prediction.ranking}
 
 
 def answer_row(answered: Answered) -> list[Any]:
     """The cells that `ANSWER` names."""
     of = answered.prediction
-    return [answered.touch.source, of.material, of.probability, of.known, finite(of.novelty), of.seconds]
-
-
-def finite(number: float) -> float | None:
-    """The number; None where it is infinite, which neither JSON nor tables have."""
-    return None if math.isinf(number) else number
+    return [answered.touch.source, *of.as_json().values(), of.seconds]
 
 
 def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from scroll_tactile.cli.everyday import MemoryFolder
-from scroll_tactile.cli.terminal import console, opened, percent, say, shown, verdict
+from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
                 seconds=ended.stream.seconds,
                 decided=ended.decided,
                 end=ended.end,
-                **_answer(ended.prediction),
+                **ended.prediction.as_json(),
             )
         else:
             safe = "decided" if ended.decided else "[yellow]undecided[/]"
@@ -113,7 +113,7 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
         if old is None:
             _line("began", at - now.seconds)
         if now.prediction is not None and (old is None or now.prediction is not old.prediction):
-            _line("prediction", at, seconds=now.seconds, decided=now.decided, **_answer(now.prediction))
+            _line("prediction", at, seconds=now.seconds, decided=now.decided, **now.prediction.as_json())
         return now
     if growing.is_started:
         growing.update(_table(now), refresh=True)
@@ -134,18 +134,8 @@ def _table(now: LiveState) -> Table:
     return table
 
 
-def _answer(prediction: Any) -> dict[str, Any]:
-    infinite = prediction.novelty == float("inf")  # JSON has no infinity
-    return {
-        "material": prediction.material,
-        "probability": prediction.probability,
-        "known": prediction.known,
-        "novelty": None if infinite else prediction.novelty,
-    }
-
-
 def _line(event: str, at: float, **more: Any) -> None:
-    typer.echo(json.dumps({"event": event, "at": round(at, 6), **more}, ensure_ascii=False))
+    say_json({"event": event, "at": round(at, 6), **more})
     sys.stdout.flush()
 
 

@@ -174,9 +174,8 @@ class Model:
     pooled: the kept touches beside it, if any; conformal: how typical others are of them. least: the columns of all but
     the shortest touches that were learned. readouts: scale → its readout. calibrations: of the stages, as far as any
     touch reached them. apart: scale → the sampled touches left out; sample: these. measures: by what beginnings were
-    measured, None before they were. dependence: how far touches of one
-    thing say the same. longest: the columns of the longest touch that was learned. fitted_to: the touches that it was
-    fitted to.
+    measured, None before they were. dependence: how far touches of one thing say the same. longest: the columns of the
+    longest touch that was learned. fitted_to: the touches that it was fitted to.
     """
 
     def __init__(

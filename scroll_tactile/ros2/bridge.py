@@ -199,12 +199,7 @@ class Bridge:
 
 
 def _said(prediction: Prediction) -> dict[str, Any]:
-    infinite = prediction.novelty == float("inf")  # JSON has no infinity
-    return {
-        "material": prediction.material,
-        "probability": prediction.probability,
-        "known": prediction.known,
-        "novelty": None if infinite else prediction.novelty,
+    return prediction.as_json() | {
         "candidates": prediction.candidates(),
         "ranking": prediction.ranking[:RANKED],
     }

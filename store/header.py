@@ -28,7 +28,7 @@ from store.schema import (
     remove_drafts,
 )
 
-__all__ = ["header_fault", "holds_store", "lock_to_write", "new_first_page", "strangers"]
+__all__ = ["header_fault", "holds_store", "lock_to_write", "new_first_page", "require_unshared", "strangers"]
 
 # What a folder may hold in which no store was made yet, and what betrays that one was.
 OURS = frozenset(
@@ -102,6 +102,18 @@ def strangers(folder: Path) -> Iterator[DamageError]:
                 "what belongs there in its place; in a folder that comes from elsewhere trust nothing",
                 path=path,
             )
+
+
+def require_unshared(folder: Path) -> None:
+    """Raise DamageError where a file of the journal, or the lock, has another name: writing would change that too."""
+    with reported(folder, "looking for what may be written"):
+        for path, is_ours in _named_as_ours(folder) if folder.is_dir() else ():
+            if is_ours and path.parent == folder and path.is_file() and path.lstat().st_nlink > 1:
+                raise DamageError(
+                    f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
+                    'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
+                    path=path,
+                )
 
 
 def _refuse_rollback(rollback: Path) -> None:
@@ -206,6 +218,7 @@ def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
             sync_folder(folder.parent)
+    require_unshared(folder)
     lock = WriterLock(folder)
     try:
         # Asked again, under the lock: another writer may have made the store, and left, since.

@@ -16,7 +16,7 @@ from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
 from store.generations import highest_number, remove_others
 from store.groups import Draft, GroupReader, folder_name, write_group
-from store.header import strangers
+from store.header import require_unshared, strangers
 from store.lock import WriterLock
 from store.records import (
     GENERATION_COLUMNS,
@@ -88,6 +88,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     with reported(folder, "looking at the store"):
         for error in strangers(folder):
             raise error
+    require_unshared(folder)
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):

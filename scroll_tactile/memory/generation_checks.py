@@ -66,12 +66,13 @@ class GenerationChecks:
         for field in ("withdrawn", "excluded"):
             sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, upto or 2**63 - 1)
             expect(len(np.unique(sequences)) == len(sequences), field, "different rows", sequences)
+        _check_descriptions(attributes.get("descriptions", {}))
         if upto is not None:
             _check_capacity(attributes.get("capacity"))
-            whole("tuned_upto", attributes.get("tuned_upto"), 0, upto)
-            _check_descriptions(attributes.get("descriptions", {}))
-            if "tuned" in attributes:
-                self._check_tuned(arrays, attributes["tuned"])
+        if upto is not None or "tuned" in attributes:  # a merge leaves f* where it is
+            whole("tuned_upto", attributes.get("tuned_upto"), 0, upto or 2**63 - 1)
+        if "tuned" in attributes:
+            self._check_tuned(arrays, attributes["tuned"])
 
     def _check_touches(self, arrays: Arrays, count: int) -> list[int]:
         observations = array(arrays, "observations", ("int64",), _folded(arrays, "observations", (count,)))

@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.memory.gate import MemoryStore
+from scroll_tactile.memory.gate import MemoryStore, require_counted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.rows import (
     DESCRIBE,
@@ -47,7 +47,8 @@ class Reembedding:
     source: the store of the other one. identity: of the new one. load: reads a memory from the new one's store. encode:
     embeds readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
 
-    Raises MismatchError where not every observation has its readings, StoreError.
+    Raises MismatchError where not every observation has its readings, DamageError where a generation counts touches
+    that no row has, StoreError.
     """
 
     def __init__(
@@ -167,6 +168,8 @@ def _require_readings(store: Store) -> None:
     elif bare:
         what = f"{len(bare)} rows, such as {bare[0]}, were observed without keeping them (exemplars=0)"
     else:
+        if (newest := store.latest()) is not None:
+            require_counted(store.path, newest, heads)
         return
     raise MismatchError(
         f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "

@@ -373,6 +373,14 @@ def hollow(attributes, arrays):
     return arrays | {"second-15": square[np.tril_indices(dimension)]}
 
 
+@pytest.mark.parametrize("changed", [{"descriptions": 1}, {"descriptions": {"a": {"x": 2.0}}}, {"tuned": 1}])
+def test_what_a_merge_leaves_out_is_looked_at_where_it_is_there(made, tmp_path, changed):
+    path = copied(made / "whole", tmp_path / "m")
+    attributes, arrays = generation_of(made / "compacted")
+    put_row(path, kind="merge", attributes=attributes | changed, payload=arrays)
+    require_refused(path, next(iter(changed)))
+
+
 def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
     attributes, arrays = generation_of(path)

@@ -6,13 +6,14 @@ import threading
 import numpy as np
 import pytest
 from commands import refused, run
+from forging import put_row
 from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, stream, without
 
 from scroll_tactile import Kernels, Maps, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory import reembed
 from scroll_tactile.prediction.reembedding import reembed_memory
-from store import LockedError, Store, StoreFullError
+from store import DamageError, LockedError, Store, StoreFullError
 
 OTHER = {
     "exact": lambda: Kernels(seed=3, dimension=128),
@@ -155,6 +156,18 @@ def test_what_is_observed_meanwhile_is_in_it(path, other, monkeypatch):
         kept = len(learner.observations())
         assert 8 <= kept <= 9
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
+
+
+def test_rows_that_are_not_those_of_the_generation_are_not_carried_over(path):
+    filled(path)[0].close()
+    put_row(path, kind="describe", label="a", attributes={"constituents": {"wool": 1.0}}, sequence=3)
+    before = rows(path)
+    with TactileLearner.open(path) as learner:
+        held = contents(learner)
+        with pytest.raises(DamageError, match="counts"):
+            learner.reembed(OTHER["exact"]())
+        assert contents(learner) == held
+    assert rows(path) == before
 
 
 class TestRefused:

@@ -258,6 +258,20 @@ def test_a_store_is_reached_through_a_link(tmp_path):
     assert check_store(tmp_path / "link") == []
 
 
+@pytest.mark.parametrize("name", [JOURNAL, f"{JOURNAL}-wal", f"{JOURNAL}-shm", "lock"])
+def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
+    path, outside = build(tmp_path / "s"), tmp_path / "outside"
+    (path / name).touch()
+    os.link(path / name, outside)
+    before = everything(tmp_path)
+    for write in (Store.open, repair_store):
+        with pytest.raises(DamageError, match="another name") as caught:
+            write(path)
+        assert caught.value.path == path / name
+    assert len(read_all(path)) == LAST
+    assert everything(tmp_path) == before
+
+
 def no_file(path, kind):
     path.unlink(missing_ok=True)
     if kind == "pipe":

@@ -46,27 +46,27 @@ BLENDED = 6  # materials, the likeliest, that have blends
 
 @dataclass(frozen=True)
 class _Asked:
-    """A touch that is compared: its levels (C, T), T those of the longest kept touch, or its own where it is `whole`.
+    """A touch that is compared: its levels (C, T), as far as the longest kept touch goes where it is not `whole`.
 
-    shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that never change. values: how
-    many count. share: the part of all that do.
+    shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that never change. full: the
+    columns that it is a part of. values: how many count. share: the part of all that do.
     """
 
     levels: LevelArray
     shifted: Rows
     seen: npt.NDArray[np.bool_]
     stuck: npt.NDArray[np.bool_]
+    full: int
     whole: bool
 
     @classmethod
     def of(cls, levels: LevelArray, columns: int, whole: bool) -> _Asked:
-        grid = np.full((len(levels), levels.shape[1] if whole else columns), MISSING, dtype=np.uint8)
-        reach = min(grid.shape[1], levels.shape[1])
-        grid[:, :reach] = levels[:, :reach]
+        full = levels.shape[1] if whole else columns
+        grid = levels[:, :full].copy()
         read = grid != MISSING
         stuck = np.where(read, grid, 0).max(axis=1) <= np.where(read, grid, LEVELS).min(axis=1)
         grid[stuck] = MISSING
-        return cls(grid, grid.ravel().astype(np.intp) << 8, grid != MISSING, stuck, whole)
+        return cls(grid, grid.ravel().astype(np.intp) << 8, grid != MISSING, stuck, full, whole)
 
     @property
     def values(self) -> int:
@@ -74,7 +74,7 @@ class _Asked:
 
     @property
     def share(self) -> float:
-        return self.values / self.levels.size
+        return self.values / (len(self.levels) * self.full)
 
 
 @dataclass(frozen=True)
@@ -261,18 +261,19 @@ class Recall:
         own, other = self._rows([row, int(others[np.argmin(far)])])
         return own, other
 
-    def _rows(self, rows: Iterable[int]) -> LevelArray:
-        """The levels of kept touches one below the other, as long as the longest, (rows, C · T)."""
+    def _rows(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
+        """The levels of kept touches one below the other, (rows, C · T); T: columns, or those of the longest."""
         kept = [self._levels[row] for row in rows]
-        beside = np.full((len(kept), self.channels, self.longest), MISSING, dtype=np.uint8)
+        beside = np.full((len(kept), self.channels, columns or self.longest), MISSING, dtype=np.uint8)
         for levels, into in zip(kept, beside, strict=True):
-            into[:, : levels.shape[1]] = levels
+            part = levels[:, : into.shape[1]]
+            into[:, : part.shape[1]] = part
         return beside.reshape(len(kept), -1)
 
     def _beside(self, rows: Rows, asked: _Asked) -> LevelArray:
         """The levels that a touch is compared with, of some kept ones, (rows, C · T)."""
         if not asked.whole:
-            return self._rows(rows)
+            return self._rows(rows, asked.levels.shape[1])
         columns = asked.levels.shape[1]
         places = np.arange(columns)[None, :] * ((self._columns[rows] - 1) / max(columns - 1, 1))[:, None]
         first = places.astype(np.intp)
@@ -421,10 +422,14 @@ def _product(blocks: LevelArray, guess: npt.NDArray[np.float32]) -> npt.NDArray[
 
 
 def _means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Means of the blocks of a touch between edges, (C, B), 0 where nothing was read; and whether anything was."""
-    seen, first = levels != MISSING, np.minimum(edges[:-1], levels.shape[1] - 1)
-    sums = np.add.reduceat(np.where(seen, levels, 0), first, axis=1, dtype=np.int64)
-    counts = np.add.reduceat(seen, first, axis=1, dtype=np.int64)
+    """Means of the blocks of a touch between edges, (C, B), 0 where nothing was read; and whether anything was.
+
+    A touch may end before the last edge.
+    """
+    seen, first = levels != MISSING, edges[:-1][edges[:-1] < levels.shape[1]]
+    sums, counts = np.zeros((2, len(levels), len(edges) - 1), dtype=np.int64)
+    np.add.reduceat(np.where(seen, levels, 0), first, axis=1, dtype=np.int64, out=sums[:, : len(first)])
+    np.add.reduceat(seen, first, axis=1, dtype=np.int64, out=counts[:, : len(first)])
     return sums / np.maximum(counts, 1), counts > 0
 
 

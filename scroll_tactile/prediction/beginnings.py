@@ -32,7 +32,7 @@ __all__ = ["early_answers", "stream_of", "without"]
 
 FloatArray = npt.NDArray[np.float64]
 
-LEFT_OUT = 64  # touches, each judged at every moment
+LEFT_OUT = 96  # touches, each judged at every moment
 
 
 @dataclass(frozen=True)

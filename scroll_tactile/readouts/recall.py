@@ -15,7 +15,7 @@ All is a function of the set of kept touches, in any order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -96,31 +96,37 @@ class _Pairs:
 class _Room:
     """What is made of kept touches, row by row.
 
-    blocks: means, rounded to levels, (touches, C · B). squares: sums of their squares by channel, (touches, C).
-    columns: the length of each. gapless: whether it has a value everywhere.
+    blocks: means, rounded to levels, (touches, C · B). brought: means over wider blocks of each one's own length,
+    (touches, C · B'). squares: sums of the squares of blocks by channel, (touches, C). columns: the length of each.
+    gapless: whether it has a value everywhere.
     """
 
     blocks: LevelArray
+    brought: LevelArray
     squares: npt.NDArray[np.float32]
     columns: npt.NDArray[np.intp]
     gapless: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, count: int, channels: int, blocks: int) -> _Room:
+    def of(cls, count: int, channels: int, blocks: int, wider: int) -> _Room:
         return cls(
             np.empty((count, channels * blocks), np.uint8),
+            np.empty((count, channels * wider), np.uint8),
             np.empty((count, channels), np.float32),
             np.empty(count, np.intp),
             np.empty(count, np.bool_),
         )
 
     def take(self, other: _Room, count: int) -> None:
-        for name in ("blocks", "squares", "columns", "gapless"):
+        for name in PARTS:
             getattr(self, name)[:count] = getattr(other, name)[:count]
 
     def move(self, row: int, to: int) -> None:
-        for name in ("blocks", "squares", "columns", "gapless"):
+        for name in PARTS:
             getattr(self, name)[to] = getattr(self, name)[row]
+
+
+PARTS = tuple(field.name for field in fields(_Room))
 
 
 class Recall:
@@ -142,7 +148,7 @@ class Recall:
         self._edges = np.linspace(0, self.longest, blocks + 1).astype(np.intp)
         self._touches: list[tuple[str, bytes]] = []
         self._levels: list[LevelArray] = []  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
-        self._held = _Room.of(len(kept), self.channels, blocks)
+        self._held = self._room(len(kept))
         for touch in kept:
             self._add(touch)
         self._named()
@@ -191,21 +197,20 @@ class Recall:
         self._named()
         return bool(self._touches)
 
-    def _room(self, count: int) -> None:
-        """Room for so many touches, with those that are kept already."""
-        room = _Room.of(count, self.channels, len(self._edges) - 1)
-        room.take(self._held, len(self._touches))
-        self._held = room
+    def _room(self, count: int) -> _Room:
+        return _Room.of(count, self.channels, len(self._edges) - 1, len(self._edges[::COARSER]) - 1)
 
     def _add(self, touch: Kept) -> None:
         row, held = len(self._touches), self._held
         if row == len(held.blocks):
-            self._room(row + max(8, row // 8))
-            held = self._held
+            held = self._room(row + max(8, row // 8))
+            held.take(self._held, row)
+            self._held = held
         whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
         whole[:, : touch.levels.shape[1]] = touch.levels
         means = np.rint(_means(whole, self._edges)[0])
         held.blocks[row], held.squares[row] = means.ravel(), (means**2).sum(axis=1)
+        held.brought[row] = np.rint(_means(touch.levels, self._wider(touch.levels.shape[1]))[0]).ravel()
         held.columns[row], held.gapless[row] = touch.levels.shape[1], not bool((whole == MISSING).any())
         self._touches.append((touch.material, touch.key))
         self._levels.append(touch.levels)
@@ -215,9 +220,8 @@ class Recall:
         self._materials = sorted({material for material, _ in self._touches})
         place = {name: i for i, name in enumerate(self._materials)}
         self._labels = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
-        self._blocks, self._squares = held.blocks[:count], held.squares[:count]
+        self._blocks, self._brought, self._squares = held.blocks[:count], held.brought[:count], held.squares[:count]
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
-        self._brought: LevelArray | None = None
 
     def recollect(
         self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None, noise: Noise | None = None
@@ -288,7 +292,7 @@ class Recall:
     def _shortlist(self, noises: Sequence[Noise], asked: _Asked, count: int, left_out: int | None) -> Rows:
         """Rows of the kept touches nearest to the touch as it was before each noise, (count, noises), ascending."""
         columns = asked.levels.shape[1]
-        edges = self._edges[::COARSER] * columns // self.longest if asked.whole else self._edges
+        edges = self._wider(columns) if asked.whole else self._edges
         means, known = _means(asked.levels, edges)
         tables = [self._table(noise) for noise in noises]
         guess = np.stack([(means - table.offset) / table.slope * known for table in tables]).reshape(len(noises), -1)
@@ -305,7 +309,7 @@ class Recall:
 
         Where some blocks lack, of either, they are means over the others, with the guesses' squares.
         """
-        blocks = self._in_their_time() if whole else self._blocks
+        blocks = self._brought if whole else self._blocks
         if self._gapless and not whole and bool((known.all(axis=1) == known.any(axis=1)).all()):
             return np.asarray((self._squares @ known[:, 0].astype(np.float32))[:, None] - 2 * _product(blocks, guess.T))
         columns = np.flatnonzero(known)
@@ -317,14 +321,10 @@ class Recall:
         far = square - 2 * _product(blocks, guess.T) + both @ np.square(guess).T
         return np.asarray(far / np.maximum(both.sum(axis=1, keepdims=True), 1))
 
-    def _in_their_time(self) -> LevelArray:
-        """Means of the kept touches over wider blocks of each one's own length, (touches, blocks)."""
-        if (brought := self._brought) is None:
-            means = []
-            for row, columns in enumerate(self._columns.tolist()):
-                means.append(_means(self._levels[row], self._edges[::COARSER] * columns // self.longest)[0].ravel())
-            brought = self._brought = np.rint(means).astype(np.uint8)
-        return brought
+    def _wider(self, columns: int) -> Rows:
+        """The edges of the blocks that a touch of so many columns has where it is compared as a whole one."""
+        edges: Rows = self._edges[::COARSER] * columns // self.longest
+        return edges
 
     def _read(self) -> npt.NDArray[np.bool_]:
         """Whether a kept touch has any value in a block, (touches, C · B)."""

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.studies.recursive_ridge import RecursiveRidge
 from scroll_tactile import Embedding
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
@@ -20,7 +21,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import extent, scales
 
-__all__ = ["ContinualPeer", "NearestMean", "RanPAC", "StreamingLDA", "touch_features"]
+__all__ = ["ACIL", "ContinualPeer", "NearestMean", "NearestNeighbour", "RanPAC", "StreamingLDA", "touch_features"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -95,6 +96,26 @@ class NearestMean(ContinualPeer):
         return nearness
 
 
+class NearestNeighbour(ContinualPeer):
+    """The nearest of all touches met, features of unit length: a control that keeps everything."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: list[FloatArray] = []
+        self._places: list[int] = []
+
+    def observe(self, features: FloatArray, material: str) -> None:
+        """Keep the touch."""
+        self._places.append(self._place(material))
+        self._rows.append(_unit(features))
+
+    def scores(self, features: FloatArray) -> FloatArray:
+        """The largest cosine with a touch of each material."""
+        cosines = _unit(features) @ np.stack(self._rows).T
+        places = np.array(self._places)
+        return np.stack([cosines[:, places == i].max(axis=1) for i in range(len(self.materials))], axis=1)
+
+
 class StreamingLDA(ContinualPeer):
     """Deep SLDA (Hayes and Kanan 2020, arXiv 1909.01520) on features as they are, without its initial batch.
 
@@ -149,7 +170,32 @@ class StreamingLDA(ContinualPeer):
         return discriminants
 
 
-class RanPAC(ContinualPeer):
+class _Expanding(ContinualPeer):
+    """A peer that learns φ(x) = relu(xW), W normal, of `size` features, one task after another."""
+
+    def __init__(self, seed: int, size: int) -> None:
+        super().__init__()
+        self._random = np.random.default_rng([seed, 1])
+        self._size = size
+        self._projection: FloatArray | None = None
+        self._task: list[tuple[FloatArray, int]] = []
+
+    def observe(self, features: FloatArray, material: str) -> None:
+        """Add to the task at hand."""
+        self._task.append((self._expand(features), self._place(material)))
+
+    def _expand(self, features: FloatArray) -> FloatArray:
+        if self._projection is None:
+            self._projection = self._random.standard_normal((features.shape[-1], self._size))
+        return np.maximum(features @ self._projection, 0.0)
+
+    def _taken(self) -> tuple[FloatArray, FloatArray]:
+        """The task at hand, shape (k, size), and its targets, 0 or 1, shape (k, C)."""
+        rows = np.stack([row for row, _ in self._task])
+        return rows, np.eye(len(self.materials))[[place for _, place in self._task]]
+
+
+class RanPAC(_Expanding):
     """Ridge on a random projection with RanPAC's rule for λ (McDonnell et al. 2023, arXiv 2307.02251).
 
     φ(x) = relu(xW), W normal; G = Σ φφᵀ, Q = Σ φyᵀ, W_o = (G + λI)⁻¹Q over all tasks. λ, of 10⁻⁸ … 10⁸, has the least
@@ -159,37 +205,22 @@ class RanPAC(ContinualPeer):
     """
 
     def __init__(self, seed: int = 0, size: int = 2000) -> None:
-        super().__init__()
-        self._random = np.random.default_rng([seed, 1])
-        self._size = size
-        self._projection: FloatArray | None = None
+        super().__init__(seed, size)
         self._gram = np.zeros((size, size))
-        self._sums: list[FloatArray] = []
-        self._task: list[tuple[FloatArray, int]] = []
+        self._sums = np.zeros((size, 0))
         self.penalty = 1.0
-
-    def observe(self, features: FloatArray, material: str) -> None:
-        """Add to the task at hand."""
-        if self._projection is None:
-            self._projection = self._random.standard_normal((len(features), self._size))
-        place = self._place(material)
-        if place == len(self._sums):
-            self._sums.append(np.zeros(self._size))
-        self._task.append((np.maximum(features @ self._projection, 0.0), place))
 
     def boundary(self) -> None:
         """Add the finished task to G and Q."""
         if self._task:
-            self.penalty = self._choose()
-            rows = np.stack([row for row, _ in self._task])
+            rows, targets = self._taken()
+            self.penalty = self._choose(rows, targets)
             self._gram += rows.T @ rows
-            for row, place in self._task:
-                self._sums[place] += row
+            self._sums = np.pad(self._sums, ((0, 0), (0, targets.shape[1] - self._sums.shape[1])))
+            self._sums += rows.T @ targets
             self._task.clear()
 
-    def _choose(self) -> float:
-        rows = np.stack([row for row, _ in self._task])
-        targets = np.eye(len(self.materials))[[place for _, place in self._task]]
+    def _choose(self, rows: FloatArray, targets: FloatArray) -> float:
         kept = max(1, int(0.8 * len(rows)))
         fitted, held = rows[:kept], rows[kept:]
         if not len(held):
@@ -207,11 +238,34 @@ class RanPAC(ContinualPeer):
     def scores(self, features: FloatArray) -> FloatArray:
         """The ridge predictions; a task at hand ends here."""
         self.boundary()
-        assert self._projection is not None
         system = self._gram.copy()
         system[np.diag_indices_from(system)] += self.penalty
-        weights = np.linalg.solve(system, np.stack(self._sums, axis=1))
-        predictions: FloatArray = np.maximum(features @ self._projection, 0.0) @ weights
+        predictions: FloatArray = self._expand(features) @ np.linalg.solve(system, self._sums)
+        return predictions
+
+
+class ACIL(_Expanding):
+    """ACIL's recursion (Zhuang et al. 2022, arXiv 2205.14922): ridge on a random expansion, in float64, task by task.
+
+    Equal, but for rounding, to one ridge regression on all touches met, whatever the tasks.
+
+    seed, size: of the expansion. penalty: the authors' γ.
+    """
+
+    def __init__(self, seed: int = 0, size: int = 2000, penalty: float = 1.0) -> None:
+        super().__init__(seed, size)
+        self._ridge = RecursiveRidge(size, 0, penalty)
+
+    def boundary(self) -> None:
+        """Let the recursion follow the finished task."""
+        if self._task:
+            self._ridge.add(*self._taken())
+            self._task.clear()
+
+    def scores(self, features: FloatArray) -> FloatArray:
+        """The ridge predictions; a task at hand ends here."""
+        self.boundary()
+        predictions: FloatArray = self._expand(features) @ self._ridge.weights
         return predictions
 
 

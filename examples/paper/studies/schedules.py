@@ -18,7 +18,7 @@ from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["SCHEDULES", "ScheduleName", "Trial", "arrange", "part_ends", "try_schedules"]
+__all__ = ["SCHEDULES", "ScheduleName", "Trial", "arrange", "part_ends", "si_blurry", "try_schedules"]
 
 
 ScheduleName = Literal["class-by-class", "reversed", "shuffled", "batches", "interleaved"]
@@ -69,6 +69,36 @@ def part_ends(schedule: ScheduleName, materials: Sequence[str]) -> list[int]:
     if schedule in ("class-by-class", "reversed"):
         return [i for i in range(1, total + 1) if i == total or materials[i] != materials[i - 1]]
     return [round(total * part / kinds) for part in range(1, kinds + 1)]
+
+
+def si_blurry(
+    materials: Sequence[str], seed: int, *, tasks: int = 5, disjoint: float = 0.5, moved: float = 0.1
+) -> tuple[list[int], list[int]]:
+    """A Si-Blurry stream (Moon et al. 2023, arXiv 2308.09303): the order of N touches, and after how many a task ends.
+
+    A share of the materials, `disjoint`, belongs to one task each, and so at first do the others, the blurry ones; both
+    are cut into tasks at drawn places, so that tasks differ in size. Of the blurry materials' touches a share, `moved`,
+    is drawn, and dealt over the tasks in shares that are drawn too. Within a task the order is at random. Each touch
+    comes once. A task that nothing falls into is left out.
+
+    materials: of each touch, N names. Raises InputError for shares that are none, or fewer tasks than one.
+    """
+    if tasks < 1 or not 0 <= disjoint <= 1 or not 0 <= moved <= 1:
+        raise InputError(f"expected tasks of 1 or more and shares from 0 to 1; came {tasks}, {disjoint} and {moved}")
+    random = np.random.default_rng([seed, 6])
+    names = random.permutation(sorted(set(materials))).tolist()
+    first = round(disjoint * len(names))
+    task_of: dict[str, int] = {}
+    for group in (names[:first], names[first:]):
+        cuts = np.sort(random.integers(0, len(group) + 1, tasks - 1))
+        task_of |= {name: int(np.searchsorted(cuts, i, side="right")) for i, name in enumerate(group)}
+    task = np.array([task_of[name] for name in materials], dtype=np.intp)
+    blurry = np.flatnonzero([name in names[first:] for name in materials])
+    travelling = random.permutation(blurry)[: round(moved * len(blurry))]
+    task[travelling] = random.choice(tasks, size=len(travelling), p=random.dirichlet(np.ones(tasks)))
+    order = sorted(random.permutation(len(materials)).tolist(), key=lambda i: task[i])  # stable: random within a task
+    ends = np.cumsum(np.bincount(task, minlength=tasks)).tolist()
+    return order, sorted({end for end in ends if end})
 
 
 @dataclass(frozen=True)

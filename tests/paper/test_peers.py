@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from examples.paper.runs.cached import Cached
-from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
+from examples.paper.studies.peers import (
+    ACIL,
+    ContinualPeer,
+    NearestMean,
+    NearestNeighbour,
+    RanPAC,
+    StreamingLDA,
+    touch_features,
+)
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from scroll_tactile import Kernels, sensors
 from scroll_tactile.datasets.simulator import Scene
@@ -93,6 +101,32 @@ class TestRanPAC:
         assert peer.penalty == 10.0 ** (np.argmin(losses) - 8)
 
 
+class TestACIL:
+    def test_the_recursion_is_ridge_on_all_touches_whatever_the_tasks(self) -> None:
+        rows, names = blobs()
+        peer = trained(ACIL(seed=3, size=20, penalty=0.1), rows, names)
+        lifted = np.maximum(rows @ np.random.default_rng([3, 1]).standard_normal((6, 20)), 0)
+        targets = np.eye(4)[[NAMES.index(name) for name in names]]
+        weights = np.linalg.solve(lifted.T @ lifted + 0.1 * np.eye(20), lifted.T @ targets)
+        np.testing.assert_allclose(peer.scores(rows), lifted @ weights, rtol=1e-6, atol=1e-8)
+        interleaved = ACIL(seed=3, size=20, penalty=0.1)
+        for i in range(0, 40, 3):  # asked in the middle of a task, and then some more
+            interleaved.observe(rows[i], names[i])
+            interleaved.scores(rows[:1])
+        for i in set(range(40)) - set(range(0, 40, 3)):
+            interleaved.observe(rows[i], names[i])
+        assert interleaved.predict(rows) == peer.predict(rows)
+
+
+class TestNearestNeighbour:
+    def test_it_is_the_largest_cosine_of_all_touches(self) -> None:
+        rows, names = blobs()
+        fresh, _ = blobs(seed=1)
+        peer = trained(NearestNeighbour(), rows, names)
+        unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        assert peer.predict(fresh) == [names[i] for i in (fresh @ unit.T).argmax(axis=1)]
+
+
 class TestGDumb:
     def test_the_buffer_is_balanced_and_never_too_large(self) -> None:
         rows, names = blobs()
@@ -121,9 +155,11 @@ class TestReplaying:
 
 
 PEERS = {
+    "nearest neighbour": NearestNeighbour,
     "nearest mean": NearestMean,
     "streaming LDA": StreamingLDA,
     "RanPAC": lambda: RanPAC(size=200),
+    "ACIL": lambda: ACIL(size=200),
     "GDumb": lambda: GDumb(12),
     "replay": lambda: Replaying(12),
 }

@@ -2,7 +2,7 @@
 
 import pytest
 
-from examples.paper.studies.schedules import SCHEDULES, ScheduleName, arrange, try_schedules
+from examples.paper.studies.schedules import SCHEDULES, ScheduleName, arrange, si_blurry, try_schedules
 from scroll_tactile import sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
@@ -66,3 +66,35 @@ def test_what_cannot_be_is_refused() -> None:
         arrange("backwards", NAMES, 0)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="at least one"):
         try_schedules(sensors.BIOTAC, [], [])
+
+
+class TestSiBlurry:
+    def test_every_touch_comes_once_and_the_seed_draws_the_order(self) -> None:
+        for seed in range(20):
+            order, ends = si_blurry(NAMES, seed)
+            assert sorted(order) == list(range(len(NAMES)))
+            assert ends == sorted(set(ends)) and ends[-1] == len(NAMES)
+            assert (order, ends) == si_blurry(NAMES, seed)
+        assert si_blurry(NAMES, 0) != si_blurry(NAMES, 1)
+
+    def test_disjoint_materials_keep_to_one_task_and_blurry_ones_travel(self) -> None:
+        names = [f"m{number}" for number in range(20) for _ in range(40)]
+
+        def spread(moved: float) -> list[int]:
+            order, ends = si_blurry(names, 3, disjoint=0.5, moved=moved)
+            tasks = [sum(place >= end for end in ends) for place in range(len(order))]
+            by_material: dict[str, set[int]] = {}
+            for place, i in enumerate(order):
+                by_material.setdefault(names[i], set()).add(tasks[place])
+            return sorted(map(len, by_material.values()))
+
+        assert spread(0.0) == [1] * 20
+        assert spread(0.1)[:10] == [1] * 10
+        assert spread(0.1)[-1] > 1
+        assert sum(count > 1 for count in spread(1.0)) == 10
+
+    def test_what_cannot_be_is_refused(self) -> None:
+        with pytest.raises(InputError, match=r"came 5, 1\.5 and 0\.1"):
+            si_blurry(NAMES, 0, disjoint=1.5)
+        with pytest.raises(InputError, match="came 0, "):
+            si_blurry(NAMES, 0, tasks=0)

@@ -82,9 +82,9 @@ def _descend(network: nn.Module, part: Part, epochs: int, batch: int = 10) -> No
     rows, places = part
     descent = torch.optim.SGD(network.parameters(), lr=RATE)
     for _ in range(epochs):
-        for chosen in torch.randperm(len(places)).split(batch):
+        for chosen in torch.split(torch.randperm(len(places)), batch):
             descent.zero_grad()
-            nn.functional.cross_entropy(network(rows[chosen]), places[chosen]).backward()
+            torch.autograd.backward(nn.functional.cross_entropy(network(rows[chosen]), places[chosen]))
             descent.step()
 
 

@@ -106,7 +106,7 @@ class ContinualMetrics:
         for fold in folds:
             measured = _MetricsFold(self, fold)
             cells = [Cell(self.recordings.name, fold, key) for key in measured.measures]
-            yield from run_cells(notes, cells, lambda cell, report, own=measured: own.measure(cell, report), progress)
+            yield from run_cells(notes, cells, measured.measure, progress)
 
     @cached_property
     def kernels(self) -> Embedding:

@@ -19,7 +19,7 @@ from examples.paper.studies.random_convolution import random_convolution
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
-SMALL: dict[str, Any] = {"every": 6, "capacity": 8, "features": 64, "fleets": ((1, 1.0), (3, 0.1))}
+SMALL: dict[str, Any] = {"every": 6, "capacity": 8, "features": 64, "robots": (3,), "alphas": (0.1,)}
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +147,8 @@ class TestStudy:
     def test_what_cannot_be_is_refused(self, recordings: Recordings) -> None:
         with pytest.raises(InputError, match="came 0"):
             ContinualMetrics(recordings, every=0)
+        with pytest.raises(InputError, match=r"came \[10, 0\]"):
+            ContinualMetrics(recordings, robots=(10, 0))
         with pytest.raises(InputError, match="folds out of"):
             list(ContinualMetrics(recordings).run([7]))
 
@@ -164,7 +166,7 @@ def test_the_command_writes_what_it_shows(
 ) -> None:
     module = sys.modules["examples.paper.commands.metrics_command"]
     monkeypatch.setattr(module, "read", lambda dataset, data, seed: recordings)
-    monkeypatch.setattr(module, "QUICK_FLEETS", ((1, 1.0), (2, 0.1)))
+    monkeypatch.setattr(module, "QUICK_FLEETS", {"robots": (2,), "alphas": (0.1,)})
     words = ["metrics", "roboskin-20", "--data", "simulated", "--features", 64, "--materials", 4, "--buffer", 8]
     result = run(*words, "--quick", "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.output
@@ -173,3 +175,4 @@ def test_the_command_writes_what_it_shows(
     assert found["command"].startswith("python -m examples.paper metrics roboskin-20 --data DATA")
     assert {"versions", "date", "machine", "seed", "sensor", "methods", "means", "cells"} <= set(found)
     assert "came 'first'" in refused(*words, "--folds", "first")
+    assert "came '10,0'" in refused(*words, "--robots", "10,0")

@@ -22,11 +22,12 @@ from examples.paper.runs.cells import Cell, Figures
 from examples.paper.studies.metrics_study import METHODS, STREAMS, ContinualMetrics, summary
 from examples.paper.studies.replay import subset
 from scroll_tactile.cli.terminal import console, progress_bar, say
+from scroll_tactile.errors import InputError
 
 __all__ = ["metrics"]
 
 QUICK_MATERIALS = 5
-QUICK_FLEETS = ((1, 1.0), (10, 0.1))
+QUICK_FLEETS: dict[str, Any] = {"robots": (10,), "alphas": (0.1,)}
 
 
 def metrics(
@@ -36,6 +37,7 @@ def metrics(
     seed: Seed = 0,
     every: Annotated[int, typer.Option(min=1, help="Measure after every so many touches.")] = 40,
     buffer: Annotated[int, typer.Option(min=1, help="Touches in the peers' buffers.")] = 200,
+    robots: Annotated[str, typer.Option(help="Of the fleets, beside one robot.")] = "10,100",
     quick: Annotated[bool, typer.Option("--quick", help="One fold of five materials, one fleet of ten.")] = False,
     run: Run = None,
     json: Json = None,
@@ -55,8 +57,8 @@ def metrics(
         most = min(materials, QUICK_MATERIALS if quick else 20)
         if most < 20:
             recordings = subset(recordings, most)
-        settings: dict[str, Any] = {"fleets": QUICK_FLEETS} if quick else {}
-        task = ContinualMetrics(recordings, seed, every, buffer, features=features, folder=run, **settings)
+        fleets = QUICK_FLEETS if quick else {"robots": parse_robots(robots)}
+        task = ContinualMetrics(recordings, seed, every, buffer, features=features, folder=run, **fleets)
         chosen = parse_folds(folds or ("0" if quick else "all"), recordings)
         for cell, figures in task.run(chosen, progress):
             found.append((cell, figures))
@@ -67,9 +69,18 @@ def metrics(
         say(f"[yellow]quick:[/] {most} materials, one fleet: for a look, not for a report")
     if json is not None:
         options = {"folds": folds, "seed": seed, "every": task.every, "buffer": buffer, "quick": quick}
+        options |= {"robots": None if quick else robots}
         command = command_line("metrics", dataset.value, data="DATA", **options, run=None if run is None else "RUN")
         made = origin(command, recordings) | machine() | task.plan | {"folds": chosen, "methods": list(METHODS)}
         write_result(json, made | {"means": means, "cells": {cell.key: figures for cell, figures in found}})
+
+
+def parse_robots(text: str) -> tuple[int, ...]:
+    """The fleets of --robots. Raises InputError for anything but numbers of 1 or more."""
+    words = [word.strip() for word in text.split(",")]
+    if not all(word.isascii() and word.isdigit() and int(word) for word in words):
+        raise InputError(f"expected --robots as numbers, such as 10,100; came {text!r}")
+    return tuple(dict.fromkeys(map(int, words)))
 
 
 def _show_streams(means: Mapping[str, Mapping[str, Any]]) -> None:

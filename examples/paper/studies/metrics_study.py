@@ -44,6 +44,7 @@ from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["METHODS", "STREAMS", "ContinualMetrics", "summary"]
 
+ALPHAS = (0.1, 1.0, 10.0)
 STREAMS = ("class by class", "Si-Blurry")
 """In which order touches come: a task is a material, or one of five tasks with blurred edges."""
 
@@ -67,23 +68,26 @@ class ContinualMetrics:
     """What is measured, and where finished cells are noted.
 
     every: measure after so many touches, and at the end of each task. capacity: touches in the peers' buffers.
-    fleets: (robots, α of the Dirichlet split) each; (1, 1.0) is one robot that has everything. seed: of all that is
+    robots: of the fleets, beside one robot that has everything. alphas: of their Dirichlet splits. seed: of all that is
     drawn. features: of the kernels. folder: of the notes, so that a run that was killed resumes; or None.
 
-    Raises InputError for fewer touches than one between two measurements.
+    Raises InputError for fewer touches than one between two measurements, or fewer robots than one.
     """
 
     recordings: Recordings
     seed: int = 0
     every: int = 40
     capacity: int = 200
-    fleets: tuple[tuple[int, float], ...] = ((1, 1.0), *((robots, a) for robots in (10, 100) for a in (0.1, 1.0, 10.0)))
+    robots: tuple[int, ...] = (10, 100)
+    alphas: tuple[float, ...] = ALPHAS
     features: int = 1008
     folder: Path | None = None
 
     def __post_init__(self) -> None:
         if self.every < 1:
             raise InputError(f"expected to measure after every 1 or more touches; came {self.every}")
+        if any(robots < 1 for robots in self.robots):
+            raise InputError(f"expected fleets of 1 or more robots; came {list(self.robots)}")
 
     @property
     def plan(self) -> dict[str, Any]:
@@ -138,8 +142,9 @@ class _MetricsFold:
         self.measures: dict[str, Callable[[Progress], Figures]] = {
             f"{stream}, {method}": partial(self._pass, stream, method) for stream in STREAMS for method in METHODS
         }
+        fleets = [(1, 1.0), *((robots, alpha) for robots in task.robots for alpha in task.alphas)]
         self.measures |= {
-            f"fleet of {robots}, alpha {alpha:g}": partial(self._fleet, robots, alpha) for robots, alpha in task.fleets
+            f"fleet of {robots}, alpha {alpha:g}": partial(self._fleet, robots, alpha) for robots, alpha in fleets
         }
 
     def measure(self, cell: Cell, progress: Progress) -> Figures:

@@ -86,6 +86,18 @@ class TestRanPAC:
         weights = np.linalg.solve(lifted.T @ lifted + peer.penalty * np.eye(20), lifted.T @ targets)
         np.testing.assert_allclose(peer.scores(rows), lifted @ weights, rtol=1e-6, atol=1e-9)
 
+    def test_an_answer_within_a_task_does_not_end_it(self) -> None:
+        rows, names = blobs()
+        plain, asked = RanPAC(seed=3, size=20), RanPAC(seed=3, size=20)
+        for i in range(40):
+            for peer in (plain, asked):
+                peer.observe(rows[i], names[i])
+                if i in (19, 39):
+                    peer.boundary()
+            asked.scores(rows[:1])
+        assert plain.penalty == asked.penalty
+        np.testing.assert_array_equal(plain.scores(rows), asked.scores(rows))
+
     def test_the_penalty_is_of_the_last_task_alone(self) -> None:
         rows, names = blobs()
         peer = trained(RanPAC(seed=3, size=20), rows, names)

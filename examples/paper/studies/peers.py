@@ -212,13 +212,16 @@ class RanPAC(_Expanding):
 
     def boundary(self) -> None:
         """Add the finished task to G and Q."""
-        if self._task:
-            rows, targets = self._taken()
-            self.penalty = self._choose(rows, targets)
-            self._gram += rows.T @ rows
-            self._sums = np.pad(self._sums, ((0, 0), (0, targets.shape[1] - self._sums.shape[1])))
-            self._sums += rows.T @ targets
-            self._task.clear()
+        self._gram, self._sums, self.penalty = self._with_task()
+        self._task.clear()
+
+    def _with_task(self) -> tuple[FloatArray, FloatArray, float]:
+        """G, Q and λ, as if the task at hand ended here."""
+        if not self._task:
+            return self._gram, self._sums, self.penalty
+        rows, targets = self._taken()
+        sums = np.pad(self._sums, ((0, 0), (0, targets.shape[1] - self._sums.shape[1]))) + rows.T @ targets
+        return self._gram + rows.T @ rows, sums, self._choose(rows, targets)
 
     def _choose(self, rows: FloatArray, targets: FloatArray) -> float:
         kept = max(1, int(0.8 * len(rows)))
@@ -236,11 +239,10 @@ class RanPAC(_Expanding):
         return float(penalties[int(np.argmin(losses))])
 
     def scores(self, features: FloatArray) -> FloatArray:
-        """The ridge predictions; a task at hand ends here."""
-        self.boundary()
-        system = self._gram.copy()
-        system[np.diag_indices_from(system)] += self.penalty
-        predictions: FloatArray = self._expand(features) @ np.linalg.solve(system, self._sums)
+        """The ridge predictions, as if the task at hand ended here; it goes on."""
+        gram, sums, penalty = self._with_task()
+        weights = np.linalg.solve(gram + penalty * np.eye(self._size), sums)
+        predictions: FloatArray = self._expand(features) @ weights
         return predictions
 
 
@@ -263,7 +265,7 @@ class ACIL(_Expanding):
             self._task.clear()
 
     def scores(self, features: FloatArray) -> FloatArray:
-        """The ridge predictions; a task at hand ends here."""
+        """The ridge predictions; to a recursion it is all the same where a task ends."""
         self.boundary()
         predictions: FloatArray = self._expand(features) @ self._ridge.weights
         return predictions

@@ -496,7 +496,8 @@ class TactileLearner:
         noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
         `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene: as for `predict`.
 
-        Each touch is predicted by the memory as it was when it began.
+        Each touch is predicted by the memory as it was when it began, and by itself unless `LiveSession.again` says
+        that it is of the same thing as the last.
 
         Raises InputError for values that cannot be, and for "auto" with frames that have no resting image;
         UnknownMaterialError for a scene that names a material never observed.
@@ -507,9 +508,9 @@ class TactileLearner:
             with self._ledger.lock, enough_memory():
                 return self._current.snapshot(self._ledger)
 
-        def answered(model: Model, candidates: Sequence[str], encoded: Encoded) -> Prediction:
+        def answered(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
             with self._ledger.lock, enough_memory():
-                return self._answer(model, candidates, [(encoded, None)])
+                return self._answer(model, candidates, [(touch, None) for touch in touches])
 
         memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answered)
         return LiveSession(memory, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)

@@ -21,7 +21,9 @@ class LiveTouch:
     `learner.predict(stream)` of the memory as it was when the touch began. decided: whether it was safe to act on
     before the touch ended, or is now; False says that it stayed undecided. at: when it began, by the readings' times;
     without any, in seconds since the session began. end: why it ended: "released", by `end()`, by a "gap" in time,
-    as "time went back", as nothing moved for long ("still"), or because the session was "closed".
+    as "time went back", as nothing moved for long ("still"), or because the session was "closed". earlier: the touches
+    of the same thing before it that the prediction weighs with it, as `learner.predict(*earlier, stream)`; none unless
+    `LiveSession.again` said so.
     """
 
     stream: Stream
@@ -29,15 +31,17 @@ class LiveTouch:
     decided: bool
     at: float
     end: End
+    earlier: tuple[Stream, ...] = ()
 
 
 class LiveState(NamedTuple):
     """Where a live session stands after a push.
 
     contact: whether something is touched. seconds: since the touch began. prediction: that of the touch's beginning,
-    made at the last of the moments at which it may change; None before the first. decided: whether it is safe to act
-    on: then both stay until the touch ends. ended: whether a touch ended in this push. touches: all that ended in it,
-    in order; a block of readings can hold several.
+    and of the touches of the same thing before it where `LiveSession.again` was called, made at the last of the moments
+    at which it may change; None before the first. decided: whether it is safe to act on: then both stay until the touch
+    ends. ended: whether a touch ended in this push. touches: all that ended in it, in order; a block of readings can
+    hold several.
 
     Where a touch ended and none began after it in the same push, seconds, prediction and decided are those of the touch
     that ended. At rest they are 0, None and False.

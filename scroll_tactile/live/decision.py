@@ -11,6 +11,9 @@ W those that are, M how many it should be by their probabilities. These are cali
 keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as coarse as
 1 / n. Touches left out are not all there are: hence one standard error. So few cannot vouch for a risk of 0.01, and
 then most are decided as whole touches, of which a probability of 1 − risk is enough.
+
+A touch of a thing that was touched before begins with what that said, and `together` is the least probability for it:
+the same, of each touch left out behind another of its material, and no less than `sure`.
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.beginnings import early_answers
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.calibration import UNMEASURED
+from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED
+from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.early import Rehearsal
 from scroll_tactile.results import Prediction
 
 __all__ = ["DecisionRule", "decision_rule"]
@@ -42,25 +47,27 @@ class DecisionRule:
     """When to predict, and when to act.
 
     moments: at which a prediction is made, in columns, ascending; after the last only at the touch's end. risk: the
-    share of wrong answers among those decided. sure: the probability at which a known touch is decided. strange: the
-    novelty at which a touch is decided to be of nothing that was observed.
+    share of wrong answers among those decided. sure: the probability at which a known touch is decided; together: that
+    of several of one thing. strange: the novelty at which a touch is decided to be of nothing that was observed.
     """
 
     moments: tuple[int, ...]
     risk: float
     sure: float
+    together: float
     strange: float
 
-    def decided(self, prediction: Prediction, columns: int) -> bool:
+    def decided(self, prediction: Prediction, columns: int, *, several: bool = False) -> bool:
         """Whether it is safe to act on the prediction for the first `columns` of a touch, or for all of it.
 
-        On `prediction.material` where it is known, and on its being new where it is not.
+        On `prediction.material` where it is known, and on its being new where it is not. several: whether the
+        prediction weighs other touches of the same thing with it.
         """
         if columns < self.moments[0]:
             return False
         if prediction.known:
-            whole = columns >= self.moments[-1]
-            return prediction.probability >= (min(self.sure, 1 - self.risk) if whole else self.sure)
+            sure, whole = self.together if several else self.sure, columns >= self.moments[-1]
+            return prediction.probability >= (min(sure, 1 - self.risk) if whole else sure)
         return prediction.novelty >= self.strange
 
 
@@ -75,14 +82,45 @@ def decision_rule(model: Model, extractor: FeatureExtractor, risk: float) -> Dec
     least = max(1, min(model.least, model.longest))
     early = early_answers(model, extractor)
     if early is None:
-        return DecisionRule((least,), risk, 1 - risk, 2 * UNMEASURED)
-    moments, said = early.moments, early.fitted
-    known = said.novelty <= np.array([np.quantile(moment.novelties, KNOWN) for moment in moments])
-    sure = least_sure(
-        np.where(known, said.chances.max(axis=2), np.nan), said.chances.argmax(axis=2) == said.targets[:, None], risk
+        return DecisionRule((least,), risk, 1 - risk, 1 - risk, 2 * UNMEASURED)
+    said, usual = early.fitted, np.array([np.quantile(moment.novelties, KNOWN) for moment in early.moments])
+    sure = _least_sure_of(said, said.novelty <= usual, risk)
+    pairs, known = in_pairs(said, usual, model.dependence)
+    together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
+    strange = max(BEYOND * float(np.nanmax(said.novelty)), UNMEASURED)
+    moments = (*(moment.columns for moment in early.moments), least)
+    return DecisionRule(moments, risk, sure, max(sure, together), strange)
+
+
+def _least_sure_of(said: Rehearsal, known: npt.NDArray[np.bool_], risk: float) -> float:
+    chances = said.chances
+    right = chances.argmax(axis=2) == said.targets[:, None]
+    return least_sure(np.where(known, chances.max(axis=2), np.nan), right, risk)
+
+
+def in_pairs(said: Rehearsal, usual: FloatArray, dependence: Dependence) -> tuple[Rehearsal, npt.NDArray[np.bool_]]:
+    """What is said of touches left out behind another of their material, at each moment, and whether it is known.
+
+    usual: the most novelty of a known touch at each moment. What comes first counts as at its last moment.
+    """
+    last = [int(np.flatnonzero(~np.isnan(of))[-1]) for of in said.novelty]
+    pairs = []
+    for target in sorted(set(said.targets.tolist())):
+        own = np.flatnonzero(said.targets == target).tolist()
+        if len(own) > 1:
+            pairs += list(zip(own, [*own[1:], own[0]], strict=True))
+    chances, novelty = (
+        np.full_like(said.chances[: len(pairs)], np.nan),
+        np.full_like(said.novelty[: len(pairs)], np.nan),
     )
-    strange = BEYOND * float(np.nanmax(said.novelty))
-    return DecisionRule((*(moment.columns for moment in moments), least), risk, sure, max(strange, UNMEASURED))
+    known = np.zeros(novelty.shape, dtype=np.bool_)
+    for row, (first, second) in enumerate(pairs):
+        for moment in np.flatnonzero(~np.isnan(said.novelty[second])):
+            before = said.chances[first, last[first]], said.novelty[first, last[first]], usual[last[first]]
+            chances[row, moment] = dependence.probability([before[0], said.chances[second, moment]])
+            novelty[row, moment] = dependence.standard([before[1], said.novelty[second, moment]])
+            known[row, moment] = novelty[row, moment] <= (before[2] + usual[moment]) / 2
+    return Rehearsal(chances, novelty, said.targets[[second for _, second in pairs]]), known
 
 
 def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Self
 from weakref import WeakKeyDictionary
@@ -36,25 +36,30 @@ Array = npt.NDArray[Any]
 
 REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have begun
 KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
+EARLIER = 7  # touches of one thing before a touch: more hardly say more, and each has its price in every prediction
 
 
 @dataclass(frozen=True)
 class Memory:
     """What a session needs of a learner.
 
-    snapshot: its model, which stays as it is while it is held. answer: what a model says, of candidates, of a touch.
+    snapshot: its model, which stays as it is while it is held. answer: what a model says, of candidates, of touches of
+    one thing.
     """
 
     sensor: Sensor
     embedding: Embedding
     extractor: FeatureExtractor
     snapshot: Callable[[], Snapshot]
-    answer: Callable[[Model, Sequence[str], Encoded], Prediction]
+    answer: Callable[[Model, Sequence[str], Sequence[Encoded]], Prediction]
 
 
 @dataclass
 class _Touch:
-    """The touch under way. rows: its readings, of a camera behind the resting image. at: when it began."""
+    """The touch under way. rows: its readings, of a camera behind the resting image. at: when it began.
+
+    earlier: the touches of the same thing before it; encoded: they, as its model reads them.
+    """
 
     rows: Rows
     at: float
@@ -63,6 +68,8 @@ class _Touch:
     cache: WindowCache
     moments: list[int]  # that are to come, in readings; the next is the last of them
     before: int  # readings that are no part of it: a camera's resting image
+    earlier: tuple[Stream, ...] = ()
+    encoded: list[Encoded] = field(default_factory=list)
     prediction: Prediction | None = None
     decided: bool = False
 
@@ -108,6 +115,8 @@ class LiveSession:
         self._since, self._came = 0.0, 0  # a time, and the readings that came from then on
         self._under_way: _Touch | None = None
         self._ended: list[LiveTouch] = []
+        self._thing: tuple[Stream, ...] = ()  # the touches of what was touched last
+        self._again = False  # whether the next touch is one more of them
         self._closed = False
         self.touch: Stream | None = None
         first = model not in _RULES
@@ -164,6 +173,24 @@ class LiveSession:
         self._ended = []
         self._end("end")
         return self._state()
+
+    def again(self) -> None:
+        """Say that the next touch to begin is of the same thing as the last; one that is under way is then the last.
+
+        What the touches say adds up, as in `learner.predict(first, second, …)`, from the next one's first prediction
+        on; a third adds up where again() is called once more. It is used up by the touch that begins next, and without
+        it a touch counts by itself. Contacts too brief for a touch, gaps and steps back in time change nothing of it.
+        Of more than eight touches of one thing the last eight count, so that what a session holds is bounded.
+
+        Raises InputError before any touch, and after `close`.
+        """
+        self._require_open()
+        if self._under_way is None and not self._thing:
+            raise InputError(
+                "again() says that the next touch is of the same thing as the last, and none has ended yet: call it "
+                "between two touches"
+            )
+        self._again = True
 
     def close(self) -> None:
         """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
@@ -235,7 +262,7 @@ class LiveSession:
                 self._end("still" if event.kind == "still" else "released")
         if event is not None and event.kind == "relearned":
             self.report.relearned += 1
-            self._under_way = None
+            self._leave(touch)
             self._recent.clear()
 
     def _begin(self, rows: Array) -> None:
@@ -254,8 +281,13 @@ class LiveSession:
         limit = MOST_FRAMES + before if self.sensor.camera else self._limit(model)
         moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
-        self._under_way = _Touch(Rows(rows, limit), at, snapshot, rule, WindowCache(), moments, before)
+        earlier, self._again = self._thing if self._again else (), False
+        self._under_way = _Touch(Rows(rows, limit), at, snapshot, rule, WindowCache(), moments, before, earlier)
         self._predict_in_time(self._under_way)
+
+    def _leave(self, touch: _Touch | None) -> None:
+        """What seemed a touch was none: the next is of what it would have been of, and that may be nothing known."""
+        self._under_way, self._again = None, bool(touch and touch.earlier)
 
     def _rule(self, model: Model) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; once for each model."""
@@ -273,7 +305,7 @@ class LiveSession:
             encoded = self._memory.extractor.encode(
                 stream, model.longest, lambda columns: model.needed(model.names, columns), cache
             )
-            self._memory.answer(model, model.names, encoded)
+            self._memory.answer(model, model.names, [encoded])
 
     def _limit(self, model: Model) -> int:
         return max(round(KEPT * self.sensor.rate), 4 * model.longest)
@@ -300,13 +332,20 @@ class LiveSession:
         if self._scene is not None:
             candidates = sorted({name for name in self._scene if name in model.known})
         if not candidates:
-            touch.prediction = Prediction(None, 0.0, (), float("inf"), False, stream.seconds)
+            seconds = math.fsum({each.key: each.seconds for each in (*touch.earlier, stream)}.values())
+            touch.prediction = Prediction(None, 0.0, (), float("inf"), False, seconds)
             return touch.prediction
-        encoded = self._memory.extractor.encode(
-            stream, model.longest, lambda columns: model.needed(candidates, columns), touch.cache
-        )
-        touch.prediction = self._memory.answer(model, candidates, encoded)
-        touch.decided = touch.decided or touch.rule.decided(touch.prediction, encoded.columns)
+
+        def encoded(each: Stream, cache: WindowCache | None = None) -> Encoded:
+            return self._memory.extractor.encode(
+                each, model.longest, lambda columns: model.needed(candidates, columns), cache
+            )
+
+        touch.encoded = touch.encoded or [encoded(each) for each in touch.earlier]
+        current = encoded(stream, touch.cache)
+        touch.prediction = self._memory.answer(model, candidates, [*touch.encoded, current])
+        several = bool(touch.earlier)
+        touch.decided = touch.decided or touch.rule.decided(touch.prediction, current.columns, several=several)
         return touch.prediction
 
     def _end(self, end: End) -> None:
@@ -320,13 +359,14 @@ class LiveSession:
             stream = self._stream(touch, touch.rows.kept)
         except StreamError:  # nothing that could be observed
             self.report.brief += 1
+            self._leave(touch)
             return
         prediction = self._predict(touch, stream)
-        self.touch = stream
+        self.touch, self._thing = stream, (*touch.earlier, stream)[-EARLIER:]
         self.report.touches += 1
         self.report.undecided += not touch.decided
         self.report.truncated += touch.rows.came > touch.rows.kept
-        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end))
+        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end, touch.earlier))
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""

@@ -65,7 +65,9 @@ PRESETS = {
     "xela-uskin": Preset(_USKIN, None, "sensors[0].taxels[*].{x,y,z}", ("sensstream",)),
     "papillarray": Preset(CONTACTILE, "/hub_0/sensor_0", "pillars[*].{fX,fY,fZ}", ("sensorstate",)),
     "anyskin": Preset(_ANYSKIN, None, "data", ()),
-    "robotiq-tsf": Preset(_ROBOTIQ, None, "taxels[*].values", ("staticdata",)),
+    # Its driver's clock, /TactileSensor/Timestamp, is of no use here: two counts of 16 bits, one of each finger, that
+    # wrap, in messages of their own. Readings go by when they were logged.
+    "robotiq-tsf": Preset(_ROBOTIQ, "/TactileSensor/StaticData", "taxels[*].values", ("staticdata",)),
     "digit": _camera("digit", 30.0),
     "gelsight": _camera("gelsight-mini", 25.0),
 }

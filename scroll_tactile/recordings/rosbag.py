@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
-import json
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -21,6 +19,7 @@ from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
 from scroll_tactile.recordings.clocks import Stamps
+from scroll_tactile.recordings.decoding import MessageTypes
 from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
 from scroll_tactile.recordings.sqlitefile import scan_db3
@@ -57,7 +56,7 @@ class RosBag(Source):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
         self.files, self.compressed = _files(path)
-        self.types = _Types(request)
+        self.types = MessageTypes(request)
 
     def contents(self) -> Contents:
         """The numbers in the first messages of each topic, those of known sensors first."""
@@ -226,64 +225,6 @@ def _files(path: Path) -> tuple[list[Path], bool]:
 
 def _natural(name: str) -> list[Any]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
-
-
-class _Types:
-    """Turns the bytes of messages into objects, by the definitions that come with them, or else ROS 2's own."""
-
-    def __init__(self, request: Request) -> None:
-        self.given = request.definitions
-        self.readers: dict[Channel, Callable[[bytes], object]] = {}
-
-    def decode(self, channel: Channel, data: bytes) -> object:
-        """Raises RecordingError for a type that is not defined, and for bytes that do not fit it."""
-        reader = self.readers.get(channel)
-        if reader is None:
-            reader = self.readers[channel] = _reader(channel, self.given.get(channel.type, ""))
-        try:
-            return reader(data)
-        except RecordingError:
-            raise
-        except Exception as error:
-            raise RecordingError(
-                f"a message of topic {channel.topic!r} does not fit its type {channel.type}, and may be damaged: "
-                f"{type(error).__name__}: {error}"
-            ) from error
-
-
-@functools.lru_cache(256)  # as many bags as touches have the same messages
-def _reader(channel: Channel, given: str) -> Callable[[bytes], object]:
-    if channel.encoding == "json":
-        return json.loads
-    if channel.encoding not in ("cdr", "ros1"):
-        raise RecordingError(
-            f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
-        )
-    try:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise missing("rosbags", "ros", "a ROS recording") from error
-    store = get_typestore(Stores.EMPTY)
-    text = given or channel.definition
-    try:
-        if text and channel.idl:
-            # A definition that needs others holds them all, each below a line of = and one with its name.
-            for part in text.split("=" * 80 + "\n"):
-                store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)) if part else {})
-        elif text:
-            store.register(get_types_from_msg(text, channel.type))
-    except Exception as error:
-        raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
-    if not text or channel.type not in store.fielddefs:
-        store = get_typestore(Stores.LATEST)
-    if channel.type not in store.fielddefs:
-        raise RecordingError(
-            f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
-            f"pass definitions={{{channel.type!r}: text of its .msg file}}"
-        )
-    if channel.encoding == "ros1":
-        return lambda data: store.deserialize_ros1(data, channel.type)
-    return lambda data: store.deserialize_cdr(data, channel.type)
 
 
 def _rate(logs: list[int]) -> float | None:

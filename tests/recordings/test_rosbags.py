@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, find, iterate, read, resampled
@@ -333,6 +335,36 @@ def test_ragged_empty_and_undefined(tmp_path, store2):
     text = full + "".join(f"\n{'=' * 80}\nMSG: {name}\n{part}" for name, part in parts.items())
     recording = read(path, preset="biotac-sp", definitions={"sr_robot_msgs/msg/BiotacAll": text})
     np.testing.assert_array_equal(recording.readings[0], np.arange(24))
+
+
+JOINTS = (
+    "00010000640000000000000004000000746970000200000006000000696e64657800d0fd060000007468756d6200000002000000000000"
+    "000000d03f000000000000f8bf00000000000000000a7f0000b090d0fd"
+)
+"""By rclpy's serialize_message: a JointState of two joints at 0.25 and -1.5, without velocity and effort."""
+
+
+def joints(path, store, *messages):
+    with Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joints", "sensor_msgs/msg/JointState", typestore=store)
+        for i, message in enumerate(messages):
+            writer.write(connection, 10**9 * (i + 1), message)
+    return path
+
+
+def test_empty_lists_leave_bytes_behind_a_message(tmp_path, store2):
+    path = joints(tmp_path / "b", store2, bytes.fromhex(JOINTS), bytes.fromhex(JOINTS))
+    recording = read(path, topic="/joints", field="position")
+    assert recording.readings.tolist() == [[0.25, -1.5]] * 2
+    assert not recording.report.notes
+    assert "position" in [entry.field for entry in describe(path).entries]
+
+
+@pytest.mark.parametrize("size", [5, 20, 40, 55, 70, 84 + 12])
+def test_messages_of_another_size_stay_errors(tmp_path, store2, size):
+    message = (bytes.fromhex(JOINTS) + bytes(12))[:size]
+    with pytest.raises(RecordingError, match="does not fit its type"):
+        read(joints(tmp_path / "b", store2, message), topic="/joints", field="position")
 
 
 def test_pictures_come_as_frames(tmp_path, store2):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.recordings.bagfiles import Message
-from scroll_tactile.recordings.paths import FieldPath
+from scroll_tactile.recordings.paths import FieldPath, fields_of
 
 __all__ = ["CLOCKS", "Stamps", "choose", "lost"]
 
@@ -95,7 +95,13 @@ class Stamps:
 
 def _first(decoded: Any, texts: list[str], counts: bool = False) -> tuple[str, FieldPath] | None:
     """The first of some paths that leads to a stamp, or to a whole number where it `counts`."""
+    names: dict[str, set[str]] = {}  # of what stands before the last dot; an error with the nearest takes long
     for text in texts:
+        before, _, name = text.rpartition(".")
+        if before not in names:
+            names[before] = _names(decoded, before)
+        if name.lower() not in names[before]:
+            continue
         path = FieldPath(text)
         try:
             value = _stamp(path, decoded)
@@ -104,6 +110,15 @@ def _first(decoded: Any, texts: list[str], counts: bool = False) -> tuple[str, F
         if not counts or isinstance(value, int):
             return text, path
     return None
+
+
+def _names(decoded: Any, text: str) -> set[str]:
+    """The fields, in lower case, of the message that a path leads to; none where it leads to none."""
+    try:
+        found = FieldPath(text).values(decoded) if text else [decoded]
+    except FieldError:
+        return set()
+    return {name.lower() for name in fields_of(found[0])} if len(found) == 1 else set()
 
 
 def _stamp(path: FieldPath, decoded: Any) -> float:

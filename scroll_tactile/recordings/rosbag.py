@@ -29,6 +29,9 @@ __all__ = ["SUFFIXES", "RosBag", "is_rosbag", "picture"]
 SUFFIXES = (".bag", ".mcap", ".db3")
 """What ROS's recordings end in."""
 
+# What is needed of metadata.yaml, as rosbag2 writes it: each with the lines below it that lie deeper, or are a list's.
+_LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
+
 _LOOKED = 2000  # messages are looked at to say what a bag holds
 
 
@@ -141,8 +144,6 @@ class RosBag(Source):
         if topic is not None and text is not None:
             return topic, text
         topics = self._having(FieldPath(text)) if text is not None else []
-        if len(topics) > 1 and self.request.likely in topics:
-            topics = [self.request.likely]
         if len(topics) == 1 and text is not None:
             return topics[0], text
         contents = self.contents()
@@ -154,7 +155,7 @@ class RosBag(Source):
         raise FieldError(f"expected a topic and a field to read\n{Contents(contents.source, entries)}")
 
     def _having(self, path: FieldPath) -> list[str]:
-        """The topics in whose first message a path leads to numbers."""
+        """The topics in whose first message a path leads to numbers; the likely one alone where it is among them."""
         topics: dict[str, bool] = {}
         for message in itertools.islice(self._messages(lambda name: True), _LOOKED):
             topic = message.channel.topic
@@ -162,6 +163,8 @@ class RosBag(Source):
                 topics[topic] = False
                 with suppress(RecordingError):
                     topics[topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
+                if topics[topic] and topic == self.request.likely:
+                    return [topic]
         return [topic for topic, has in topics.items() if has]
 
     def _absent(self, topic: str | None) -> NoReturn:
@@ -212,7 +215,10 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         from ruamel.yaml import YAML  # comes with rosbags
     except ImportError as error:
         raise missing("rosbags", "ros", "a ROS recording") from error
-    about = YAML(typ="safe").load(listed.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    text = listed.read_text(encoding="utf-8")
+    yaml, parts = YAML(typ="safe"), [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
+    # The whole text takes as long as a hundred messages do.
+    about = yaml.load("".join(parts)) if len(parts) == 2 else yaml.load(text)["rosbag2_bagfile_information"]
     files = [path / Path(str(name)).name for name in about["relative_file_paths"]]
     absent = [file.name for file in files if not file.exists()]
     if absent:

@@ -510,3 +510,30 @@ def test_importing_brings_no_library_of_a_format():
     heavy = ["rosbags", "pyarrow", "h5py", "zarr", "fsspec", "torch", "lz4", "sqlite3", "PIL"]
     code = f"import sys, scroll_tactile.recordings; print([name for name in {heavy} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout.strip() == b"[]"
+
+
+STYLES = {
+    "rosbags": "relative_file_paths:\n  - one.mcap\n  - 'two: 2.mcap'\n",
+    "rosbag2": "relative_file_paths:\n    - one.mcap\n    - 'two: 2.mcap'\n",
+    "in brackets": "relative_file_paths: [one.mcap, 'two: 2.mcap']\n",
+    "in lines": "relative_file_paths: [one.mcap,\n    'two: 2.mcap']\n",
+}
+
+
+@pytest.mark.parametrize("deep", ["  ", "    "])
+@pytest.mark.parametrize("style", STYLES)
+def test_the_parts_of_a_bag_are_those_it_lists(tmp_path, store2, style, deep):
+    """However its metadata is written. deep: what each line begins with; rosbag2 has two spaces."""
+    folder = tmp_path / "b"
+    folder.mkdir()
+    listed = STYLES[style].replace("\n", f"\n{deep}").rstrip(" ")
+    about = f"compression_format: zstd\n{deep}compression_mode: FILE\n{deep}message_count: 2\n{deep}{listed}"
+    text = f"rosbag2_bagfile_information:\n{deep}version: 9\n{deep}{about}{deep}custom_data: ~\n"
+    (folder / "metadata.yaml").write_text(text)
+    with pytest.raises(RecordingError, match=r"lists one.mcap, two: 2.mcap, which are not there"):
+        read(folder)
+    for i, name in enumerate(("one.mcap", "two: 2.mcap")):
+        values = np.full((1, 3), i, np.float32)
+        made = bags.write(tmp_path / str(i), store2, {"/skin": [(1.0 + i, bags.array(store2, values[0]))]}, form="mcap")
+        shutil.copy(next(made.glob("*.mcap")), folder / name)
+    assert read(folder, topic="/skin", field="data").readings[:, 0].tolist() == [0, 1]

@@ -103,23 +103,21 @@ def in_pairs(said: Rehearsal, usual: FloatArray, dependence: Dependence) -> tupl
 
     usual: the most novelty of a known touch at each moment. What comes first counts as at its last moment.
     """
-    last = [int(np.flatnonzero(~np.isnan(of))[-1]) for of in said.novelty]
-    pairs = []
+    reached = [np.flatnonzero(~np.isnan(of)).tolist() for of in said.novelty]
+    pairs: list[tuple[int, int]] = []
     for target in sorted(set(said.targets.tolist())):
-        own = np.flatnonzero(said.targets == target).tolist()
-        if len(own) > 1:
-            pairs += list(zip(own, [*own[1:], own[0]], strict=True))
-    chances, novelty = (
-        np.full_like(said.chances[: len(pairs)], np.nan),
-        np.full_like(said.novelty[: len(pairs)], np.nan),
-    )
+        own = [i for i in np.flatnonzero(said.targets == target).tolist() if reached[i]]
+        pairs += zip(own, [*own[1:], *own[:1]], strict=True) if len(own) > 1 else ()
+    chances = np.full((len(pairs), *said.chances.shape[1:]), np.nan)
+    novelty = np.full((len(pairs), said.novelty.shape[1]), np.nan)
     known = np.zeros(novelty.shape, dtype=np.bool_)
     for row, (first, second) in enumerate(pairs):
-        for moment in np.flatnonzero(~np.isnan(said.novelty[second])):
-            before = said.chances[first, last[first]], said.novelty[first, last[first]], usual[last[first]]
-            chances[row, moment] = dependence.probability([before[0], said.chances[second, moment]])
-            novelty[row, moment] = dependence.standard([before[1], said.novelty[second, moment]])
-            known[row, moment] = novelty[row, moment] <= (before[2] + usual[moment]) / 2
+        last = reached[first][-1]
+        for moment in reached[second]:
+            both = (first, last), (second, moment)
+            chances[row, moment] = dependence.probability([said.chances[at] for at in both])
+            novelty[row, moment] = dependence.standard([said.novelty[at] for at in both])
+            known[row, moment] = novelty[row, moment] <= (usual[last] + usual[moment]) / 2
     return Rehearsal(chances, novelty, said.targets[[second for _, second in pairs]]), known
 
 

@@ -48,7 +48,8 @@ class Bridge:
     An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
     stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
     probability, known, novelty (None where nothing was ever observed), candidates and ranking (the five likeliest);
-    "ended" also has end, why it did. All but event, stamp and contact may be missing where nothing was predicted yet.
+    "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but event, stamp and
+    contact may be missing where nothing was predicted yet.
 
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
@@ -138,6 +139,11 @@ class Bridge:
         touch = state.touches[-1]
         return f"touched for {touch.stream.seconds:g} s: {touch.prediction.material or 'nothing was ever observed'}"
 
+    def again(self) -> str:
+        """The next touch is of the same thing as the last. Raises InputError before any touch."""
+        self.session.again()
+        return "the next touch is of the same thing as the last: what they say adds up"
+
     def status(self) -> dict[str, int | bool]:
         """What the bridge and its session met, by name."""
         return {**asdict(self.report), **asdict(self.session.report)}
@@ -195,6 +201,7 @@ class Bridge:
 
     def _ended(self, touch: LiveTouch) -> Answer:
         over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
+        over |= {"touches": 1 + len(touch.earlier)}
         return {"event": "ended", "stamp": self.stamp, **over, **_said(touch.prediction)}
 
 

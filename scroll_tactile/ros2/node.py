@@ -43,7 +43,8 @@ class TactileNode:
     on `~/diagnostics`.
 
     Services, all std_srvs/Trigger, whose reply says what was done or why not: `~/learn` and `~/forget`, under the name
-    that the parameter `material` has then; `~/begin` and `~/end`, with contact="manual".
+    that the parameter `material` has then; `~/begin` and `~/end`, with contact="manual"; `~/again`, before the next
+    touch of the same thing.
 
         ros2 param set /scroll_tactile material silk
         ros2 service call /scroll_tactile/learn std_srvs/srv/Trigger
@@ -83,6 +84,7 @@ class TactileNode:
             "forget": lambda: bridge.forget(self._material()),
             "begin": bridge.begin,
             "end": bridge.end,
+            "again": bridge.again,
         }
         for name, call in calls.items():
             node.create_service(trigger, f"~/{name}", _service(call))

@@ -8,8 +8,10 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
-from scroll_tactile.live.decision import DecisionRule, decision_rule, least_sure
+from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.early import Rehearsal
 from scroll_tactile.results import Prediction
 
 SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6)
@@ -123,6 +125,43 @@ def test_a_rule_says_known_where_it_is_sure_and_new_where_it_is_strange():
     assert [rule.decided(known[p], 10) for p in known] == [False, True, True]  # of a whole touch 1 − risk is enough
     assert [rule.decided(new[n], 5) for n in new] == [False, True]
     assert not rule.decided(known[0.97], 4)
+    assert [rule.decided(known[0.97], columns, several=True) for columns in (4, 5, 10)] == [False, False, True]
+
+
+def test_touches_left_out_are_rehearsed_behind_another_of_their_material():
+    """Four touches of material 0 and one of 1, two moments; one of 0 too short for the second, one for both."""
+    short = [np.nan] * 2
+    likely = np.array([[0.6, 0.8], [0.3, 0.9], [0.5, np.nan], short, [0.1, 0.1]])
+    chances = np.stack([likely, 1 - likely], axis=2)
+    novelty = np.array([[0.0, 1.0], [2.0, 0.5], [1.0, np.nan], short, [0.0, 0.0]])
+    dependence = Dependence(0.5, 0.0)
+    pairs, known = in_pairs(Rehearsal(chances, novelty, np.array([0, 0, 0, 0, 1])), np.array([1.0, 2.0]), dependence)
+    assert pairs.targets.tolist() == [0, 0, 0]
+    for row, (first, second) in enumerate([(chances[0, 1], 1), (chances[1, 1], 2), (chances[2, 0], 0)]):
+        expected = dependence.probability([first, chances[second, 0]])
+        np.testing.assert_array_equal(pairs.chances[row, 0], expected)
+    assert np.isnan(pairs.chances[1, 1]).all() and np.isnan(pairs.novelty[1, 1]) and not known[1, 1]
+    np.testing.assert_allclose(pairs.novelty[0], [(1.0 + 2.0) / np.sqrt(2), (1.0 + 0.5) / np.sqrt(2)])
+    assert known[0].tolist() == [False, True]  # 2.1 of a usual (2 + 1) / 2, and 1.1 of (2 + 2) / 2
+
+
+def test_touches_that_err_alike_take_more_to_be_decided_together(learner):
+    for risk in (0.2, 0.05, 0.01):
+        rule = rule_of(learner, risk)
+        assert rule.sure <= rule.together <= 1
+    rng = np.random.default_rng(2)
+    names, odd = np.repeat(np.arange(20), 4), np.repeat(rng.random(20) < 0.15, 4)  # whole materials that mislead
+    right = np.where(odd, 0.3, 0.8)[:, None] + rng.uniform(-0.1, 0.1, (80, 3))
+    chances = np.zeros((80, 3, 20))
+    chances[np.arange(80), :, names], chances[np.arange(80), :, (names + 1) % 20] = right, 1 - right
+    alone = Rehearsal(chances, np.zeros((80, 3)), names)
+    pairs, known = in_pairs(alone, np.ones(3), Dependence(0.0, 0.0))
+    assert known.all()
+    levels = [
+        least_sure(of.chances.max(axis=2), of.chances.argmax(axis=2) == of.targets[:, None], 0.1)
+        for of in (alone, pairs)
+    ]
+    assert levels[1] > levels[0]
 
 
 def test_the_least_probability_keeps_the_risk_of_calibrated_answers():

@@ -149,6 +149,22 @@ def test_touches_that_somebody_else_begins_and_ends():
     assert answers[-1]["event"] == "ended" and answers[-1]["end"] == "end"
 
 
+def test_touches_of_one_thing_add_up():
+    made, answers, _ = bridge(contact="manual")
+    rows = ROWS[slice(*PLACES[1])]
+    parts = [rows[:40], rows[10:40]]
+    with pytest.raises(errors.InputError, match="between two touches"):
+        made.again()
+    for i, part in enumerate(parts):
+        made.begin()
+        run(made, part, start=2000.0 + 10 * i)
+        made.end()
+        assert "adds up" in made.again()
+    one, two = [answer for answer in answers if answer["event"] == "ended"]
+    assert (one["touches"], two["touches"]) == (1, 2)
+    assert two["probability"] == learner().predict(*parts).probability
+
+
 def test_pictures_are_readings_of_a_camera():
 
     @dataclass

@@ -125,7 +125,8 @@ def test_learning_by_services_and_by_the_parameter(spinning, learner):
     arm = spinning.node("arm")
     assert "ros2 param set /scroll_tactile material NAME" in spinning.call(arm, "/scroll_tactile/learn").message
     node.set_parameters([rclpy.Parameter("material", value="felt")])
-    assert "none has ended" in spinning.call(arm, "/scroll_tactile/learn").message
+    for service in ("learn", "again"):
+        assert "none has ended" in spinning.call(arm, f"/scroll_tactile/{service}").message
     feed(served, shift("a")[0])
     reply = spinning.call(arm, "/scroll_tactile/learn")
     assert reply.success and reply.message.startswith("felt: ")
@@ -145,6 +146,7 @@ def test_a_touch_between_the_services_begin_and_end(spinning, learner):
     feed(served, rows[slice(*place)])
     reply = spinning.call(node, "/scroll_tactile/end")
     assert reply.success and reply.message.endswith(": b")
+    assert spinning.call(node, "/scroll_tactile/again").success
 
 
 def test_diagnostics_say_what_was_met(spinning, learner):

@@ -9,6 +9,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import refused
 from live_touches import shift
@@ -16,6 +17,7 @@ from robot import TOPIC, taught
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner, errors
+from scroll_tactile.recordings import read
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -258,3 +260,27 @@ def set_material(spinning, node, name):
 def test_a_memory_that_is_not_there(tmp_path):
     said = refused("ros2", "--memory", tmp_path / "none", "--topic", TOPIC, "--field", "position")
     assert "there is no memory" in said
+
+
+def test_messages_that_a_node_serialized_are_read_from_a_bag(tmp_path):
+    """Lists of any lengths, empty ones among them; the truth is what was put into the messages."""
+    from rclpy.serialization import serialize_message
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    random = np.random.default_rng(4)
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/JointState"
+    truth = []
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joints", kind, typestore=store)
+        for i in range(60):
+            names = ["x" * length for length in random.integers(0, 9, random.integers(0, 4)).tolist()]
+            lists = [random.standard_normal(count).tolist() for count in (2, *random.integers(0, 3, 2).tolist())]
+            message = JointState(name=names, position=lists[0], velocity=lists[1], effort=lists[2])
+            message.header.stamp.sec, message.header.frame_id = 100 + i, "f" * (i % 9)
+            writer.write(connection, 10**9 * i, serialize_message(message))
+            truth.append(lists[0])
+    recording = read(tmp_path / "bag", topic="/joints", field="position")
+    assert recording.readings.tolist() == truth
+    assert recording.times.tolist() == [100.0 + i for i in range(60)]
+    assert not recording.report.notes

@@ -144,9 +144,9 @@ def ros2(
     """Send BioTac's readings at 100 Hz from another process to the ROS 2 node."""
     require_folders(json)
     with progress_bar() as progress:
-        record = run_node(seconds, note=lambda what: progress(what, 0, 1))
-    show_node(record)
-    _written(context, json, {"records": [record]})
+        result = run_node(seconds, note=lambda what: progress(what, 0, 1))
+    show_node(result)
+    _written(context, json, result)
 
 
 @app.command()

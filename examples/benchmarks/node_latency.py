@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from examples.benchmarks.timing import circumstances
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.cli.terminal import console
 from scroll_tactile.datasets.shift import simulated_shift
@@ -37,8 +38,9 @@ WAITED = 60.0  # seconds for what is still to come
 
 
 def run_node(seconds: float, note: Callable[[str], None]) -> Record:
-    """The record of so many seconds. Raises RecordingError without rclpy, InputError where nothing came."""
+    """The result of so many seconds. Raises RecordingError without rclpy, InputError where nothing came."""
     require_rclpy()
+    result = {"bench": "ros2", **circumstances(SCENE.seed)}
     os.environ.setdefault("ROS_DOMAIN_ID", str(10 + os.getpid() % 90))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     note("learning")
@@ -56,7 +58,7 @@ def run_node(seconds: float, note: Callable[[str], None]) -> Record:
     if publisher.returncode or not latencies:
         raise InputError(f"the publisher ended with {publisher.returncode}, and {len(latencies)} readings came")
     taken = 1e3 * np.array(latencies)
-    return {
+    record = {
         "case": "simulated biotac at 100 Hz, Fast DDS",
         "readings": count,
         "lost": count - int(status["readings"]),
@@ -66,6 +68,7 @@ def run_node(seconds: float, note: Callable[[str], None]) -> Record:
         "max_milliseconds": float(taken.max()),
         "to_reach": TO_REACH,
     }
+    return result | {"records": [record]}
 
 
 class _Timed(TactileNode):
@@ -99,8 +102,9 @@ def _received(learner: TactileLearner, count: int) -> tuple[list[float], Mapping
         rclpy.try_shutdown(context=context)
 
 
-def show_node(record: Record) -> None:
-    """A table of the record."""
+def show_node(result: Record) -> None:
+    """A table of the result."""
+    [record] = result["records"]
     table = Table(title="BioTac's 19 electrodes at 100 Hz from another process, from publish to state")
     for heading in ("readings", "lost", "touches", "ms, median", "p99", "longest"):
         table.add_column(heading, justify="right")

@@ -180,7 +180,8 @@ class LiveSession:
         What the touches say adds up, as in `learner.predict(first, second, …)`, from the next one's first prediction
         on; a third adds up where again() is called once more. It is used up by the touch that begins next, and without
         it a touch counts by itself. Contacts too brief for a touch, gaps and steps back in time change nothing of it.
-        Of more than eight touches of one thing the last eight count, so that what a session holds is bounded.
+        Of more than eight touches of one thing the last eight count, so that what a session holds is bounded. One that
+        was observed meanwhile speaks for what it was observed as.
 
         Raises InputError before any touch, and after `close`.
         """
@@ -287,7 +288,9 @@ class LiveSession:
 
     def _leave(self, touch: _Touch | None) -> None:
         """What seemed a touch was none: the next is of what it would have been of, and that may be nothing known."""
-        self._under_way, self._again = None, bool(touch and touch.earlier)
+        self._under_way = None
+        if touch is not None:
+            self._again = bool(touch.earlier)
 
     def _rule(self, model: Model) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; once for each model."""

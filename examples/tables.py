@@ -39,11 +39,11 @@ MARK = re.compile(r"<!-- table: (\S+) -->\n(.*?)<!-- (/?)table", re.DOTALL)
 LOOKUP = re.compile(r"\{(\??)([^{}]*)\}")
 
 
-def _spread(found: Mapping[str, float], scale: float = 100.0, digits: int = 1) -> str:
+def _spread(found: Mapping[str, Any], scale: float = 100.0, digits: int = 1) -> str:
     """A mean, and behind ± its standard deviation, or error, where more than one fold was measured."""
     mean = f"{scale * found['mean']:.{digits}f}"
     spread = found["sd"] if "sd" in found else found["error"]
-    return mean if found.get("folds") == 1 else f"{mean} ± {scale * spread:.{digits}f}"
+    return mean if spread is None or found.get("folds") == 1 else f"{mean} ± {scale * spread:.{digits}f}"
 
 
 STEPS: dict[str, Callable[[Any], Any]] = {

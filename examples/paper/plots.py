@@ -62,7 +62,7 @@ def draw_efficiency(path: Path, curves: Rows) -> None:
             mine = [curve for curve in curves if curve["dataset"] == dataset]
             for panel, by in ((left, "epochs"), (right, "streams")):
                 for curve in (curve for curve in mine if curve["by"] == by):
-                    place, mean, spread = np.asarray(curve["points"], dtype=float).T
+                    place, mean, spread = np.nan_to_num(np.asarray(curve["points"], dtype=float)).T
                     panel.errorbar(place, 100 * mean, 100 * spread, marker=".", capsize=2, label=curve["system"])
                 panel.grid(alpha=0.3)
                 if panel.get_legend_handles_labels()[0]:
@@ -89,7 +89,7 @@ def draw_transfer(path: Path, rows: Rows) -> None:
             mine = [row for row in rows if row["dataset"] == dataset]
             for row in mine:
                 means = [100 * point["mean"] for point in row["points"].values()]
-                spreads = [100 * point["sd"] for point in row["points"].values()]
+                spreads = [100 * (point["sd"] or 0) for point in row["points"].values()]
                 counts = [int(count) for count in row["points"]]
                 panel.errorbar(counts, means, spreads, marker=".", capsize=2, label=row["system"])
             panel.set(xlabel="touches of each material", ylabel="accuracy on the test, %", title=dataset)
@@ -113,7 +113,7 @@ def robustness_curves(rows: Rows) -> dict[str, dict[tuple[str, bool], list[tuple
     found: dict[str, dict[tuple[str, bool], list[tuple[float, float, float]]]] = {}
     for row in sorted(rows, key=lambda row: row["strength"]):
         lines = found.setdefault(row["study"], {})
-        lines.setdefault((row["system"], row["augmented"]), []).append((row["strength"], row["mean"], row["sd"]))
+        lines.setdefault((row["system"], row["augmented"]), []).append((row["strength"], row["mean"], row["sd"] or 0.0))
     return {study: found[study] for study in LABELS if study in found}
 
 

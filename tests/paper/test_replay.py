@@ -56,6 +56,6 @@ class TestReplay:
 
     def test_a_summary_leaves_out_what_was_not_measured(self) -> None:
         folds = [{"accuracy": 0.5, "first": None}, {"accuracy": 1.0, "first": 0.2}]
-        names = ("half", "twice", "calibration_error", "false_alarms", "novelty_auroc")
+        names = ("half", "twice", "calibration_error", "false_alarms", "wrong_known", "novelty_auroc")
         means = summary([fold | dict.fromkeys(names) for fold in folds])
-        assert means == {"accuracy": {"mean": 0.75, "sd": pytest.approx(math.sqrt(0.125))}}
+        assert means == {"accuracy": {"mean": 0.75, "sd": pytest.approx(math.sqrt(0.125)), "folds": 2}}

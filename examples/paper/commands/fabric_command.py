@@ -19,6 +19,7 @@ from examples.paper.commands.sets import (
     parse_folds,
     read,
     require_folders,
+    with_spread,
     write_result,
 )
 from examples.paper.fabric import objects
@@ -168,34 +169,32 @@ def gelsight(
 
 
 def _show_objects(means: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
-    def shown(figure: Mapping[str, float] | None) -> str:
-        return "" if figure is None else f"{percent(figure['mean'])} ({percent(figure['sd'])})"
-
     counts, network = means.get("known, counts", {}), means.get("known, network", {})
     head = ("counts", "network", "trees")
-    table = Table("GelSight, objects that were touched", *head, title="right by video (sd over folds)")
-    table.add_row("frames together", *map(shown, (counts.get("video"), network.get("video"), counts.get("trees"))))
+    table = Table("GelSight, objects that were touched", *head, title="right by video (± sd over folds)")
     table.add_row(
-        "majority of frames", *map(shown, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
+        "frames together", *map(with_spread, (counts.get("video"), network.get("video"), counts.get("trees")))
     )
-    table.add_row("a single frame", *map(shown, (counts.get("frame"), network.get("frame"), None)))
+    table.add_row(
+        "majority of frames", *map(with_spread, (counts.get("vote"), network.get("vote"), counts.get("trees' vote")))
+    )
+    table.add_row("a single frame", *map(with_spread, (counts.get("frame"), network.get("frame"), None)))
     console().print(table)
     new = means.get("never touched", {})
     table = Table(
         "GelSight, objects never touched", "heads", "compose", "trees", "always the commonest", title="right by video"
     )
     for name in physiclear.ATTRIBUTES:
-        table.add_row(name, *(shown(new.get(name + what)) for what in ("", ", composed", ", trees", ", always")))
+        table.add_row(name, *(with_spread(new.get(name + what)) for what in ("", ", composed", ", trees", ", always")))
     console().print(table)
 
 
 def _show_letters(results: Sequence[Mapping[str, Any]]) -> None:
     means = summary(results)
-    table = Table("figure", *means, title="letter-spike, mean over touches (sd over folds or groups of letters)")
+    table = Table("figure", *means, title="letter-spike, mean over touches (± sd over folds or groups of letters)")
     for name in FIGURES:
         cells = [means[kind].get(name) for kind in means]
-        shown = [percent(cell["mean"]) + f" ({percent(cell['sd'])})" if cell else "" for cell in cells]
-        table.add_row(_LABELS[name], *shown)
+        table.add_row(_LABELS[name], *map(with_spread, cells))
     console().print(table)
     dots = Table("dot", "there", *(f"{kind}: {what}" for kind in means for what in ("correct", "precision", "recall")))
     for dot in DOTS:

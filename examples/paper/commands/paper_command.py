@@ -35,7 +35,7 @@ from examples.paper.commands.options import (
     read_sets,
     say_conditions,
 )
-from examples.paper.commands.sets import draw_into, require_folders
+from examples.paper.commands.sets import draw_into, require_folders, with_spread
 from examples.paper.commands.strengths_command import StudyChoice, strengths
 from examples.paper.plots import draw_activation, draw_efficiency
 from examples.paper.runs.study import SystemStudy
@@ -221,7 +221,7 @@ def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: SystemS
         table.add_row(
             row["system"],
             "" if paper is None else percent(paper),
-            percent(figures["mean"]) + (f" ± {100 * figures['sd']:.1f}" if figures["folds"] > 1 else "") + vote,
+            with_spread(figures) + vote,
             "" if apart is None else f"{100 * apart:+.1f}",
             str(figures["folds"]),
             f"{figures['seconds']:.0f}",

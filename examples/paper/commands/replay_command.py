@@ -20,6 +20,7 @@ from examples.paper.commands.sets import (
     parse_folds,
     read,
     require_folders,
+    with_spread,
     write_result,
 )
 from examples.paper.studies.replay import FIGURES, PUBLISHED, Replay, subset, summary
@@ -54,6 +55,7 @@ _LABELS = {
     "twice": "… trained on half streams",
     "calibration_error": "expected calibration error, 15 bins",
     "false_alarms": "known touches called unknown",
+    "wrong_known": "touches taken for another, and called known",
     "novelty_auroc": "novelty AUROC, 4 of 20 materials held out",
 }
 
@@ -110,18 +112,16 @@ def replay(
 def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], *, compared: bool) -> None:
     means = summary(results)
     count = "1 fold" if len(results) == 1 else f"{len(results)} folds"
-    table = Table("figure", "mean", "sd over folds", title=f"{recordings.name}, one pass, {count}")
+    table = Table("figure", "mean ± sd over folds", title=f"{recordings.name}, one pass, {count}")
     for name in FIGURES:
         if name in means:
-            mean, spread = means[name]["mean"], means[name]["sd"]
-            areas = name in ("novelty_auroc", "calibration_error")
-            shown = (f"{mean:.4f}", f"{spread:.4f}") if areas else (percent(mean), percent(spread))
-            table.add_row(_LABELS[name], shown[0], shown[1] if len(results) > 1 else "")
+            share = name not in ("novelty_auroc", "calibration_error")
+            table.add_row(_LABELS[name], with_spread(means[name], share=share))
     if compared and recordings.name in PUBLISHED:
         ridge, tuned = PUBLISHED[recordings.name]
         table.add_section()
-        table.add_row("published: ridge on a frozen vision model", percent(ridge), "")
-        table.add_row("published: ResNet fine-tuned offline", percent(tuned), "")
+        table.add_row("published: ridge on a frozen vision model", percent(ridge))
+        table.add_row("published: ResNet fine-tuned offline", percent(tuned))
     console().print(table)
     for result in results:
         same = "[green]yes[/]" if result["equals_offline"] else "[red]no[/]"

@@ -19,6 +19,7 @@ from examples.paper.commands.sets import (
     parse_folds,
     read,
     require_folders,
+    with_spread,
     write_result,
 )
 from examples.paper.studies.default_learner import Answering, Checkout, answers
@@ -111,10 +112,8 @@ def _show(name: str, folds: str, sides: Mapping[str, Mapping[str, Any]]) -> None
             if "novelty_auroc" in figures:
                 cells += [f"AUROC {figures['novelty_auroc']['mean']:.4f}", "", ""]
                 continue
-            share = figures["accuracy"]
-            spread = f" ± {100 * share['sd']:.1f}" if share["folds"] > 1 else ""
             error, known = figures["calibration_error"]["mean"], figures["known"]["mean"]
-            cells += [percent(share["mean"]) + spread, f"{error:.3f}", percent(known)]
+            cells += [with_spread(figures["accuracy"]), f"{error:.3f}", percent(known)]
         table.add_row(row, *cells)
     console().print(table)
 

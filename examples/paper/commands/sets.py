@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from examples.paper import drawing
 from scroll_tactile import __version__
-from scroll_tactile.cli.terminal import say
+from scroll_tactile.cli.terminal import percent, say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
@@ -31,6 +31,7 @@ __all__ = [
     "parse_folds",
     "read",
     "require_folders",
+    "with_spread",
     "write_result",
 ]
 
@@ -101,6 +102,16 @@ def command_line(*words: str, **options: Any) -> str:
         # What begins with a dash would be read as an option.
         spelled += [option] if value is True else [f"{option}={text}"] if text.startswith("-") else [option, text]
     return shlex.join(spelled)
+
+
+def with_spread(figure: Mapping[str, Any] | None, *, share: bool = True) -> str:
+    """A mean, and its standard deviation over folds where there are several; empty for None. share: in percent."""
+    if figure is None:
+        return ""
+    mean, sd = figure["mean"], figure["sd"]
+    if share:
+        return percent(mean) + ("" if sd is None else f" ± {100 * sd:.1f}")
+    return f"{mean:.4f}" + ("" if sd is None else f" ± {sd:.4f}")
 
 
 def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:

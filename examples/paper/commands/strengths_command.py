@@ -38,6 +38,7 @@ from examples.paper.commands.sets import (
     parse_folds,
     read,
     require_folders,
+    with_spread,
     write_result,
 )
 from examples.paper.plots import draw_robustness
@@ -202,7 +203,7 @@ def _show(dataset: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for study in dict.fromkeys(row["study"] for row in rows):
         for strength in dict.fromkeys(row["strength"] for row in rows if row["study"] == study):
             own = [cells[study, strength, *system] for system in systems]
-            shown = [percent(row["mean"]) + (f" ± {100 * row['sd']:.1f}" if row["folds"] > 1 else "") for row in own]
+            shown = [with_spread(row) for row in own]
             mine = cells.get((study, strength, OURS, False))
             shown += _beside(dataset, PAPER.get((study, strength), {}), mine) if quoted else []
             table.add_row(study, "" if study == SESSION else f"{strength:g}", *shown)

@@ -30,6 +30,7 @@ from examples.paper.commands.sets import (
     origin,
     parse_folds,
     require_folders,
+    with_spread,
     write_result,
 )
 from examples.paper.plots import draw_transfer
@@ -191,7 +192,7 @@ def _show_tasks(
         table = Table("embedding", *counts, title=title)
         for row in mine:
             mark = " (its own)" if row["tuned on"] == item.name else ""
-            table.add_row(row["system"] + mark, *(_cell(row["points"][count]) for count in counts))
+            table.add_row(row["system"] + mark, *(with_spread(row["points"][count]) for count in counts))
         console().print(table)
     trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
     text = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
@@ -207,16 +208,12 @@ def _show_sensors(
         for row in found:
             if row["direction"] == direction:
                 points = [row["points"].get(str(count)) for count in study.counts]
-                table.add_row(row["name"], *(_cell(point) if point else "" for point in points))
+                table.add_row(row["name"], *map(with_spread, points))
         console().print(table)
     text = ", ".join(f"{item['correlation']:+.2f} in {kind} ({item['chance']:.2f})" for kind, item in agreement.items())
     say(
         f"chance: {percent(study.chance)}. Which materials feel alike, one sensor against the other: {text} (by chance)"
     )
-
-
-def _cell(point: Mapping[str, float]) -> str:
-    return f"{percent(point['mean'])} ± {100 * point['sd']:.1f}"
 
 
 def _write(

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
+from examples.paper.runs.cells import over_folds
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Maps
 from scroll_tactile.datasets import Recordings
@@ -25,7 +26,7 @@ from scroll_tactile.datasets.letter_spike import DOTS, GRID, dots_of, letter_fol
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.fabric import score, score_compositions
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["FIGURES", "Letters", "SlideTransfer", "directions", "summary"]
@@ -204,16 +205,14 @@ class SlideTransfer:
         }
 
 
-def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
     """Of each kind of part: mean over its touches, and standard deviation over its folds or groups, of each figure."""
     means: dict[str, dict[str, dict[str, float]]] = {}
     for kind in dict.fromkeys(result["part"] for result in results):
         those = [result for result in results if result["part"] == kind]
         weights = [result["tested"] for result in those]
         for name in FIGURES:
-            values = [result.get(name) for result in those]
-            if None not in values:
-                mean = float(np.average(np.array(values, dtype=np.float64), weights=weights))
-                _, spread = mean_and_spread([float(value) for value in values if value is not None])
-                means.setdefault(kind, {})[name] = {"mean": mean, "sd": spread}
+            values = [result[name] for result in those if result.get(name) is not None]
+            if len(values) == len(those):
+                means.setdefault(kind, {})[name] = over_folds([float(value) for value in values], weights)
     return means

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from examples.paper.fabric.unseen import fit_heads
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import data_digest
+from examples.paper.runs.cells import data_digest, over_folds
 from examples.paper.runs.study import weights_digest
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Frames
@@ -28,7 +28,7 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.contact import image_of
@@ -242,7 +242,7 @@ def most_often(predicted: Sequence[Any]) -> Any:
     return max(sorted(set(predicted)), key=list(predicted).count)
 
 
-def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
     """Of each kind of part: mean over its videos, and standard deviation over its folds or groups, of each figure.
 
     Figures of attributes are named as "hardness", "hardness, composed", "hardness, trees" and "hardness, always".
@@ -252,9 +252,7 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         answers = [(_flat(result), result["tested"]) for result in results if result["part"] == kind]
         weights = [tested for _, tested in answers]
         for name in answers[0][0]:
-            values = [figures[name] for figures, _ in answers]
-            _, spread = mean_and_spread(values)
-            means.setdefault(kind, {})[name] = {"mean": float(np.average(values, weights=weights)), "sd": spread}
+            means.setdefault(kind, {})[name] = over_folds([figures[name] for figures, _ in answers], weights)
     return means
 
 

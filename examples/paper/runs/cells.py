@@ -14,10 +14,22 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
+from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Cell", "Split", "data_digest", "held_back", "pooled", "require_data", "run_cells", "split", "time_left"]
+__all__ = [
+    "Cell",
+    "Split",
+    "data_digest",
+    "held_back",
+    "over_folds",
+    "pooled",
+    "require_data",
+    "run_cells",
+    "split",
+    "time_left",
+]
 
 Figures = dict[str, Any]
 
@@ -166,11 +178,12 @@ def require_data(notes: RunFile, recordings: Recordings) -> None:
         )
 
 
-def pooled(cells: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Right answers by all that were asked for, over folds that may differ in size; their standard deviation."""
-    shares = [cell["right"] / cell["tested"] for cell in cells]
-    return {
-        "mean": sum(cell["right"] for cell in cells) / sum(cell["tested"] for cell in cells),
-        "sd": float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0,
-        "folds": len(shares),
-    }
+def over_folds(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, Any]:
+    """Over folds: "mean", weighted by their sizes, "sd", the standard deviation, None of one fold, and "folds"."""
+    sd = mean_and_spread(values)[1] if len(values) > 1 else None
+    return {"mean": float(np.average(values, weights=weights)), "sd": sd, "folds": len(values)}
+
+
+def pooled(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Right answers by all that were asked for, see `over_folds`: folds may differ in size."""
+    return over_folds([cell["right"] / cell["tested"] for cell in cells], [cell["tested"] for cell in cells])

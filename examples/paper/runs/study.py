@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
-from examples.paper.systems.catalogue import NEED_WEIGHTS, SYSTEMS, Catalogue
+from examples.paper.systems.catalogue import CONTROLS, NEED_WEIGHTS, SYSTEMS, Catalogue
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import require_device
@@ -23,9 +23,10 @@ from scroll_tactile.sensors import Sensor
 
 __all__ = ["NOT_OF_FRAMES", "SystemStudy", "columns_averaged", "weights_digest"]
 
-NOT_OF_FRAMES = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda")
-"""What is not run on a camera's frames: systems of streams, for which the paper has no figure there, and ours of two
-embeddings, for `Frames` with a network is one."""
+_OF_STREAMS = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda", "conv1d-lda")
+NOT_OF_FRAMES = (*_OF_STREAMS, *CONTROLS)
+"""What is not run on a camera's frames: systems of streams, for which the paper has no figure there, ours of two
+embeddings, for `Frames` with a network is one, and the controls."""
 
 QUICK_COLUMNS = 50  # about, of the residual networks' images in a quick run
 QUICK_EVERY = 2  # of the recordings that are learned in a quick run

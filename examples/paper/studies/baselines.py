@@ -10,7 +10,7 @@ import numpy as np
 
 from examples.paper.runs.cells import held_back
 from examples.paper.studies.strengths_study import Make, Progress
-from examples.paper.systems.catalogue import EPOCHAL, OURS, SYSTEMS, Catalogue
+from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, OURS, SYSTEMS, Catalogue
 from examples.paper.systems.system_protocol import System
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
@@ -18,7 +18,7 @@ from scroll_tactile.signals.augmentation import Augmentation, Change
 
 __all__ = ["BASELINES", "COPIES", "STRONG", "Sometimes", "baseline"]
 
-BASELINES = tuple(key for key in SYSTEMS if key not in OURS and not key.startswith("least-squares"))
+BASELINES = tuple(key for key in SYSTEMS if key not in (*OURS, *CONTROLS) and not key.startswith("least-squares"))
 """Keys of the catalogue that classify touches of any length and speed."""
 
 

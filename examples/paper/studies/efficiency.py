@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.cells import Cell, Figures, Split
+from examples.paper.runs.cells import Cell, Figures, Split, over_folds
 from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import EPOCHAL, SYSTEMS
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy
 
 __all__ = ["STREAMS", "Efficiency", "curves", "first_touches"]
 
@@ -81,8 +81,9 @@ def curves(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     for dataset, key in dict.fromkeys((cell.dataset, cell.system) for cell, _ in results):
         cells = [figures for cell, figures in results if (cell.dataset, cell.system) == (dataset, key)]
         points = [
-            [column[0][0], *mean_and_spread([share for _, share in column])]
+            [column[0][0], figure["mean"], figure["sd"]]
             for column in zip(*(cell["points"] for cell in cells), strict=True)
+            for figure in [over_folds([share for _, share in column])]
         ]
         found.append(
             {"dataset": dataset, "key": key, "system": SYSTEMS[key], "by": cells[0]["by"], "folds": len(cells)}

@@ -12,25 +12,27 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.runs.cells import over_folds
 from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, hold_out, observe_all
-from scroll_tactile.pipelines.metrics import calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
+from scroll_tactile.settings import Settings
 
 __all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "novelty_area", "rotations", "subset", "summary"]
 
 Progress = Callable[[str, int, int], object]
 """Receives (what is being done, steps done, steps in all)."""
 
-FIGURES = ("accuracy", "first", "half", "twice", "calibration_error", "false_alarms", "novelty_auroc")
+FIGURES = ("accuracy", "first", "half", "twice", "calibration_error", "false_alarms", "wrong_known", "novelty_auroc")
 """Of each fold: accuracy after the last material; from the first 0.3 s; of half streams after learning full ones;
-of full streams after learning half ones; expected calibration error; the share of known touches called unknown;
-AUROC of novelty with a fifth of the materials held out."""
+of full streams after learning half ones; expected calibration error; the shares of known touches called unknown,
+and of touches taken for another material and called known; AUROC of novelty with a fifth of the materials held out."""
 
 PUBLISHED = {"BioTac-20": (0.938, 0.989), "RoboSkin-20": (0.848, 0.960)}
 """The paper's accuracies: ridge on its frozen vision model, and a pre-trained ResNet fine-tuned offline."""
@@ -65,8 +67,9 @@ class Replay:
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
         options = ("schedule", "seed", "readout", "blocked", "novelty", "features")
+        asked = {"false_alarms_asked": Settings().false_alarms}
         size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        return {"run": "replay", "dataset": self.recordings.name, **size} | {
+        return {"run": "replay", "dataset": self.recordings.name, **size, **asked} | {
             name: getattr(self, name) for name in options
         }
 
@@ -135,12 +138,14 @@ class _ReplayFold:
         self.progress("testing", 2, 3)
         half = evaluate(learner, [(name, stream.first(stream.seconds / 2)) for name, stream in self.test])
         self.progress("testing", 3, 3)
+        answers = zip(whole.truth, whole.predictions, strict=True)
         return {
             "accuracy": whole.accuracy,
             "first": first.accuracy,
             "half": half.accuracy,
             "calibration_error": _calibration_error(whole),
             "false_alarms": float(np.mean([not prediction.known for prediction in whole.predictions])),
+            "wrong_known": float(np.mean([given.known and given.material != name for name, given in answers])),
             "confusions": whole.confusions(),
         }
 
@@ -199,14 +204,13 @@ def _calibration_error(answers: Answers) -> float:
     return calibration_error([prediction.probability for prediction in answers.predictions], right)
 
 
-def summary(folds: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Mean and standard deviation over the folds of each figure that all of them have."""
+def summary(folds: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Mean and standard deviation over the folds, see `over_folds`, of each figure that all of them have."""
     means = {}
     for name in FIGURES:
         values = [fold[name] for fold in folds]
         if values and None not in values:
-            mean, spread = mean_and_spread(values)
-            means[name] = {"mean": mean, "sd": spread}
+            means[name] = over_folds(values)
     return means
 
 

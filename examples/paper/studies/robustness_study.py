@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.cells import require_data
+from examples.paper.runs.cells import over_folds, require_data
 from examples.paper.studies.default_learner import Answering, Answers, answers
 from examples.paper.studies.replay import novelty_area, rotations
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error
 from scroll_tactile.pipelines.robustness import dead, drift, gaussian, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
@@ -241,7 +241,6 @@ def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         own = [record for record in records if (record["side"], record["row"]) == (side, row)]
         for figure in FIGURES:
             if figure in own[0]:
-                mean, spread = mean_and_spread([record[figure] for record in own])
                 means = found.setdefault(side, {}).setdefault(row, {})
-                means[figure] = {"mean": mean, "sd": spread, "folds": len(own)}
+                means[figure] = over_folds([record[figure] for record in own])
     return found

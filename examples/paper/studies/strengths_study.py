@@ -18,12 +18,12 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from examples.paper.runs.cells import require_data
+from examples.paper.runs.cells import over_folds, require_data
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
-from scroll_tactile.pipelines.metrics import accuracy, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
@@ -240,7 +240,6 @@ def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         groups.setdefault(cell, []).append(record["accuracy"])
     rows = []
     for (study, strength, system, augmented), values in groups.items():
-        mean, spread = mean_and_spread(values)
         about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
-        rows.append(about | {"mean": mean, "sd": spread, "folds": len(values)})
+        rows.append(about | over_folds(values))
     return rows

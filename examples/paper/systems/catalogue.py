@@ -10,6 +10,8 @@ from functools import cached_property
 from torch import nn
 
 from examples.paper.runs.cached import Cached
+from examples.paper.studies.peers import StreamingLDA
+from examples.paper.systems.controls import NearestNeighbour, OnFeatures, random_conv1d
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
@@ -26,7 +28,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.augmentation import Augmentation
 
-__all__ = ["EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue"]
+__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue"]
 
 SYSTEMS = {
     "svm": "SVM",
@@ -43,10 +45,15 @@ SYSTEMS = {
     "vision-lda": "ours, vision, LDA",
     "kernels+vision-ridge": "ours, kernels+vision, ridge",
     "kernels+vision-lda": "ours, kernels+vision, LDA",
+    "conv1d-lda": "ours, random untrained Conv1d, LDA",
+    "neighbour": "nearest neighbour, kernels",
+    "streaming-lda": "streaming LDA, kernels",
 }
 """Key, as on the command line → name, as in tables."""
 
 OURS = tuple(key for key, name in SYSTEMS.items() if name.startswith("ours"))
+CONTROLS = ("neighbour", "streaming-lda")
+"""Plain rules on the features of ours."""
 EPOCHAL = ("conv-lstm", "snn", "resnet", "resnet-pretrained")
 """Those that are trained over epochs."""
 NEED_WEIGHTS = tuple(key for key in SYSTEMS if "vision" in key or key in ("least-squares", "resnet-pretrained"))
@@ -98,6 +105,8 @@ class Catalogue:
             "least-squares-random": lambda: self._random_squares,
             "resnet": lambda: self._residual(key, self._new),
             "resnet-pretrained": lambda: self._residual(key, self._pretrained),
+            "neighbour": lambda: OnFeatures(SYSTEMS[key], self._kernels, NearestNeighbour),
+            "streaming-lda": lambda: OnFeatures(SYSTEMS[key], self._kernels, StreamingLDA),
         }
         return makers[key]()
 
@@ -136,6 +145,7 @@ class Catalogue:
             "kernels": lambda: self._kernels,
             "vision": lambda: self._vision,
             "kernels+vision": lambda: self._both,
+            "conv1d": lambda: self._random_conv1d,
         }
         return OnePass(SYSTEMS[key], frozen[embedding](), name)
 
@@ -147,6 +157,10 @@ class Catalogue:
     def _vision(self) -> Embedding:
         assert self.weights is not None
         return Cached(Frames(self.weights, rest=None) if self.camera else Vision(self.weights))
+
+    @cached_property
+    def _random_conv1d(self) -> Embedding:
+        return Cached(random_conv1d(self.seed))
 
     @cached_property
     def _both(self) -> Embedding:

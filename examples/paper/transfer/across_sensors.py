@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
+from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells
 from examples.paper.studies.peers import touch_features
 from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
@@ -25,7 +25,6 @@ from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.stream import Stream
 
@@ -235,11 +234,11 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     for (direction, way), own in shares.items():
         points = {}
         for count, values in own.items():
-            mean, spread = mean_and_spread(values)
-            point: dict[str, float | None] = {"mean": mean, "sd": spread, "gain": None, "gain sd": None}
+            point = over_folds(values) | {"gain": None, "gain sd": None}
             alone = shares.get((direction, ALONE), {}).get(count, [])
             if len(alone) == len(values):
-                point["gain"], point["gain sd"] = mean_and_spread(np.subtract(values, alone).tolist())
+                gain = over_folds(np.subtract(values, alone).tolist())
+                point |= {"gain": gain["mean"], "gain sd": gain["sd"]}
             points[count] = point
         found.append({"direction": direction, "way": way, "name": WAYS[way], "points": points})
     return found

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, require_data, run_cells, split
+from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells, split
 from examples.paper.runs.study import weights_digest
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.networks import ResNetClassifier
@@ -27,7 +27,6 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.image import tactile_image
 
@@ -260,11 +259,11 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     for (dataset, system), own in shares.items():
         points = {}
         for count, values in own.items():
-            mean, spread = mean_and_spread(values)
-            point: dict[str, float | None] = {"mean": mean, "sd": spread, "gain": None, "gain sd": None}
+            point = over_folds(values) | {"gain": None, "gain sd": None}
             plain = shares.get((dataset, "vision"), {}).get(count, [])
             if len(plain) == len(values):
-                point["gain"], point["gain sd"] = mean_and_spread(np.subtract(values, plain).tolist())
+                gain = over_folds(np.subtract(values, plain).tolist())
+                point |= {"gain": gain["mean"], "gain sd": gain["sd"]}
             points[count] = point
         tuned = system.removeprefix(TUNED) if system.startswith(TUNED) else None
         found.append({"dataset": dataset, "system": system, "tuned on": tuned, "points": points})

@@ -38,6 +38,7 @@ SHOWN = {
     "quickstart": "known False",
     "own_sensor": "right: 3 of 3",
     "own_embedding": "right: 5 of 5",
+    "own_system": "NearestMean: right",
     "camera": "refused: expected frames",
     "live": "10 of 10 touches found",
     "fleet": "the bytes of one process: True",

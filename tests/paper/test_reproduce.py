@@ -178,6 +178,33 @@ class TestCommand:
         assert first["difference"] == pytest.approx(first["mean"] - 0.942)
         assert "epochs 6 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")
 
+    def test_ones_own_stand_in_the_table_and_in_the_noted_command(self, tmp_path: Path):
+        own = ("--system", "examples.own_system:NearestMean", "--embedding", "examples.own_system:Strengths")
+        words = (
+            "table1",
+            "--data",
+            tmp_path,
+            "--systems",
+            "svm-spikes",
+            *own,
+            "--quick",
+            "--json",
+            tmp_path / "a.json",
+        )
+        result = run(*words)
+        assert result.exit_code == 0, result.output
+        kept = json.loads((tmp_path / "a.json").read_text())
+        keys = ["svm-spikes", own[1], f"{own[3]}-lda"]
+        assert [row["key"] for row in kept["rows"]] == keys
+        assert f"--systems {','.join(keys)} " in kept["command"]
+        noted = kept["command"].split()[3:]
+        again = run(*[tmp_path if word == "DATA" else word for word in noted], "--json", tmp_path / "b.json")
+        assert again.exit_code == 0, again.output
+        assert untimed(json.loads((tmp_path / "b.json").read_text())["rows"]) == untimed(kept["rows"])
+        assert "no Missing" in refused("table1", "--data", tmp_path, "--system", "examples.own_system:Missing")
+        robust = run("strengths", "dead", "--data", tmp_path, "--quick", "--systems", own[1])
+        assert robust.exit_code == 0, robust.output
+
     @pytest.mark.parametrize(
         ("words", "message"),
         [

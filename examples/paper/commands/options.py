@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from examples.paper.runs.cells import Cell, Figures
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import blocked
 from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
+from examples.paper.systems.own import is_own, require_own
 from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.biotac_slide import load
@@ -31,8 +32,10 @@ __all__ = [
     "choose_systems",
     "close",
     "machine",
+    "own_keys",
     "read_sets",
     "say_conditions",
+    "spelled",
 ]
 
 
@@ -66,6 +69,12 @@ Weights = Annotated[
 ]
 Sets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(SETS)}.")]
 Systems = Annotated[str | None, typer.Option(help=f"Which systems, of {', '.join(SYSTEMS)}.")]
+OwnSystems = Annotated[
+    list[str] | None, typer.Option("--system", help="One's own, as module:factory, see examples/own_system.py; again.")
+]
+OwnEmbeddings = Annotated[
+    list[str] | None, typer.Option("--embedding", help="Ours on an embedding of one's own, as module:factory; again.")
+]
 Folds = Annotated[str | None, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Of the networks' training.")]
 Where = Annotated[Device, typer.Option(help="Where networks are trained.")]
@@ -85,10 +94,30 @@ Plot = Annotated[Path | None, typer.Option(help="Draw the figure into this file.
 FewMaterials = Annotated[int, typer.Option("--materials", hidden=True, min=2)]
 
 
-def choose_systems(asked: str | None, usual: Sequence[str], weights: str | None) -> tuple[str, ...]:
-    """The systems of --systems; without it all that can be made, and a word on the others."""
-    if asked is not None:
-        return named("--systems", asked, SYSTEMS)  # before anything is read
+def own_keys(systems: Sequence[str] | None, embeddings: Sequence[str] | None) -> tuple[str, ...]:
+    """The keys of --system and --embedding. Raises InputError where one makes no system, or no embedding."""
+    keys = (*(systems or ()), *(f"{spelled}-lda" for spelled in embeddings or ()))
+    for key in keys:
+        require_own(key)
+    return keys
+
+
+def spelled(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
+    """The systems that an option asks for, with commas between, one's own among them. Raises InputError for others."""
+    parts = dict.fromkeys(part.strip() for part in asked.split(","))
+    own = own_keys([part for part in parts if is_own(part)], None)
+    if len(own) == len(parts):
+        return own
+    return (*named(option, ",".join(part for part in parts if part not in own), known), *own)
+
+
+def choose_systems(
+    asked: str | None, usual: Sequence[str], weights: str | None, own: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """The systems of --systems, and one's own; without either all that can be made, and a word on the others."""
+    keys = (*(() if asked is None else spelled("--systems", asked, SYSTEMS)), *own)  # before anything is read
+    if keys:
+        return tuple(dict.fromkeys(keys))
     return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
 
 

@@ -20,6 +20,8 @@ from examples.paper.commands.options import (
     Folds,
     InPrecision,
     Json,
+    OwnEmbeddings,
+    OwnSystems,
     Plot,
     PrecisionChoice,
     Quick,
@@ -32,6 +34,7 @@ from examples.paper.commands.options import (
     choose_folds,
     choose_systems,
     close,
+    own_keys,
     read_sets,
     say_conditions,
 )
@@ -58,6 +61,8 @@ def table1(
     weights: Weights = None,
     sets: Sets = None,
     systems: Systems = None,
+    own_systems: OwnSystems = None,
+    own_embeddings: OwnEmbeddings = None,
     folds: Folds = None,
     epochs: Epochs = None,
     device: Where = Device.CPU,
@@ -72,7 +77,7 @@ def table1(
     100 epochs, five folds: hours on a GPU, days without. --systems and --folds take parts of it, --run adds them up.
     """
     require_folders(json)
-    keys = choose_systems(systems, tuple(SYSTEMS), weights)
+    keys = choose_systems(systems, tuple(SYSTEMS), weights, own_keys(own_systems, own_embeddings))
     with progress_bar() as progress:
         progress("reading", 0, 1)
         read = read_sets(sets, tuple(SETS), data, seed, quick)
@@ -106,6 +111,8 @@ def efficiency(
     weights: Weights = None,
     sets: Sets = None,
     systems: Systems = None,
+    own_systems: OwnSystems = None,
+    own_embeddings: OwnEmbeddings = None,
     folds: Folds = None,
     epochs: Epochs = None,
     device: Where = Device.CPU,
@@ -121,7 +128,7 @@ def efficiency(
     Of the paper's figure there are curves only, no numbers; its final accuracies are those of table1.
     """
     require_folders(json, plot)
-    keys = choose_systems(systems, CURVES, weights)
+    keys = choose_systems(systems, CURVES, weights, own_keys(own_systems, own_embeddings))
     with progress_bar() as progress:
         progress("reading", 0, 1)
         read = read_sets(sets, QUICK_SETS, data, seed, quick)

@@ -21,12 +21,16 @@ from examples.paper.commands.options import (
     Folds,
     InPrecision,
     Json,
+    OwnEmbeddings,
+    OwnSystems,
     Plot,
     PrecisionChoice,
     Run,
     Seed,
     Weights,
     Where,
+    own_keys,
+    spelled,
 )
 from examples.paper.commands.sets import (
     Dataset,
@@ -84,6 +88,8 @@ def strengths(
         str, typer.Option(help=f"Which data sets, of {', '.join(Dataset)}; a picture for each.")
     ] = ",".join(QUICK_SETS),
     systems: Annotated[str, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; or all.")] = OURS,
+    own_systems: OwnSystems = None,
+    own_embeddings: OwnEmbeddings = None,
     weights: Weights = None,
     folds: Folds = "all",
     epochs: Epochs = None,
@@ -105,7 +111,7 @@ def strengths(
     """
     require_folders(json, plot)
     require_device(device.value)
-    keys = _choose(systems, weights)
+    keys = (*_choose(systems, weights), *own_keys(own_systems, own_embeddings))
     passes = epochs or (QUICK_EPOCHS if quick else 100)
     course = Course.in_proportion(passes, precision.value)
     kept: dict[str, Any] = {}
@@ -152,7 +158,7 @@ def _choose(systems: str, weights: str | None) -> tuple[str, ...]:
     """
     if systems == "all":
         return CHOICES if weights is not None else leave_out(CHOICES, NEED_WEIGHTS, "--weights")
-    keys = named("--systems", systems, CHOICES)
+    keys = spelled("--systems", systems, CHOICES)
     if weights is None and (lacking := [key for key in keys if key in NEED_WEIGHTS]):
         raise InputError(f"{', '.join(lacking)} need the weights of a trained ResNet: give --weights")
     return keys

@@ -12,6 +12,7 @@ from typing import Any
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
 from examples.paper.systems.catalogue import CONTROLS, NEED_WEIGHTS, SYSTEMS, Catalogue
 from examples.paper.systems.descent import Course, Precision
+from examples.paper.systems.own import code_digest, is_own, require_own
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import require_device
 from scroll_tactile.datasets import Recordings
@@ -21,7 +22,7 @@ from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["NOT_OF_FRAMES", "SystemStudy", "columns_averaged", "weights_digest"]
+__all__ = ["NOT_OF_FRAMES", "SystemStudy", "columns_averaged", "require_code", "weights_digest"]
 
 _OF_STREAMS = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda", "conv1d-lda")
 NOT_OF_FRAMES = (*_OF_STREAMS, *CONTROLS)
@@ -59,9 +60,13 @@ class SystemStudy:
     name = "study"
 
     def __post_init__(self) -> None:
-        strange = [key for key in self.systems if key not in SYSTEMS]
+        strange = [key for key in self.systems if key not in SYSTEMS and not is_own(key)]
         if strange or not self.systems:
-            raise InputError(f"expected systems out of {', '.join(SYSTEMS)}; came {', '.join(strange) or 'none'}")
+            raise InputError(
+                f"expected systems out of {', '.join(SYSTEMS)}, or module:factory; came {', '.join(strange) or 'none'}"
+            )
+        for key in filter(is_own, self.systems):
+            require_own(key)
         needing = [key for key in self.systems if key in NEED_WEIGHTS and self.weights is None]
         if needing:
             raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
@@ -102,6 +107,8 @@ class SystemStudy:
         """
         notes = RunFile(None if self.folder is None else self.folder / f"{self.name}.json", self.plan)
         cells = self.cells(folds)
+        for key in filter(is_own, self.systems):
+            require_code(notes, key)
         for item in self.sets:
             require_data(notes, item)
             for fold in folds[item.name]:
@@ -130,6 +137,14 @@ class SystemStudy:
         every = columns_averaged(recordings.sensor) if self.quick else 1
         camera = recordings.sensor.camera
         return Catalogue(self.weights, self.course, self.device, every, self.seed, camera=camera)
+
+
+def require_code(notes: RunFile, key: str) -> None:
+    """Note which file a system of one's own lies in. Raises InputError where the run began with another."""
+    if notes.notes.setdefault(f"code of {key}", digest := code_digest(key)) != digest:
+        raise InputError(
+            f"the run in {notes.path} was begun with another {key}: its file has changed. Take another folder"
+        )
 
 
 def columns_averaged(sensor: Sensor) -> int:

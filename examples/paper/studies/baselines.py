@@ -11,6 +11,7 @@ import numpy as np
 from examples.paper.runs.cells import held_back
 from examples.paper.studies.strengths_study import Make, Progress
 from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, OURS, SYSTEMS, Catalogue
+from examples.paper.systems.own import code_digest, is_own
 from examples.paper.systems.system_protocol import System
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
@@ -50,14 +51,14 @@ COPIES = 3
 def baseline(
     key: str, catalogue: Catalogue, seed: int = 0, augmentation: Augmentation = STRONG
 ) -> tuple[Make, dict[str, Any]]:
-    """A system of the catalogue for the studies of robustness, and what it depends on, in JSON's types.
+    """A system of the catalogue, or one's own, for the studies of robustness, and what it depends on, in JSON's types.
 
     With its augmentation a network sees each touch changed anew in every epoch, and any other system COPIES changed
     ones beside each. The validation, a tenth of each material's touches, is left as it was recorded.
 
     Raises InputError for a system that is not in BASELINES.
     """
-    if key not in BASELINES:
+    if key not in BASELINES and not is_own(key):
         raise InputError(f"expected a system out of {', '.join(BASELINES)}; came {key!r}")
 
     def make(train: Sequence[Labelled], augmented: bool, progress: Progress) -> System:
@@ -70,7 +71,8 @@ def baseline(
 
     course = {"epochs": catalogue.course.epochs, "precision": catalogue.course.precision} if key in EPOCHAL else {}
     drawn = asdict(augmentation) | ({} if key in EPOCHAL else {"copies": COPIES})
-    return make, {"augmentation": drawn, "columns": catalogue.every, "seed": seed, **course}
+    code = {"code": code_digest(key)} if is_own(key) else {}
+    return make, {"augmentation": drawn, "columns": catalogue.every, "seed": seed, **course, **code}
 
 
 def _part(train: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[Labelled]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from examples.paper.runs.cells import Cell, Figures, Split, over_folds
 from examples.paper.runs.study import SystemStudy
-from examples.paper.systems.catalogue import EPOCHAL, SYSTEMS
+from examples.paper.systems.catalogue import EPOCHAL, name_of
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.metrics import accuracy
@@ -86,7 +86,7 @@ def curves(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
             for figure in [over_folds([share for _, share in column])]
         ]
         found.append(
-            {"dataset": dataset, "key": key, "system": SYSTEMS[key], "by": cells[0]["by"], "folds": len(cells)}
+            {"dataset": dataset, "key": key, "system": name_of(key), "by": cells[0]["by"], "folds": len(cells)}
             | {"points": points, "seconds": sum(cell["seconds"] for cell in cells)}
         )
     return found

@@ -8,7 +8,7 @@ from typing import Any
 
 from examples.paper.runs.cells import Cell, Figures, pooled
 from examples.paper.runs.study import SystemStudy
-from examples.paper.systems.catalogue import SYSTEMS
+from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.datasets import Recordings
@@ -85,7 +85,7 @@ def _votes(truth: Sequence[str], predicted: Sequence[str], touch: Sequence[int])
 def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     """One row for each system: data set → accuracy over its folds, the paper's, and the difference."""
     found: list[dict[str, Any]] = []
-    for key in SYSTEMS:
+    for key in dict.fromkeys([*SYSTEMS, *(cell.system for cell, _ in results)]):
         sets: dict[str, Any] = {}
         for dataset in dict.fromkeys(cell.dataset for cell, _ in results):
             cells = [figures for cell, figures in results if (cell.system, cell.dataset) == (key, dataset)]
@@ -102,7 +102,7 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
                 asked = sum(cell["recordings"] for cell in cells)
                 sets[dataset]["vote"] = sum(cell["recordings_right"] for cell in cells) / asked
         if sets:
-            found.append({"key": key, "system": SYSTEMS[key], "sets": sets})
+            found.append({"key": key, "system": name_of(key), "sets": sets})
     return found
 
 

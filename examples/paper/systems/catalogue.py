@@ -17,6 +17,7 @@ from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
 from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
 from examples.paper.systems.one_pass import OnePass
+from examples.paper.systems.own import is_own, is_own_embedding, own_embedding, own_system
 from examples.paper.systems.spikes import encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System
@@ -28,7 +29,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.augmentation import Augmentation
 
-__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue"]
+__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue", "name_of"]
 
 SYSTEMS = {
     "svm": "SVM",
@@ -49,7 +50,7 @@ SYSTEMS = {
     "neighbour": "nearest neighbour, kernels",
     "streaming-lda": "streaming LDA, kernels",
 }
-"""Key, as on the command line → name, as in tables."""
+"""Key, as on the command line → name, as in tables; those of one's own (see `own`) are their own names."""
 
 OURS = tuple(key for key, name in SYSTEMS.items() if name.startswith("ours"))
 CONTROLS = ("neighbour", "streaming-lda")
@@ -85,9 +86,12 @@ class Catalogue:
     seed: int = 0
     augmentation: Augmentation | None = None
     camera: bool = False
+    _embeddings: dict[str, Embedding] = field(default_factory=dict, repr=False)
 
     def make(self, key: str) -> System:
         """A new system. Raises InputError for a name that is not there, or weights that are needed and not given."""
+        if is_own(key):
+            return self._own(key) if is_own_embedding(key) else own_system(key)
         if key not in SYSTEMS:
             raise InputError(f"expected a system, one of {', '.join(SYSTEMS)}; came {key!r}")
         if key in NEED_WEIGHTS and self.weights is None:
@@ -138,16 +142,21 @@ class Catalogue:
         vision = Vision(None, seed=self.seed, stages=(4,))
         return LeastSquares(SYSTEMS["least-squares-random"], vision, self.device)
 
+    def _own(self, key: str) -> OnePass:
+        spelled = key.rpartition("-")[0]
+        if spelled not in self._embeddings:
+            self._embeddings[spelled] = Cached(own_embedding(key))
+        return OnePass(key, self._embeddings[spelled], _readout(key))
+
     def _ours(self, key: str) -> OnePass:
-        embedding, _, readout = key.rpartition("-")
-        name: ReadoutName = "lda" if readout == "lda" else "ridge"
+        embedding = key.rpartition("-")[0]
         frozen: dict[str, Callable[[], Embedding]] = {
             "kernels": lambda: self._kernels,
             "vision": lambda: self._vision,
             "kernels+vision": lambda: self._both,
             "conv1d": lambda: self._random_conv1d,
         }
-        return OnePass(SYSTEMS[key], frozen[embedding](), name)
+        return OnePass(SYSTEMS[key], frozen[embedding](), _readout(key))
 
     @cached_property
     def _kernels(self) -> Embedding:
@@ -166,6 +175,15 @@ class Catalogue:
     def _both(self) -> Embedding:
         # 1260 kernels beside vision, as `continual` has: RoboSkin 98.7 % against 98.6 with 1008.
         return Joined(Cached(Kernels(dimension=1260)), self._vision)
+
+
+def name_of(key: str) -> str:
+    """What tables call a system."""
+    return SYSTEMS.get(key, key)
+
+
+def _readout(key: str) -> ReadoutName:
+    return "lda" if key.endswith("-lda") else "ridge"
 
 
 def _spike_counts(image: Image) -> Image:

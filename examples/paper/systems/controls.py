@@ -53,7 +53,7 @@ class OnFeatures:
         """See `System.predict`."""
         if self._learned is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
-        return self._learned.predict(touch_features(self._embedding, streams))
+        return self._learned.predict(touch_features(self._embedding, streams)) if streams else []
 
 
 class NearestNeighbour(ContinualPeer):

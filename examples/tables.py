@@ -1,5 +1,8 @@
 """The tables of the texts, made from the results: `python -m examples.tables`, and `--check`, which writes nothing.
 
+`python -m examples.tables NAME --format latex` prints one, as Markdown, CSV or LaTeX (with booktabs); `--results RUN`
+makes it of what `python -m examples.paper all --run RUN` measured.
+
 A text marks where a table stands: `<!-- table: NAME -->`, anything, `<!-- /table -->`. `tables.toml`, beside the
 results, says what the table NAME holds:
 
@@ -9,7 +12,7 @@ results, says what the table NAME holds:
 - `cells`: what a row shows; without it a row's words are its cells. `$0`, `$1` … stand for the words of the row, or
   `$name` for the element's fields.
 - `above`, `below`: further rows, of cells. `text`: a paragraph behind the table.
-- `commands = false`: leave out the commands that made the results.
+- `commands = false`: leave out the commands that made the results, which another table then shows.
 
 A cell is text with lookups in braces: `{STEM:KEY/KEY|STEP|STEP}` looks into STEM.json, `{./KEY}` into the element. A
 KEY is a name, a place in a list, or `field=value;field=value`, the first element of a list with these. STEPs are those
@@ -20,16 +23,31 @@ lookup that finds nothing is an error; `{?…}` then leaves its cell empty, or s
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["ROOMS", "TEXTS", "filled", "made", "main", "read_tables"]
+__all__ = [
+    "FORMATS",
+    "ROOMS",
+    "TEXTS",
+    "Table",
+    "duration",
+    "filled",
+    "made",
+    "main",
+    "read_tables",
+    "seconds_of",
+    "table_of",
+]
 
 HERE = Path(__file__).parent
 ROOMS = (HERE / "paper", HERE / "benchmarks")
@@ -153,8 +171,22 @@ def _bound(template: str, words: Mapping[str, Any]) -> str:
     return re.sub(r"\$(\w+)", lambda match: str(words[match[1]]), template)
 
 
-def made(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) -> str:
-    """The table of a name, in Markdown. Raises InputError where it, or what it looks up, is not there."""
+@dataclass(frozen=True)
+class Table:
+    """A table as it is shown: head and rows of Markdown, a paragraph, and (a note, a command) of each result in it.
+
+    used: the names of all results that were looked into, whether their commands are shown or not.
+    """
+
+    head: list[str]
+    rows: list[list[str]]
+    text: str
+    commands: list[tuple[str, str]]
+    used: list[str]
+
+
+def table_of(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) -> Table:
+    """The table of a name. Raises InputError where it, or what it looks up, is not there."""
     if name not in tables:
         raise InputError(f"expected a table out of {', '.join(sorted(tables))}; came {name!r}")
     table, results = tables[name], _Results(folders)
@@ -176,13 +208,84 @@ def made(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) 
     head = table["head"]
     if wrong := next((row for row in rows if len(row) != len(head)), None):
         raise InputError(f"table {name!r}: expected rows of {len(head)} cells; came {wrong}")
-    lines = ["| " + " | ".join(row) + " |" for row in (head, *rows)]
-    lines.insert(1, "|---" * len(head) + "|")
-    parts = ["\n".join(line.replace("|  |", "| |").replace("|  |", "| |") for line in lines), text]
-    if table.get("commands", True):
-        commands = dict.fromkeys(f"{results.of(stem)['command']}" for stem in results.used)
-        parts.append("```sh\n" + "\n".join(commands) + "\n```")
+    shown = [stem for stem in results.used if table.get("commands", True)]
+    commands = [(_origin(f"{stem}.json", results.of(stem)), str(results.of(stem)["command"])) for stem in shown]
+    return Table(head, rows, text, commands, results.used)
+
+
+def _origin(file: str, made_by: Mapping[str, Any]) -> str:
+    """A result's file, how long it took, its seed, the project's version and the date."""
+    seconds, version = seconds_of(made_by), made_by.get("versions", {}).get("scroll-tactile")
+    parts = ["time not noted" if seconds is None else duration(seconds)]
+    parts += [f"seed {made_by['seed']}"] if "seed" in made_by else []
+    parts += [f"version {version}"] if version else []
+    return f"{file}: {', '.join([*parts, str(made_by['date'])[:10]] if 'date' in made_by else parts)}"
+
+
+def seconds_of(made_by: Mapping[str, Any]) -> float | None:
+    """How long a result took: what it notes, or what its cells, folds or parts do, together; None where none do."""
+    if "seconds" in made_by:
+        return float(made_by["seconds"])
+    found: list[float | None] = []
+    for name in ("cells", "folds", "parts", "records", "sets"):
+        within = made_by.get(name)
+        each = within.values() if isinstance(within, Mapping) else within if isinstance(within, list) else ()
+        found += [seconds_of(part) for part in each if isinstance(part, Mapping)]
+    known = [seconds for seconds in found if seconds is not None]
+    return sum(known) if known else None
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words: 40 s, 12 min, 3.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def _markdown(table: Table) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in (table.head, *table.rows)]
+    lines.insert(1, "|---" * len(table.head) + "|")
+    parts = ["\n".join(line.replace("|  |", "| |").replace("|  |", "| |") for line in lines), table.text]
+    if table.commands:
+        parts.append("```sh\n" + "\n".join(f"# {note}\n{command}" for note, command in table.commands) + "\n```")
     return "\n\n".join(part for part in parts if part)
+
+
+def _csv(table: Table) -> str:
+    lines = io.StringIO()
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerows([re.sub(r"\*\*|`|\\(?=\*)", "", cell) for cell in row] for row in (table.head, *table.rows))
+    return lines.getvalue().rstrip("\n")
+
+
+# What is special to LaTeX, or not in its usual fonts; the backslash is one of the characters, so each is done once.
+LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
+LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+LATEX |= {"±": r"$\pm$", "×": r"$\times$", "→": r"$\rightarrow$", "λ": r"$\lambda$", "…": r"\ldots{}", "–": "--"}
+LATEX |= {"−": "$-$", "α": r"$\alpha$", "Δ": r"$\Delta$", "≤": r"$\leq$", "²": "$^2$", "°": r"$^\circ$"}
+
+
+def _latex_cell(cell: str) -> str:
+    plain = re.sub(r"\\(?=\*)", "", cell.replace("**", "\0").replace("`", "\1"))
+    text = "".join(LATEX.get(character, character) for character in plain)
+    text = re.sub("\0([^\0]*)\0", r"\\textbf{\1}", text)
+    return re.sub("\1([^\1]*)\1", r"\\texttt{\1}", text)
+
+
+def _latex(table: Table) -> str:
+    head, *rows = [" & ".join(map(_latex_cell, row)) + r" \\" for row in (table.head, *table.rows)]
+    lines = [f"% {line}" for note, command in table.commands for line in (note, command)]
+    lines += [rf"\begin{{tabular}}{{l{'r' * (len(table.head) - 1)}}}", r"\toprule", head, r"\midrule"]
+    return "\n".join([*lines, *rows, r"\bottomrule", r"\end{tabular}"])
+
+
+FORMATS: dict[str, Callable[[Table], str]] = {"markdown": _markdown, "csv": _csv, "latex": _latex}
+"""How a table can be written."""
+
+
+def made(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS, form: str = "markdown") -> str:
+    """The table of a name, written in one of FORMATS. Raises what `table_of` raises."""
+    return FORMATS[form](table_of(name, tables, folders))
 
 
 def filled(text: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROOMS) -> str:
@@ -213,8 +316,20 @@ def main(words: Sequence[str] | None = None, texts: Sequence[Path] = TEXTS) -> N
     """Make the tables of all texts; with --check, exit 1 where one is not as the results say."""
     parser = argparse.ArgumentParser(prog="python -m examples.tables", description="Make all tables from the results.")
     parser.add_argument("--check", action="store_true", help="write nothing; fail where a table is not as it would be")
-    check = parser.parse_args(words).check
-    tables = read_tables()
+    parser.add_argument("names", nargs="*", metavar="NAME", help="print these tables, and write nothing")
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="of what is printed")
+    parser.add_argument("--results", type=Path, metavar="RUN", help="a folder of `python -m examples.paper all --run`")
+    asked = parser.parse_args(words)
+    check, tables = asked.check, read_tables()
+    if asked.names:
+        try:
+            folders = ROOMS if asked.results is None else (asked.results,)
+            print("\n\n".join(made(name, tables, folders, asked.format) for name in asked.names))
+        except InputError as error:
+            raise SystemExit(f"Error: {error}") from error
+        return
+    if asked.results is not None:
+        parser.error("--results makes the tables that are named: give their names too")
     for path in texts:
         text = path.read_text(encoding="utf-8")
         new = filled(text, tables)

@@ -1,5 +1,7 @@
 """The tables of the texts are what the results say, and every result says what made it."""
 
+import csv
+import io
 import json
 import re
 import shlex
@@ -8,7 +10,7 @@ import pytest
 import typer
 
 from examples.paper.__main__ import app as paper
-from examples.tables import ROOMS, TEXTS, filled, made, main, read_tables
+from examples.tables import ROOMS, TEXTS, duration, filled, made, main, read_tables, seconds_of, table_of
 from scroll_tactile.errors import InputError
 
 TABLES = read_tables()
@@ -68,7 +70,68 @@ def test_a_row_of_each_element_and_the_commands_behind(room):
     table |= {"above": [["a", "b"]], "below": [["y", "z"]], "text": "{one:all/x} in all."}
     lines = made("t", {"t": table}, [room]).splitlines()
     assert lines[2:5] == ["| a | b |", "| c | 1 |", "| y | z |"]
-    assert lines[5:] == ["", "1500 in all.", "", "```sh", "run one", "```"]
+    assert lines[5:] == ["", "1500 in all.", "", "```sh", "# one.json: time not noted", "run one", "```"]
+
+
+def test_no_table_without_results_and_no_result_without_its_command_in_its_text():
+    shown: dict[str, set[str]] = {"README.md": set()}
+    used: dict[str, set[str]] = {}
+    for text in TEXTS:
+        for name in re.findall(r"<!-- table: (\S+) -->", text.read_text()):
+            table = table_of(name, TABLES)
+            assert table.used, name
+            used.setdefault(str(text), set()).update(table.used)
+            shown.setdefault(str(text), set()).update(table.used if table.commands else ())
+    pages = [str(text) for text in TEXTS[1:]]
+    assert [used[page] - shown[page] for page in pages] == [set(), set()]
+    assert used[str(TEXTS[0])] <= set().union(*(shown[page] for page in pages))  # README sends there
+
+
+def test_every_result_stands_in_a_table():
+    used = {stem for name in TABLES for stem in table_of(name, TABLES).used}
+    assert {path.stem for path in RESULTS if path.suffix == ".json"} - used == set()
+
+
+HARD = [["**a** & b_1, 5 %", "1.0 ± 0.1"], ["`f\\*` # $ ~ ^ \\", "– → λ"]]
+
+
+def test_a_table_as_csv_and_as_latex(room):
+    table = {"head": ["of, which", "%"], "rows": HARD, "text": "{one:all/x}"}
+    shown = made("t", {"t": table}, [room], "csv")
+    assert list(csv.reader(io.StringIO(shown))) == [
+        ["of, which", "%"],
+        ["a & b_1, 5 %", "1.0 ± 0.1"],
+        ["f* # $ ~ ^ \\", "– → λ"],
+    ]
+    assert made("t", {"t": table}, [room], "latex").splitlines() == [
+        "% one.json: time not noted",
+        "% run one",
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"of, which & \% \\",
+        r"\midrule",
+        r"\textbf{a} \& b\_1, 5 \% & 1.0 $\pm$ 0.1 \\",
+        r"\texttt{f*} \# \$ \textasciitilde{} \textasciicircum{} \textbackslash{} & -- $\rightarrow$ $\lambda$ \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_a_table_is_printed_of_ones_own_results(room, tmp_path, capsys):
+    main(["table1-gelsight", "--format", "csv"])
+    printed = capsys.readouterr().out
+    assert printed.startswith('"percent, single GelSight frames') and "ours, counts (Frames())" in printed
+    with pytest.raises(SystemExit, match=r"expected a result table1-gelsight\.json; there are one"):
+        main(["table1-gelsight", "--results", str(room)])
+    with pytest.raises(SystemExit, match="expected a table out of"):
+        main(["no-table"])
+
+
+def test_how_long_a_result_took():
+    cells = {"a": {"seconds": 60.0, "epochs": [{"seconds": 9.0}]}, "b": {"seconds": 60}}
+    assert seconds_of({"cells": cells}) == 120 and seconds_of({"seconds": 7, "cells": cells}) == 7
+    assert seconds_of({"sets": {"one": {"parts": [{"seconds": 1}, {}]}}}) == 1 and seconds_of({"cells": {}}) is None
+    assert [duration(seconds) for seconds in (40.2, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
 
 
 @pytest.mark.parametrize(
@@ -114,3 +177,13 @@ def test_the_noted_commands_can_be_given(path):
 
 def test_the_results_are_small():
     assert sum(path.stat().st_size for path in RESULTS) <= 800_000
+
+
+def test_the_map_of_the_paper_names_commands_that_can_be_given():
+    named = re.findall(r"^\| .* \| \[.*\]\(#\S+\) \| `(.+)` \|$", (ROOMS[0] / "RESULTS.md").read_text(), re.MULTILINE)
+    assert len(named) >= 8
+    for command in named:
+        parsed, words = typer.main.get_command(paper), command.split()
+        while words and hasattr(parsed, "commands"):
+            parsed = parsed.commands[words.pop(0)]
+        parsed.make_context("it", words)

@@ -118,7 +118,9 @@ def robustness_curves(rows: Rows) -> dict[str, dict[tuple[str, bool], list[tuple
 
 
 def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
-    """Draw accuracy against strength, a panel for each study, a line for each system; dashed without augmentation.
+    """Draw accuracy against strength, a panel for each study, a line for each system.
+
+    Dashed where a system is without augmentation and its other line is with it.
 
     rows: of a robustness summary. Raises InputError where there are none.
     """
@@ -138,7 +140,7 @@ def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
                     [100 * mean for mean in means],
                     yerr=[100 * spread for spread in spreads],
                     color=colours[system],
-                    linestyle="-" if augmented else "--",
+                    linestyle="--" if not augmented and (system, True) in lines else "-",
                     marker="o",
                     markersize=4,
                     capsize=2,

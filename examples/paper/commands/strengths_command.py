@@ -85,7 +85,7 @@ def strengths(
     ],
     data: Data,
     sets: Annotated[
-        str, typer.Option(help=f"Which data sets, of {', '.join(Dataset)}; a picture for each.")
+        str, typer.Option(help=f"Which data sets, of {', '.join(Dataset)}; a picture for each, of each study.")
     ] = ",".join(QUICK_SETS),
     systems: Annotated[str, typer.Option(help=f"Which systems, of {', '.join(CHOICES)}; or all.")] = OURS,
     own_systems: OwnSystems = None,
@@ -148,7 +148,7 @@ def strengths(
         options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
         made = origin(command_line("strengths", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
         write_result(json, made | {"sets": kept, "means": means, "records": records})
-    _draw(plot, list(kept), means)
+    _draw(plot, means)
 
 
 def _choose(systems: str, weights: str | None) -> tuple[str, ...]:
@@ -187,13 +187,16 @@ def _studies(study: StudyChoice, recordings: Recordings) -> list[str]:
     return [name for name in NAMES if name != SESSION or recordings.ordered]
 
 
-def _draw(plot: Path | None, sets: Sequence[str], means: Sequence[Mapping[str, Any]]) -> None:
-    if plot is None:
-        return
-    for name in sets:
-        # One picture a set: lines of two sensors in one panel cannot be distinguished.
-        file = plot if len(sets) == 1 else plot.with_stem(f"{plot.stem}-{name.lower()}")
-        rows = [row for row in means if row["dataset"] == name]
+def _draw(plot: Path | None, means: Sequence[Mapping[str, Any]]) -> None:
+    """A picture of each study of each set, as the paper has: lines of two sensors in one cannot be distinguished."""
+    pictures = dict.fromkeys((row["dataset"], row["study"]) for row in means)
+    several = [len(set(names)) > 1 for names in zip(*pictures, strict=True)]
+    for name, study in pictures:
+        if plot is None:
+            return
+        told = [word for word, tell in zip((name.lower(), study), several, strict=True) if tell]
+        file = plot.with_stem("-".join([plot.stem, *told]))
+        rows = [row for row in means if (row["dataset"], row["study"]) == (name, study)]
         if not draw_into(file, partial(draw_robustness, rows=rows, title=f"{name}, trained on clean touches")):
             return
 

@@ -6,6 +6,7 @@ row of a fold of a side, is written down when it is finished, and an interrupted
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,10 +73,13 @@ def _measure(
     left = {row: test for row, test in fit.tests.items() if keys[row] not in notes.notes}
     if left:
         train = [(material, stream.readings) for material, stream in fit.train]
+        begun = time.perf_counter()
         touches = {row: [stream.readings for _, stream in test] for row, test in left.items()}
         for row, found in answering(fit.sensor, train, touches, progress):
             truth = [material for material, _ in left[row]]
-            notes.note(keys[row], _figures(truth, found, {material for material, _ in fit.train}))
+            figures = _figures(truth, found, {material for material, _ in fit.train})
+            notes.note(keys[row], figures | {"seconds": time.perf_counter() - begun})
+            begun = time.perf_counter()
     return {row: notes.notes[key] for row, key in keys.items()}
 
 

@@ -9,6 +9,7 @@ next.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -154,7 +155,7 @@ class Strengths:
     ) -> Iterator[list[dict[str, Any]]]:
         """The records of each fold in turn, as they are finished; cells finished before are read back.
 
-        A record holds study, strength, system, augmented, fold, accuracy (a share) and tested (touches).
+        A record holds study, strength, system, augmented, fold, accuracy (a share), tested (touches) and seconds.
 
         Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
         under other settings.
@@ -208,6 +209,7 @@ class Strengths:
             progress(where, done, len(cells))
             key = f"{study}/{strength:g}/{name}/{'augmented' if augmented else 'plain'}/{fold}"
             if key not in notes.notes:
+                begun = time.perf_counter()
                 session = study == SESSION
                 train, test = self._split(fold, session)
                 if session not in systems:
@@ -219,7 +221,8 @@ class Strengths:
                 asked = test if session else self._perturbed(test, study, strength)
                 predicted = systems[session].predict([stream for _, stream in asked])
                 share = accuracy([material for material, _ in asked], list(predicted))
-                notes.note(key, {"accuracy": share, "tested": len(asked)})
+                seconds = time.perf_counter() - begun  # of the first strength the training's, too
+                notes.note(key, {"accuracy": share, "tested": len(asked), "seconds": seconds})
             about = {"study": study, "strength": strength, "system": name, "augmented": augmented, "fold": fold}
             yield about | notes.notes[key]
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import typer
 
+from examples.paper.commands.all_command import everything
 from examples.paper.commands.continual_command import continual
 from examples.paper.commands.fabric_command import fabric
 from examples.paper.commands.metrics_command import metrics
-from examples.paper.commands.paper_command import activation, efficiency, everything, table1
+from examples.paper.commands.paper_command import activation, efficiency, table1
 from examples.paper.commands.replay_command import replay
 from examples.paper.commands.robustness_command import robustness
 from examples.paper.commands.schedules_command import schedules

@@ -1,7 +1,6 @@
 """Studies of systems, their resumption, and `python -m examples.paper`, on a few simulated touches."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -277,23 +276,6 @@ class TestCommand:
         assert run(*words, "--systems", "svm,svm-spikes").exit_code == 0
         again = refused(*words[:6], 2, *words[7:], "--systems", "conv-lstm")
         assert "other settings of conv-lstm" in again and "'epochs': 2" in again
-
-    def test_all_writes_every_part_and_reads_finished_cells_back(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        pytest.importorskip("matplotlib")
-        # The package's names are the commands; their modules lie behind them.
-        module = sys.modules["examples.paper.commands.paper_command"]
-        monkeypatch.setattr(module, "SYSTEMS", {"svm-spikes": "SVM on spikes"})
-        monkeypatch.setattr(module, "CURVES", ("kernels-lda",))
-        monkeypatch.setattr("examples.paper.commands.strengths_command.CHOICES", ("svm-spikes",))
-        words = ("all", "--data", tmp_path, "--out", tmp_path, "--quick", "--run", tmp_path / "run")
-        for _ in range(2):
-            result = run(*words)
-            assert result.exit_code == 0, result.output
-        made = {file.name for file in tmp_path.iterdir() if file.is_file()}
-        pictures = {f"strengths-{name}.png" for name in ("biotac-20", "roboskin-20")}
-        assert made == {"table1.json", "efficiency.json", "efficiency.png", "strengths.json", *pictures}
-        studies = {item["study"] for item in json.loads((tmp_path / "strengths.json").read_text())["means"]}
-        assert studies == {"length", "speed", "noise"}
 
 
 class TestPhysiclear:

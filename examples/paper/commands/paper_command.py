@@ -1,13 +1,11 @@
-"""`table1`, `efficiency`, `activation`, and `all`: the paper's own systems, and ours beside them."""
+"""`table1`, `efficiency` and `activation`: the paper's own systems, and ours beside them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.table import Table
 
 from examples.paper.commands.options import (
@@ -39,7 +37,6 @@ from examples.paper.commands.options import (
     say_conditions,
 )
 from examples.paper.commands.sets import draw_into, require_folders, with_spread
-from examples.paper.commands.strengths_command import StudyChoice, strengths
 from examples.paper.plots import draw_activation, draw_efficiency
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.activation_study import ActivationStudy
@@ -49,7 +46,7 @@ from examples.paper.systems.catalogue import SYSTEMS
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.errors import InputError
 
-__all__ = ["activation", "efficiency", "everything", "table1"]
+__all__ = ["activation", "efficiency", "table1"]
 
 
 CURVES = ("resnet", "resnet-pretrained", "kernels-lda", "vision-lda", "kernels+vision-lda")
@@ -187,34 +184,6 @@ def activation(
     if plot is not None:
         draw_activation(plot, images)
         say(f"plot: {plot}")
-
-
-def everything(
-    data: Data,
-    out: Annotated[Path, typer.Option(help="An existing folder: every part's figures and pictures go there.")],
-    weights: Weights = None,
-    folds: Folds = None,
-    epochs: Epochs = None,
-    device: Where = Device.CPU,
-    precision: InPrecision = PrecisionChoice.FLOAT32,
-    seed: Seed = 0,
-    quick: Quick = False,
-    run: Run = None,
-) -> None:
-    """All of it, one after the other: table1, efficiency, strengths paper, and with weights activation."""
-    require_folders(out / "table1.json")
-    shared: dict[str, Any] = {"data": data, "weights": weights, "epochs": epochs, "device": device, "seed": seed}
-    shared |= {"precision": precision, "quick": quick}
-
-    def files(part: str, *, picture: bool = True) -> dict[str, Any]:
-        kept: dict[str, Any] = {"run": None if run is None else run / part, "json": out / f"{part}.json"}
-        return kept | ({"plot": out / f"{part}.png"} if picture else {})
-
-    table1(**shared, folds=folds, **files("table1", picture=False))
-    efficiency(**shared, folds=folds, **files("efficiency"))
-    strengths(StudyChoice.PAPER, systems="all", **shared, folds=folds, **files("strengths"))
-    if weights is not None:
-        activation(**shared, **files("activation"))
 
 
 def _show_table(dataset: str, found: Sequence[Mapping[str, Any]], study: SystemStudy) -> None:

@@ -173,6 +173,8 @@ class TestCommand:
         assert "snntorch" in kept["versions"]
         assert kept["command"].startswith("python -m examples.paper table1") and "--quick" in kept["command"]
         assert len(kept["cells"]) == 6
+        assert kept["systems"]["svm"] == {"name": "SVM", "library": "scikit-learn"}
+        assert {system["library"] for system in kept["systems"].values()} <= kept["versions"].keys()
         first = {row["key"]: row for row in kept["rows"]}["svm"]["sets"]["BioTac-20"]
         assert first["difference"] == pytest.approx(first["mean"] - 0.942)
         assert "epochs 6 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")

@@ -15,7 +15,7 @@ from examples.paper.commands.sets import command_line, leave_out, named, origin,
 from examples.paper.runs.cells import Cell, Figures
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import blocked
-from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS
+from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS, library_of, name_of
 from examples.paper.systems.own import is_own, require_own
 from scroll_tactile.cli.terminal import say
 from scroll_tactile.datasets import Recordings, physiclear
@@ -36,6 +36,7 @@ __all__ = [
     "read_sets",
     "say_conditions",
     "spelled",
+    "systems_of",
 ]
 
 
@@ -162,6 +163,11 @@ def say_conditions(study: SystemStudy) -> None:
         )
 
 
+def systems_of(keys: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Key → name and library of each system; the libraries' versions stand in what `origin` notes."""
+    return {key: {"name": name_of(key), "library": library_of(key)} for key in keys}
+
+
 def close(
     study: SystemStudy,
     results: Sequence[tuple[Cell, Figures]],
@@ -192,7 +198,12 @@ def close(
         quick=study.quick,
         run=None if study.folder is None else "RUN",
     )
-    about = machine() | study.plan | {"seconds": sum(figures["seconds"] for _, figures in results)}
+    about = (
+        machine()
+        | study.plan
+        | {"systems": systems_of(study.systems)}
+        | {"seconds": sum(figures["seconds"] for _, figures in results)}
+    )
     sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
     cells = {cell.key: figures for cell, figures in results}
     write_result(json, origin(command) | about | {"sensors": sensors, **found, "cells": cells})

@@ -31,6 +31,7 @@ from examples.paper.commands.options import (
     Where,
     own_keys,
     spelled,
+    systems_of,
 )
 from examples.paper.commands.sets import (
     Dataset,
@@ -147,6 +148,7 @@ def strengths(
         options: dict[str, Any] = {"data": "DATA", "sets": sets, "systems": ",".join(keys), "folds": folds or "all"}
         options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
         made = origin(command_line("strengths", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
+        made |= {"systems": systems_of(keys)}
         write_result(json, made | {"sets": kept, "means": means, "records": records})
     _draw(plot, means)
 

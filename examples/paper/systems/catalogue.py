@@ -29,7 +29,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.augmentation import Augmentation
 
-__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue", "name_of"]
+__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue", "library_of", "name_of"]
 
 SYSTEMS = {
     "svm": "SVM",
@@ -180,6 +180,15 @@ class Catalogue:
 def name_of(key: str) -> str:
     """What tables call a system."""
     return SYSTEMS.get(key, key)
+
+
+def library_of(key: str) -> str:
+    """The library whose work a system is; the learner and the controls are this project's."""
+    if is_own(key):
+        return "one's own"
+    if key in EPOCHAL:
+        return "snntorch" if key == "snn" else "torch"
+    return "scikit-learn" if key.startswith("svm") else "scroll-tactile"
 
 
 def _readout(key: str) -> ReadoutName:

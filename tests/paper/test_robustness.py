@@ -39,7 +39,10 @@ def test_every_row_has_its_figures_and_what_is_noted_is_read_back(tmp_path):
     assert [record["row"] for record in records] == ROWS
     assert records[0]["accuracy"] == 1 and records[0]["tested"] == 10
     assert all(0 <= record["calibration_error"] <= 1 and 0 <= record["known"] <= 1 for record in records[:-1])
+    assert all(record["wrong_known"] <= 1 - record["accuracy"] + 1e-9 for record in records[:-1])
     assert 0.5 < records[-1]["novelty_auroc"] <= 1 and records[-1]["tested"] == 50
+    (quick,) = Robustness(few(), folder=tmp_path / "run", quick=True).run([0])
+    assert quick == resumed[:-1]
     with pytest.raises(InputError, match="another run"):
         list(Robustness(few(), seed=1, folder=tmp_path / "run").run([0]))
 

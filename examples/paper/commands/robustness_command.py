@@ -46,6 +46,9 @@ def robustness(
     before: Annotated[
         Path | None, typer.Option(help="An older checkout of the project, whose default learner is measured beside.")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="The first of these sets and folds, no session and no novelty: for a look.")
+    ] = False,
     seed: Seed = 0,
     run: Run = None,
     json: Json = None,
@@ -65,13 +68,13 @@ def robustness(
     tested: dict[str, str] = {}
     records: list[dict[str, Any]] = []
     with progress_bar() as progress:
-        for name in named("--set", sets, list(Dataset)):
+        for name in named("--set", sets, list(Dataset))[: 1 if quick else None]:
             progress("reading", 0, 1)
             recordings = read(Dataset(name), data, seed)
             if materials < 20:
                 recordings = subset(recordings, materials)
-            chosen = parse_folds(folds or "all", recordings)
-            task = Robustness(recordings, sides, seed, None if run is None else run / recordings.name)
+            chosen = parse_folds(folds or "all", recordings)[: 1 if quick else None]
+            task = Robustness(recordings, sides, seed, None if run is None else run / recordings.name, quick)
             own = [record for fold in task.run(chosen, progress) for record in fold]
             for side, rows in summary(own).items():
                 found[side][name] = rows
@@ -96,6 +99,7 @@ def robustness(
         options |= {
             "before": None if before is None else "CHECKOUT",
             "seed": seed,
+            "quick": quick,
             "run": None if run is None else "RUN",
         }
         made = origin(command_line("robustness", **options)) | {"seed": seed, "folds": tested}

@@ -47,8 +47,9 @@ PERTURBED: dict[str, Callable[[Stream, int], Stream]] = {
 SESSION = "session"  # ten successive repetitions of fifty held out; nothing is perturbed
 NOVELTY = "novelty"  # four of twenty materials never touched, five rotations; nothing is perturbed
 NOW = "now"
-FIGURES = ("accuracy", "calibration_error", "known", "novelty_auroc")
-"""Of a cell: shares of right answers and of touches called known, expected calibration error; of novelty its AUROC."""
+FIGURES = ("accuracy", "calibration_error", "known", "wrong_known", "novelty_auroc")
+"""Of a cell: shares of right answers, of touches called known, and of these that are taken for another material, of all
+touches; expected calibration error; of novelty its AUROC."""
 
 RATE = 100.0  # readings a second of series that come without one
 
@@ -96,6 +97,7 @@ def _figures(truth: Sequence[str], found: Answers, learned: set[str]) -> Figures
         "accuracy": accuracy(truth, found["material"]),
         "calibration_error": calibration_error(found["probability"], right),
         "known": float(np.mean(found["known"])),
+        "wrong_known": float(np.mean(np.logical_and(found["known"], np.logical_not(right)))),
         "tested": len(truth),
     }
 
@@ -104,8 +106,8 @@ def _figures(truth: Sequence[str], found: Answers, learned: set[str]) -> Figures
 class Robustness:
     """All rows of a recorded set.
 
-    sides: by name, whose default learner answers. seed: of what perturbations draw. folder: where finished cells are
-    kept, or None; a changed project's figures belong into another.
+    sides: by name, whose default learner answers. seed: of what perturbations draw. quick: no other session, and no
+    materials left out. folder: where finished cells are kept, or None; a changed project's figures belong into another.
 
     Raises InputError for a negative seed and for a camera's frames.
     """
@@ -114,6 +116,7 @@ class Robustness:
     sides: Mapping[str, Answering] = field(default_factory=lambda: {NOW: answers})
     seed: int = 0
     folder: Path | None = None
+    quick: bool = False
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -161,6 +164,8 @@ class Robustness:
             for row, perturb in PERTURBED.items()
         }
         fits = [Fit(recordings.sensor, train, tests)]
+        if self.quick:
+            return fits
         if recordings.ordered:
             earlier, later = hold_out(recordings, recordings.blocked() == fold)
             fits.append(Fit(recordings.sensor, earlier, {SESSION: later}))
@@ -178,8 +183,11 @@ class Robustness:
             where = f"{self.recordings.name}, fold {fold}, {side}, learner {i + 1} of {len(fits)}"
             rows |= _measure(notes, side, answering, fit, fold, _below(progress, where))
         turned = [rows.pop(row) for row in list(rows) if row.startswith(NOVELTY)]
+        if not turned:
+            return rows
         area = float(np.mean([figures["novelty_auroc"] for figures in turned]))
-        return rows | {NOVELTY: {"novelty_auroc": area, "tested": sum(figures["tested"] for figures in turned)}}
+        sums = {name: sum(figures.get(name, 0) for figures in turned) for name in ("tested", "seconds")}
+        return rows | {NOVELTY: {"novelty_auroc": area} | sums}
 
 
 @dataclass(frozen=True)

@@ -210,10 +210,18 @@ class TestCommand:
         assert "came '20,many'" in refused(*simulated, "--sizes", "20,many")
         assert "needs --weights" in refused(*simulated, "--embedding", "vision")
         assert "has no weights" in refused(*simulated, "--weights", "resnet18")
+        assert "or as module:factory; came 'sound'" in refused(*simulated, "--embedding", "sound")
+        assert "has no Missing" in refused(*simulated, "--embedding", "examples.own_system:Missing")
         assert "none.pth" in refused(*simulated, "--embedding", "vision", "--weights", tmp_path / "none.pth")
         assert "folder that exists" in refused(*simulated, "--json", tmp_path / "none" / "r.json")
         assert "--folds" in refused(*simulated, "--folds", "first")
         assert run(*simulated, "--schedule", "backwards").exit_code == 2
+
+    def test_an_embedding_of_ones_own(self, simulated: list[object], tmp_path: Path) -> None:
+        own = ("--embedding", "examples.own_system:Strengths", "--json", tmp_path / "own.json")
+        result = run(*simulated, "--sizes", 0, "--curve", 0, "--no-peers", *own)
+        assert result.exit_code == 0, result.output
+        assert json.loads((tmp_path / "own.json").read_text())["embedding"]["dimension"] == 32
 
     def test_sizes(self) -> None:
         assert parse_sizes("0, 20,all,20") == (0, 20, "all")

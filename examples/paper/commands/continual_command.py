@@ -25,6 +25,7 @@ from examples.paper.commands.sets import (
 from examples.paper.plots import draw_continual
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
+from examples.paper.systems.own import is_own, own_embedding
 from scroll_tactile import Embedding, Joined, Kernels, Vision
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
 from scroll_tactile.datasets import Recordings
@@ -55,7 +56,9 @@ def continual(
     weights: Annotated[
         str | None, typer.Option(help="Of the vision embedding: a file, or a published name such as resnet18.")
     ] = None,
-    embedding: Annotated[EmbeddingChoice, typer.Option(help="The frozen features.")] = EmbeddingChoice.KERNELS,
+    embedding: Annotated[
+        str, typer.Option(help=f"The frozen features: {', '.join(EmbeddingChoice)}, or one's own, as module:factory.")
+    ] = EmbeddingChoice.KERNELS,
     schedule: Annotated[Order, typer.Option(help="The order in which touches are learned.")] = Order.CLASSES,
     sizes: Annotated[str, typer.Option(help="Exemplars in the buffer; all: every touch.")] = "0,20,50,100,200,400,all",
     folds: Folds = "all",
@@ -87,7 +90,7 @@ def continual(
     require_folders(json, plot)
     chosen_sizes = parse_sizes(sizes)
     # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 have 98.6; both have 99.5 of BioTac.
-    kernels = features or (1260 if embedding is EmbeddingChoice.BOTH else 1008)
+    kernels = features or (1260 if embedding == EmbeddingChoice.BOTH else 1008)
     frozen = _embedding(embedding, weights, kernels)
     with progress_bar() as progress:
         progress("reading", 0, 1)
@@ -114,8 +117,9 @@ def continual(
     published = PUBLISHED.get(recordings.name) if materials == 20 else None
     _show(recordings, results, published)
     if json is not None:
-        settings: dict[str, Any] = {"embedding": embedding.value, "weights": None if weights is None else Path(weights)}
-        settings |= {"features": None if embedding is EmbeddingChoice.VISION else kernels}
+        settings: dict[str, Any] = {"embedding": str(embedding), "weights": None if weights is None else Path(weights)}
+        of_kernels = embedding in (EmbeddingChoice.KERNELS, EmbeddingChoice.BOTH)
+        settings |= {"features": kernels if of_kernels else None}
         settings |= {"schedule": schedule.value, "sizes": ",".join(map(str, chosen_sizes)), "folds": folds or "all"}
         settings |= {"seed": seed, "curve": curve, "device": device.value, "epochs": epochs}
         settings |= {"tuned_curve": tuned_curve, "no_peers": not peers, "run": None if run is None else "RUN"}
@@ -137,20 +141,23 @@ def parse_sizes(text: str) -> tuple[Size, ...]:
     return tuple(dict.fromkeys(sizes))
 
 
-def _embedding(choice: EmbeddingChoice, weights: str | None, features: int) -> Embedding:
-    if choice is EmbeddingChoice.KERNELS:
+def _embedding(choice: str, weights: str | None, features: int) -> Embedding:
+    if choice not in list(EmbeddingChoice) and not is_own(choice):
+        known = ", ".join(EmbeddingChoice)
+        raise InputError(f"expected --embedding out of {known}, or as module:factory; came {choice!r}")
+    if choice == EmbeddingChoice.KERNELS or is_own(choice):
         if weights is not None:
             raise InputError(
-                f"--embedding kernels has no weights; came {weights!r}. Choose vision, or leave --weights out"
+                f"--embedding {choice} has no weights; came {weights!r}. Choose vision, or leave --weights out"
             )
-        return Kernels(dimension=features)
+        return Kernels(dimension=features) if choice == EmbeddingChoice.KERNELS else own_embedding(choice)
     if weights is None:
         raise InputError(
-            f"--embedding {choice.value} needs --weights: a file in torchvision's or Meta-Dataset's layout, or a "
+            f"--embedding {choice} needs --weights: a file in torchvision's or Meta-Dataset's layout, or a "
             "published name such as resnet18"
         )
     vision = Vision(weights)
-    return vision if choice is EmbeddingChoice.VISION else Joined(Kernels(dimension=features), vision)
+    return vision if choice == EmbeddingChoice.VISION else Joined(Kernels(dimension=features), vision)
 
 
 def _show(recordings: Recordings, results: Sequence[Mapping[str, Any]], published: tuple[float, float] | None) -> None:

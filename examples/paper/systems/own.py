@@ -53,11 +53,14 @@ def own_system(key: str) -> System:
 
 
 def own_embedding(key: str) -> Embedding:
-    """The embedding in `module:factory-lda`. Raises InputError where it is not there, or is something else."""
+    """The embedding in `module:factory`, whatever readout stands behind it.
+
+    Raises InputError where it is not there, cannot be made, or is something else.
+    """
     made = _made(key)
     if isinstance(made, type) or not is_embedding(made):
         raise InputError(
-            f"expected {key.rpartition('-')[0]} to make an embedding, with name, dimension, bound, fingerprint and "
+            f"expected {':'.join(_parts(key))} to make an embedding, with name, dimension, bound, fingerprint and "
             f"embed(image); it makes {_kind(made)}. See examples/own_system.py"
         )
     embedding: Embedding = made  # type: ignore[assignment]  # it has what the protocol asks for

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 
 from examples.paper.commands.options import SETS
-from examples.paper.runs.cells import Cell, pooled, split, time_left
+from examples.paper.runs.cells import Cell, pooled, split, thinned, time_left
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import PAPER, Table1, blocked, rows
 from scroll_tactile.datasets import Recordings, physiclear
@@ -42,6 +43,17 @@ class TestSplit:
     def test_a_quick_one_learns_every_second(self, recordings: Recordings):
         parts = split(recordings, 0, seed=0, every=2)
         assert (len(parts.streams), len(parts.validation), len(parts.test)) == (9, 3, 12)
+
+    def test_a_thinned_set_has_a_fifth_of_each_material_in_each_fold(self):
+        few = thinned(recorded(each=18, ordered=True), 5)
+        assert [*zip(few.materials[:6], few.fold[:6].tolist(), strict=True)] == [
+            (few.materials[0], fold) for fold in (0, 1, 2, 0, 1, 2)
+        ]
+        assert few.repetition[:6].tolist() == [0, 1, 2, 15, 16, 17] and len(few) == 18
+        frames = recorded(materials=2, each=12)
+        video = np.tile(np.repeat(np.arange(6), 2), 2)
+        few = thinned(replace(frames, repetition=video, fold=video % 2), 5)
+        assert few.repetition[:4].tolist() == [0, 0, 1, 1]
 
     def test_frames_of_a_video_are_not_parted(self):
         sets = recorded()

@@ -141,6 +141,8 @@ def test_the_command_on_real_touches(real_data, tmp_path):
         "--data",
         real_data,
         "--quick",
+        "--every",
+        1,
         "--materials",
         2,
         "--folds",

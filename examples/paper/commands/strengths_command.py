@@ -13,6 +13,7 @@ from rich.table import Table
 
 from examples.paper.commands.options import (
     QUICK_EPOCHS,
+    QUICK_EVERY,
     QUICK_SETS,
     Data,
     Device,
@@ -47,6 +48,7 @@ from examples.paper.commands.sets import (
     write_result,
 )
 from examples.paper.plots import draw_robustness
+from examples.paper.runs.cells import thinned
 from examples.paper.runs.study import columns_averaged, weights_digest
 from examples.paper.studies.baselines import BASELINES, baseline
 from examples.paper.studies.replay import subset
@@ -98,8 +100,13 @@ def strengths(
     precision: InPrecision = PrecisionChoice.FLOAT32,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="The first of these folds, few strengths, 6 epochs of networks on small images."),
+        typer.Option(
+            "--quick", help="The first of these folds, every fifth touch, few strengths, 6 epochs on small images."
+        ),
     ] = False,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="Learn and test one of so many touches; 5 in a quick run.")
+    ] = None,
     seed: Seed = 0,
     run: Run = None,
     json: Json = None,
@@ -112,6 +119,7 @@ def strengths(
     """
     require_folders(json, plot)
     require_device(device.value)
+    thin = every or (QUICK_EVERY if quick else 1)
     keys = (*_choose(systems, weights), *own_keys(own_systems, own_embeddings))
     passes = epochs or (QUICK_EPOCHS if quick else 100)
     course = Course.in_proportion(passes, precision.value)
@@ -125,6 +133,7 @@ def strengths(
             if materials < 20:
                 recordings = subset(recordings, materials)
             every = columns_averaged(recordings.sensor) if quick else 1
+            recordings = thinned(recordings, thin)
             makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
             folder = None if run is None else run / recordings.name
             studies = _studies(study, recordings)
@@ -143,9 +152,10 @@ def strengths(
         networks = {"epochs": passes, "device": device.value, "precision": precision.value}
         say(f"networks: {passes} epochs, on {device.value}, ResNets in {precision.value}")
     if quick:
-        say("[yellow]quick:[/] one fold, few strengths; the ResNets' images averaged to about 50 columns")
+        say(f"[yellow]quick:[/] one fold, few strengths; ResNets' images of about 50 columns; one touch of {thin}")
     if json is not None:
         options: dict[str, Any] = {"data": "DATA", "sets": sets, "systems": ",".join(keys), "folds": folds or "all"}
+        options |= {"every": None if thin == 1 and not quick else thin}
         options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
         made = origin(command_line("strengths", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
         made |= {"systems": systems_of(keys)}

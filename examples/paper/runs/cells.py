@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import Any
 
@@ -28,6 +28,7 @@ __all__ = [
     "require_data",
     "run_cells",
     "split",
+    "thinned",
     "time_left",
 ]
 
@@ -112,6 +113,22 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
         validation=[labelled[i] for i in validation],
         test=[labelled[i] for i in test],
         touch=groups[test].tolist(),
+    )
+
+
+def thinned(recordings: Recordings, every: int) -> Recordings:
+    """One of so many recordings of each material in each fold, for a look; frames of a video stay together."""
+    marks = list(zip(recordings.materials, recordings.fold.tolist(), recordings.repetition.tolist(), strict=True))
+    numbers: dict[tuple[str, int], list[int]] = {}
+    for material, fold, repetition in dict.fromkeys(marks):
+        numbers.setdefault((material, fold), []).append(repetition)
+    kept = [i for i, (material, fold, number) in enumerate(marks) if number in numbers[material, fold][::every]]
+    return replace(
+        recordings,
+        streams=[recordings.streams[i] for i in kept],
+        materials=[recordings.materials[i] for i in kept],
+        repetition=recordings.repetition[kept],
+        fold=recordings.fold[kept],
     )
 
 

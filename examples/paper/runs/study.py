@@ -30,7 +30,6 @@ NOT_OF_FRAMES = (*_OF_STREAMS, *CONTROLS)
 embeddings, for `Frames` with a network is one, and the controls."""
 
 QUICK_COLUMNS = 50  # about, of the residual networks' images in a quick run
-QUICK_EVERY = 2  # of the recordings that are learned in a quick run
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class SystemStudy:
     sets: of different names. systems: keys of SYSTEMS. weights: of a trained ResNet, for those in NEED_WEIGHTS.
     epochs: of the networks. device: of all networks but ours. seed: of all that is drawn.
     precision: of the residual networks' training, see `Course`.
-    quick: learn every second recording, and let residual networks read about 50 columns an image: for a look.
+    quick: let residual networks read about 50 columns an image: for a look, on sets that `thinned` made small.
     folder: where finished cells are noted, so that a killed run resumes; or None.
 
     Raises InputError for unknown systems, sets of one name, a device that is not there, or weights that are needed and
@@ -119,7 +118,7 @@ class SystemStudy:
         raise NotImplementedError
 
     def _split(self, cell: Cell) -> Split:
-        return split(self._by_name[cell.dataset], cell.fold, self.seed, every=QUICK_EVERY if self.quick else 1)
+        return split(self._by_name[cell.dataset], cell.fold, self.seed)
 
     def _system(self, cell: Cell) -> System:
         return self._catalogues[self._by_name[cell.dataset].sensor.name].make(cell.system)

@@ -1,11 +1,25 @@
 """Fixtures that several test modules share."""
 
+import os
+import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from real_sets import CACHE
+
+from scroll_tactile.readouts.likelihood import Likelihood, Noise, Table
+
+# The tests sync files tens of thousands of times: where there is room in memory, they do not wait for a disk.
+IN_MEMORY = Path("/dev/shm")
+if os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free > 2**32:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(IN_MEMORY))  # of `tmp_path`
+    tempfile.tempdir = str(IN_MEMORY)
 
 UNPACK = Path(__file__).parents[2] / "shared" / "data" / "unpack.py"
 
@@ -17,3 +31,24 @@ def real_data() -> Path:
         pytest.skip(f"no real data: {UNPACK} does not exist, and the project ships none")
     subprocess.run([sys.executable, UNPACK, CACHE, "biotac_slide_20_50"], check=True, timeout=300)
     return CACHE / "biotac_slide_20_50"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_tables() -> Iterator[None]:
+    """A table is a function of its noise, spread and weights: what one memory made, another of the same touches reads.
+
+    Half of the time of a first prediction goes into tables, and most tests have memories of the same few touches.
+    """
+    made = Likelihood._made
+
+    @lru_cache(maxsize=512)
+    def table(noise: Noise, spread: bytes, weights: bytes) -> Table:
+        likelihood = object.__new__(Likelihood)
+        likelihood.spread, likelihood.weights = np.frombuffer(spread), np.frombuffer(weights)
+        return made(likelihood, noise)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Likelihood, "_made", lambda self, noise: table(noise, self.spread.tobytes(), self.weights.tobytes())
+        )
+        yield

@@ -19,6 +19,10 @@ WAYS = {
 }
 
 
+RNG = np.random.default_rng(0)
+TOUCHES = [("ab"[i % 2], RNG.random((60, 3))) for i in range(6)]  # as few as it takes
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_a_learner_keeps_its_promises(way):
     held = check_learner(lambda path: TactileLearner.open(path, **WAYS[way]))
@@ -57,12 +61,10 @@ class Careless(TactileLearner):
 )
 def test_one_that_breaks_a_promise_is_named(kind, said):
     with pytest.raises(LearnerError, match=said):
-        check_learner(lambda path: kind.open(path, sensor=PAD, embedding=SMALL))
+        check_learner(lambda path: kind.open(path, sensor=PAD, embedding=SMALL), touches=TOUCHES)
 
 
 def test_touches_may_be_given():
-    rng = np.random.default_rng(0)
-    touches = [("ab"[i % 2], rng.random((60, 3))) for i in range(6)]
-    assert check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=touches)
+    assert check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=TOUCHES)
     with pytest.raises(LearnerError, match="three touches or more"):
-        check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=touches[:3])
+        check_learner(lambda path: TactileLearner.open(path, sensor=PAD, embedding=SMALL), touches=TOUCHES[:3])

@@ -50,12 +50,14 @@ SCENE = 3  # materials
 class Sizes:
     """How much is measured.
 
-    touches: of the everyday memory. pairs: of an observation and a prediction. starts: processes that open it anew.
+    touches: of the everyday memory, asked about `asked` others of each material. pairs: of an observation and a
+    prediction. starts: processes that open it anew.
     materials: of the large memory, with so many touches `each`; before_materials: of the one that an older checkout is
     given, too. opening: touches of the memories that are opened; before_opening: the largest for an older checkout.
     """
 
     touches: int = 800
+    asked: int = 10
     pairs: int = 200
     starts: int = 5
     materials: int = 10_000
@@ -162,7 +164,7 @@ def _biotac(bench: _Bench, data: Path | None) -> tuple[Touches, Touches]:
         scene = Scene(sensor=sensors.BIOTAC, seed=bench.seed)
         repetitions = -(-number // len(scene.materials))
         train = [(name, scene.touch(name, i)) for i in range(repetitions) for name in scene.materials][:number]
-        test = [(name, scene.touch(name, 1000 + i)) for i in range(10) for name in scene.materials]
+        test = [(name, scene.touch(name, 1000 + i)) for i in range(bench.sizes.asked) for name in scene.materials]
     else:
         recordings = load(data, "biotac", bench.seed)
         train, test = hold_out(recordings, recordings.fold == 0)

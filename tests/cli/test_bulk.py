@@ -126,7 +126,7 @@ class TestLearn:
             assert "is being written by process" in refused("learn", memory, data, "--label", "a")
 
     def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
-        for i in range(400):
+        for i in range(100):
             touch(tmp_path / "many", "silk", i)
         words = [sys.executable, "-c", SLOWLY, "learn", memory, tmp_path / "many", "--label", "silk"]
         process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -140,9 +140,9 @@ class TestLearn:
             process.kill()
         assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
         before = _observed(memory)
-        assert 0 < before < 400
+        assert 0 < before < 100
         found = json.loads(run("learn", memory, tmp_path / "many", "--label", "silk", "--json").stdout)
-        assert (found["touches"], found["skipped"], found["observations"]) == (400 - before, before, 400)
+        assert (found["touches"], found["skipped"], found["observations"]) == (100 - before, before, 100)
 
 
 SLOWLY = """

@@ -36,13 +36,27 @@ def process(*words, shell="", env=(), **options):
     return done, errors
 
 
-@pytest.fixture
-def path(tmp_path):
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+def made(folder):
+    """A memory of two touches in a folder, and beside it the first of them."""
+    with TactileLearner.open(folder / "m", **SETTINGS) as learner:
         for i, name in enumerate(("naïve", "felt")):
             learner.observe(name, stream((i, 60)))
-    np.save(tmp_path / "t.npy", stream((0, 60)))
-    return tmp_path / "m"
+    np.save(folder / "t.npy", stream((0, 60)))
+    return folder / "m"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return made(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def seconds(tmp_path_factory):
+    """How long a prediction takes that nothing interrupts."""
+    folder = tmp_path_factory.mktemp("whole")
+    typed, began = ("predict", made(folder), folder / "t.npy"), time.monotonic()
+    process(*typed)
+    return time.monotonic() - began
 
 
 @pytest.fixture
@@ -179,14 +193,11 @@ def test_an_interrupt_while_a_generation_is_written(path):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_an_interrupt_at_any_time(path, tmp_path, share):
-    whole = time.monotonic()
-    process("predict", path, tmp_path / "t.npy")
-    whole = time.monotonic() - whole
+def test_an_interrupt_at_any_time(path, tmp_path, seconds, share):
     running = begun("print('ready', flush=True)", "predict", path, tmp_path / "t.npy")
     try:
         assert running.stdout.readline() == "ready\n"
-        time.sleep(share * whole)
+        time.sleep(share * seconds)
         running.send_signal(signal.SIGINT)
         _, errors = running.communicate(timeout=60)
     finally:

@@ -240,7 +240,7 @@ class Flipping:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many flips as asked."""
-    flips = 12 if options.quick else options.flips
+    flips = 8 if options.quick else options.flips
     warm()
     with folder(options, in_memory=True) as home:
         flipping = Flipping(home, options.seed)

@@ -1,6 +1,7 @@
 """Early answers: what their probabilities are worth, when they are decided, several touches of one thing."""
 
 import itertools
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,9 +30,15 @@ def learned(touches=TOUCHES, **settings):
     return learner
 
 
+@cache
+def model_of(learner):
+    """The model of a learner that observes nothing more."""
+    return learner.model()
+
+
 def rule_of(learner, risk):
     extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
-    return decision_rule(learner.model(), extractor, risk)
+    return decision_rule(model_of(learner), extractor, risk)
 
 
 @pytest.fixture(scope="module")

@@ -46,6 +46,14 @@ def made(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def others(made, tmp_path_factory):
+    """A memory into which no merge of what is refused brings anything, and what it holds."""
+    path = copied(made / "other", tmp_path_factory.mktemp("others") / "m")
+    with opened(path) as learner:
+        return path, contents(learner)
+
+
 @pytest.fixture
 def path(made, tmp_path):
     return copied(made / "whole", tmp_path / "m")
@@ -62,13 +70,13 @@ def require_refused(path, match, expected=DamageError, others=None, **settings_)
     with pytest.raises(expected, match=match):
         opened(path, **settings_)
     if others is not None:
-        with opened(others) as target:
-            before = contents(target)
+        target_path, before = others
+        with opened(target_path) as target:
             with pytest.raises(expected, match=match) as error:
                 target.merge(path, shared="twice")
             assert str(path) in str(error.value)
             assert contents(target) == before
-        with opened(others) as target:
+        with opened(target_path) as target:
             assert contents(target) == before
     assert any(found for found in check_memory(path))
 
@@ -124,14 +132,14 @@ ROWS = {
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_a_row_that_is_no_observation_is_damage(made, tmp_path, path, name):
+def test_a_row_that_is_no_observation_is_damage(path, others, name):
     match, changes = ROWS[name]
     row = {
         "attributes": {"columns": 60, "nbytes": 480},
         "payload": {"readings": validate(stream((20, 60)), PAD).readings},
     }
     put_row(path, **row | changes)
-    require_refused(path, match, others=copied(made / "other", tmp_path / "other"))
+    require_refused(path, match, others=others)
 
 
 def test_a_row_of_nothing_is_damage(path):
@@ -219,9 +227,9 @@ def test_scales_must_be_those_of_the_touch(made, tmp_path, changes):
         [[1, 2], [2, 3]],
     ],
 )
-def test_a_retraction_is_of_rows_before_it(made, tmp_path, path, sequences):
+def test_a_retraction_is_of_rows_before_it(path, others, sequences):
     put_row(path, kind="retract", label="", key=b"", attributes={} if sequences is None else {"sequences": sequences})
-    require_refused(path, "sequences: expected", others=copied(made / "other", tmp_path / "other"))
+    require_refused(path, "sequences: expected", others=others)
 
 
 def test_a_description_cannot_be_retracted_and_no_observation_twice(path):
@@ -239,9 +247,9 @@ def test_an_observation_cannot_be_retracted_twice(path):
     "constituents",
     ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}],
 )
-def test_a_description_is_one_that_describe_keeps(made, tmp_path, path, constituents):
+def test_a_description_is_one_that_describe_keeps(path, others, constituents):
     put_row(path, kind="describe", label="a", key=b"", attributes={"constituents": constituents})
-    require_refused(path, "constituents", others=copied(made / "other", tmp_path / "other"))
+    require_refused(path, "constituents", others=others)
 
 
 IDENTITIES = {

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from touches import PAD, SETTINGS, contents, fed, stream
+from touches import PAD, SETTINGS, fed, require_same, stream
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
@@ -38,10 +38,7 @@ TOUCHES = [(name, (seed, 40 + 5 * seed)) for seed in range(4) for name in "abc"]
 
 def expected(touches=TOUCHES, **settings):
     """What one learner holds that observed each touch once."""
-    learner = TactileLearner(**SETTINGS | settings)
-    for name, touch in sorted(set(touches)):
-        learner.observe(name, stream(touch).astype(np.float32))
-    return learner
+    return fed(sorted(set(touches)), **settings)
 
 
 def run(destination, sources, options=BY_FOLDER, client=None, **settings):
@@ -51,7 +48,7 @@ def run(destination, sources, options=BY_FOLDER, client=None, **settings):
 def require_learned(destination, touches=TOUCHES, **settings):
     """The memory is that of one process, to the byte, now and when its generation is lost; each touch says its file."""
     with TactileLearner.open(destination) as learner:
-        assert contents(learner) == contents(expected(touches, **settings))
+        require_same(learner, set(touches), **settings)
         assert sum(learner.materials.values()) == len(set(touches))
     return learner
 

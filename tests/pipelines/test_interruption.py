@@ -128,7 +128,7 @@ class TestWithoutAPath:
             assert followed == pytest.approx(dict(answer.ranking), abs=0.2), at
             learner.settle()
             assert learner.predict(stream((99, 30))) == answer, at
-            at += 1 + at // 4
+            at += 1 + at // 3
         assert at > 60
 
     def test_describing(self):

@@ -25,6 +25,7 @@ from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.system import System
 
 OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
+FEWER = OBSERVED[:15]
 PROBES = (("a", 50, 60), ("b", 51, 25), ("c", 52, 6))
 FIT = Draft.fit
 
@@ -82,10 +83,10 @@ def slowly(monkeypatch, seconds):
 
 
 # A touch that is observed, or None for a prediction.
-CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=24)
+CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=16)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(CALLS, st.sampled_from(["lda", "ridge"]), st.sampled_from([0.01, 0.03]))
 def test_the_same_calls_give_the_same_answers_whatever_the_threads_speed(calls, readout, seconds):
     said = []
@@ -104,7 +105,7 @@ def test_the_same_calls_give_the_same_answers_whatever_the_threads_speed(calls, 
     assert said[0] == said[1]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(CALLS, st.sampled_from(["lda", "ridge"]))
 def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
     learner, observed = fed(OBSERVED[:6], readout=readout), list(OBSERVED[:6])
@@ -125,7 +126,7 @@ def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
 def test_what_was_just_observed_counts_and_the_calibration_lags_by_no_more_than_is_said(readout):
     learner = fed([(name, seed) for seed in range(16) for name in "ab"], readout=readout)
-    for i in range(40):
+    for i in range(16):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))
         learner.predict(stream(*PROBES[0]))
         model = learner._current.present(learner._ledger)
@@ -136,19 +137,20 @@ def test_what_was_just_observed_counts_and_the_calibration_lags_by_no_more_than_
 
 
 def test_no_prediction_fits_in_the_foreground_while_touches_come_one_by_one(monkeypatch):
-    learner = fed(OBSERVED)
+    learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
     fitted = []
     monkeypatch.setattr(Draft, "fit", lambda draft: fitted.append(threading.current_thread()) or FIT(draft))
-    for i in range(60):
+    for i in range(24):
         learner.observe("abcd"[i % 4], stream("abcd"[i % 4], 100 + i))
         learner.predict(stream(*PROBES[0]))
     assert len(fitted) >= 3
     assert threading.main_thread() not in fitted
 
 
-def test_many_touches_without_a_question_are_not_kept():
-    learner = fed(OBSERVED)
+def test_many_touches_without_a_question_are_not_kept(monkeypatch):
+    monkeypatch.setattr(current, "MOST_BEHIND", 20)
+    learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
     for i in range(current.MOST_BEHIND + 50):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
@@ -169,7 +171,7 @@ def failing(monkeypatch, what, name, error):
 )
 def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, monkeypatch, what, name):
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
-        for touch in OBSERVED:
+        for touch in FEWER:
             learner.observe(touch[0], stream(*touch))
         if name in ("follow", "judge"):
             learner.predict(stream(*PROBES[0]))
@@ -182,20 +184,20 @@ def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, m
         require_followed(learner)
         learner.settle()
         settled = bits(learner)
-    fresh = fed([*OBSERVED, ("a", 90), ("b", 91)])
+    fresh = fed([*FEWER, ("a", 90), ("b", 91)])
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as again:
         assert bits(again) == settled == bits(fresh)
 
 
 @pytest.mark.parametrize("error", [MemoryError("no room"), InputError("too many"), RuntimeError("no new thread")])
 def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monkeypatch, error):
-    learner = fed(OBSERVED)
+    learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
     with monkeypatch.context() as broken:
         failing(broken, Draft, "of", error)
         for i in range(5):
-            assert learner.observe("a", stream("a", 90 + i)).sequence == len(OBSERVED) + 1 + i
-    fresh = fed([*OBSERVED, *(("a", 90 + i) for i in range(5))])
+            assert learner.observe("a", stream("a", 90 + i)).sequence == len(FEWER) + 1 + i
+    fresh = fed([*FEWER, *(("a", 90 + i) for i in range(5))])
     assert bits(learner) == bits(fresh)
 
 
@@ -319,8 +321,8 @@ def test_a_forked_process_waits_for_no_thread_of_its_parent(fitting):
 
 
 def test_predictions_from_four_threads_while_a_fifth_observes_are_each_of_some_state():
-    observed = [("abcd"[i % 4], 100 + i) for i in range(24)]
-    learner = fed(OBSERVED)
+    observed = [("abcd"[i % 4], 100 + i) for i in range(12)]
+    learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
     said, failures, done = [], [], threading.Event()
 
@@ -347,7 +349,7 @@ def test_predictions_from_four_threads_while_a_fifth_observes_are_each_of_some_s
         assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
         assert np.isfinite(prediction.novelty)
     learner.settle()
-    assert bits(learner) == bits(fed([*OBSERVED, *observed]))
+    assert bits(learner) == bits(fed([*FEWER, *observed]))
 
 
 ENDS = """

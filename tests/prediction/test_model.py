@@ -1,5 +1,7 @@
 """The model: scenes, materials that no sampled touch is of, and readouts that hold only the materials asked for."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 
 NAMES = [f"material {i:02d}" for i in range(12)]
+WINDOWED = Windowed(dimension=64)
 LONG = PAD.model_copy(update={"duration": 4.0})
 
 
@@ -32,8 +35,17 @@ def learner_of(touches=3, sensor=PAD, embedding=SMALL, **settings):
     return learner
 
 
-LEARNERS = {readout: learner_of(readout=readout) for readout in ("lda", "ridge")}
-WINDOWED = {readout: learner_of(readout=readout, embedding=Windowed(dimension=64)) for readout in ("lda", "ridge")}
+@cache
+def shared(readout, embedding=SMALL):
+    """A learner that no test changes."""
+    return learner_of(readout=readout, embedding=embedding)
+
+
+@cache
+def model_of(readout):
+    return shared(readout).model()
+
+
 scenes = st.sets(st.sampled_from(NAMES), min_size=1)
 
 
@@ -47,8 +59,8 @@ def require_same_odds(part, whole, scene):
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(["lda", "ridge"]), scenes, st.integers(50, 90))
 def test_the_probabilities_of_a_scene_are_those_of_its_materials_alone(readout, scene, seed):
-    whole = WINDOWED[readout].predict(stream(seed % 12, seed))
-    part = WINDOWED[readout].predict(stream(seed % 12, seed), scene=sorted(scene, reverse=True))
+    whole = shared(readout, WINDOWED).predict(stream(seed % 12, seed))
+    part = shared(readout, WINDOWED).predict(stream(seed % 12, seed), scene=sorted(scene, reverse=True))
     require_same_odds(part, whole, scene)
 
 
@@ -56,8 +68,8 @@ def test_the_probabilities_of_a_scene_are_those_of_its_materials_alone(readout, 
 @given(st.sampled_from(["lda", "ridge"]), scenes, st.integers(50, 90))
 def test_how_strange_a_view_looks_depends_on_what_can_be_there(readout, scene, seed):
     """So the odds within a scene are those of all only where it holds the best of every scale."""
-    learner, probe = LEARNERS[readout], stream(seed % 12, seed)
-    model, image = learner.model(), tactile_image(validate(probe, PAD))
+    learner, probe = shared(readout), stream(seed % 12, seed)
+    model, image = model_of(readout), tactile_image(validate(probe, PAD))
     means = FeatureExtractor(PAD, SMALL, learner.plan, None).means(image, learner.plan.scales)
     for scale in learner.plan.scales:
         scores = model.readouts[scale].scores(means[scale], np.arange(len(NAMES)), readout)
@@ -66,7 +78,7 @@ def test_how_strange_a_view_looks_depends_on_what_can_be_there(readout, scene, s
 
 
 def test_a_scene_of_ten_thousand_names():
-    learner, probe = LEARNERS["lda"], stream(3, 60)
+    learner, probe = shared("lda"), stream(3, 60)
     assert learner.predict(probe, scene=NAMES * 1000) == learner.predict(probe)
     with pytest.raises(UnknownMaterialError, match="never observed") as raised:
         learner.predict(probe, scene=[*NAMES, *(f"nobody's {i}" for i in range(10_000))])

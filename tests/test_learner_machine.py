@@ -4,6 +4,6 @@ from faults.history import History
 from hypothesis import HealthCheck, settings
 
 History.TestCase.settings = settings(
-    max_examples=12, stateful_step_count=15, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=8, stateful_step_count=15, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestHistory = History.TestCase

@@ -5,6 +5,7 @@ import json
 import pytest
 from commands import run
 
+from examples.benchmarks import live_shift
 from examples.benchmarks.live_shift import _scored
 from scroll_tactile import sensors
 from scroll_tactile.datasets.shift import Shift, Truth
@@ -13,7 +14,8 @@ from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Prediction
 
 
-def test_shifts_are_measured(tmp_path):
+def test_shifts_are_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(live_shift, "LEARNED", 2)
     result = run("bench", "live", "--hours", "0.01", "--json", tmp_path / "live.json")
     assert result.exit_code == 0, result.output
     records = json.loads((tmp_path / "live.json").read_text())["shifts"]

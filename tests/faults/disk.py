@@ -180,7 +180,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         bench = Bench(home)
         if may_mount(home):
             with mounted(home / "disk", SIZE) as disk:
-                pages = [0, 40, 160] if options.quick else [0, 1, 3, *range(8, 240, 8)]
+                pages = [0, 80] if options.quick else [0, 1, 3, *range(8, 240, 8)]
                 full(bench, disk, [4096 * page for page in pages])
                 progress(f"full: {bench.tried} operations, {len(bench.failures)} failures")
                 read_only(bench, disk)

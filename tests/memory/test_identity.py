@@ -226,7 +226,7 @@ def test_an_answer_is_of_one_state(monkeypatch):
         learner.observe("ab"[seed % 2], touch(seed))
     states = {repr(learner.predict(touch(9)))}
     twin, stop = copy.deepcopy(learner), threading.Event()
-    for seed in range(10, 22):
+    for seed in range(10, 16):
         twin.observe("ab"[seed % 2], touch(seed))
         states.add(repr(twin.predict(touch(9))))
     answers: list[str] = []
@@ -237,7 +237,7 @@ def test_an_answer_is_of_one_state(monkeypatch):
 
     thread = threading.Thread(target=ask)
     thread.start()
-    for seed in range(10, 22):
+    for seed in range(10, 16):
         learner.observe("ab"[seed % 2], touch(seed))
     stop.set()
     thread.join()

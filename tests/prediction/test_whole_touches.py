@@ -25,7 +25,14 @@ def learned(touches, embedding):
     return learner
 
 
-VIEWED, WINDOWED = (learned(TOUCHES, kind(dimension=256)) for kind in (Kernels, Windowed))
+@pytest.fixture(scope="module")
+def viewed():
+    return learned(TOUCHES, Kernels(dimension=256))
+
+
+@pytest.fixture(scope="module")
+def windowed():
+    return learned(TOUCHES, Windowed(dimension=256))
 
 
 def right(learner, asked, change=lambda touch: touch):
@@ -44,19 +51,19 @@ def lasting(times):
 
 
 @pytest.mark.parametrize("times", [2, 4])
-def test_a_slower_touch_longer_than_any_learned_is_known_by_its_views_and_lost_without(times):
-    assert right(VIEWED, ASKED, lasting(times)) >= 0.95
-    assert right(WINDOWED, ASKED, lasting(times)) <= 0.5
+def test_a_slower_touch_longer_than_any_learned_is_known_by_its_views_and_lost_without(viewed, windowed, times):
+    assert right(viewed, ASKED, lasting(times)) >= 0.95
+    assert right(windowed, ASKED, lasting(times)) <= 0.5
 
 
-def test_a_faster_touch_is_better_known_with_views():
-    assert right(VIEWED, ASKED, lasting(0.5)) > max(0.85, right(WINDOWED, ASKED, lasting(0.5)))
+def test_a_faster_touch_is_better_known_with_views(viewed, windowed):
+    assert right(viewed, ASKED, lasting(0.5)) > max(0.85, right(windowed, ASKED, lasting(0.5)))
 
 
 @pytest.mark.parametrize("seconds", [0.3, 0.5, 0.7])
-def test_beginnings_are_judged_as_before(seconds):
+def test_beginnings_are_judged_as_before(viewed, windowed, seconds):
     beginning = [(material, touch.first(seconds)) for material, touch in ASKED]
-    assert right(VIEWED, beginning) >= right(WINDOWED, beginning) - 1 / len(ASKED) >= 0.9
+    assert right(viewed, beginning) >= right(windowed, beginning) - 1 / len(ASKED) >= 0.9
 
 
 def test_beginnings_after_one_touch_of_each_are_judged_by_windows_alone():
@@ -98,9 +105,9 @@ def test_materials_that_were_only_ever_touched_briefly(kind):
             assert learner.predict(touch.first(seconds), scene=[name]).probability == 1
 
 
-def test_joined_kernels_have_views():
+def test_joined_kernels_have_views(viewed):
     joined = learned(TOUCHES, Joined(Kernels(dimension=128), Kernels(seed=2, dimension=128)))
-    assert joined.plan.views == VIEWED.plan.views != ()
+    assert joined.plan.views == viewed.plan.views != ()
     assert right(joined, ASKED, lasting(2)) >= 0.95
     mixed = learned(TOUCHES[:16], Joined(Kernels(dimension=64), Windowed(seed=2, dimension=64)))
     assert mixed.plan.views == ()
@@ -116,13 +123,13 @@ def test_touches_of_two_readings_and_of_one_value_are_answered(readout):
         assert np.isfinite([prediction.novelty, *(share for _, share in prediction.ranking)]).all()
 
 
-def test_of_many_materials_the_answer_is_that_of_few(monkeypatch):
+def test_of_many_materials_the_answer_is_that_of_few(monkeypatch, viewed):
     """Beyond a thousand, scores in single precision choose those that are solved for; here beyond four."""
     for module in ("prediction.model", "readouts.readout"):
         monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 4)
     many = learned(TOUCHES, Kernels(dimension=256))
     for times in (0.5, 1, 2):
         for _, touch in ASKED[::3]:
-            ours, theirs = (learner.predict(lasting(times)(touch)) for learner in (VIEWED, many))
+            ours, theirs = (learner.predict(lasting(times)(touch)) for learner in (viewed, many))
             assert dict(theirs.ranking) == pytest.approx(dict(ours.ranking), rel=1e-5, abs=1e-6)
             assert theirs.novelty == pytest.approx(ours.novelty, rel=1e-6, abs=1e-6)

@@ -24,6 +24,12 @@ if os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free > 2**32:
 UNPACK = Path(__file__).parents[2] / "shared" / "data" / "unpack.py"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers are as many as cores: each computes on one, but where a test says how many."""
+    if config.getoption("numprocesses", None):
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of BioTac-20 and RoboSkin-20 as published; skips where the data is not at hand."""

@@ -204,8 +204,13 @@ def seal(path: Path, row: Named, identity: Any = None) -> None:
         known |= {"attributes": json.loads(row.attributes)} | (content if isinstance(content, Mapping) else {})
     except (ValueError, RecursionError):
         return  # no JSON: the group stays as it was
-    group["attributes"] = known | {"sha256": hashlib.sha256(as_text(known).encode("ascii")).hexdigest()}
+    group["attributes"] = sealed(known)
     header.write_text(json.dumps(group), encoding="utf-8")
+
+
+def sealed(known: Mapping[str, Any]) -> dict[str, Any]:
+    """What a generation's group says of itself, with the sha256 of it."""
+    return {**known, "sha256": hashlib.sha256(as_text(dict(known)).encode("ascii")).hexdigest()}
 
 
 def put_arrays(path: Path, row: Named, arrays: Mapping[str, np.ndarray]) -> Named:

@@ -270,7 +270,7 @@ def test_a_material_felt_only_for_a_moment_beside_others_felt_for_long(readout):
 @pytest.mark.parametrize("duration", [0.5, 0.6, 0.61, 0.65, 0.7, 0.72, 0.75])
 def test_a_sensor_whose_touches_are_hardly_long_enough_for_two_scales(duration):
     learner = TactileLearner(sensor=PAD.model_copy(update={"name": "brief", "duration": duration}), embedding=SMALL)
-    for repetition in range(12):
+    for repetition in range(6):
         for name in NAMES:
             learner.observe(name, touch(name, repetition, readings=20 if repetition % 2 else 75))
     for readings in (10, 20, 29, 30, 35, 75):

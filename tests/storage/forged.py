@@ -1,37 +1,24 @@
 """Rows, payloads and generations as somebody else could make them: their checksums are right, as these have no key."""
 
-import hashlib
 import json
-import sqlite3
-import struct
 import subprocess
 import sys
 import textwrap
-from contextlib import closing
+
+from forging import Named, Packed, as_text, name_generation, pack, sealed
 
 from store.content import ArrayContent
 from store.encoding import array_digest
-from store.records import checksum
 
 
-def payload(arrays, version=1, after=b""):
+def payload(arrays, version=1):
     """The bytes of a payload; arrays: (name, dtype, shape, codec, bytes of the array, buffer)."""
-    head, buffers = struct.pack("<4sBH", b"ARPL", version, len(arrays)), b""
-    for name, dtype, shape, codec, size, buffer in arrays:
-        for text in (name, dtype):
-            head += struct.pack("<B", len(text)) + text.encode()
-        head += struct.pack(f"<B{len(shape)}Q", len(shape), *shape) + struct.pack("<BQQ", codec, size, len(buffer))
-        buffers += buffer
-    return head + buffers + after
+    return pack([Packed(*array) for array in arrays], version)
 
 
 def put_generation(path, number, content, *, upto=1, base=0, time=1.0, attributes="{}"):
     """Name a generation in the journal of the store in `path`; content: JSON's values, or its text."""
-    text = content if isinstance(content, str) else json.dumps(content)
-    fields = (number, upto, base, time, attributes, text)
-    stored = checksum("generation", *(part.encode() if isinstance(part, str) else part for part in fields))
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
-        connection.execute("INSERT OR REPLACE INTO generation VALUES (?,?,?,?,?,?,?)", (*fields, stored))
+    name_generation(path, Named(number, upto, base, time, attributes, as_text(content)))
 
 
 def describe_again(folder, **changes):
@@ -40,8 +27,7 @@ def describe_again(folder, **changes):
     group = json.loads(header.read_text())
     known = group["attributes"] | changes
     known.pop("sha256", None)
-    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
-    group["attributes"] = known | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    group["attributes"] = sealed(known)
     header.write_text(json.dumps(group))
     return {"format": known["format"], "arrays": known["arrays"]}
 
@@ -70,9 +56,7 @@ def write_first_format(folder, arrays, *, rows=None, level=3, **known):
     }
     content = {"format": 1, "arrays": described}
     known = {"number": 1, "upto": 1, "attributes": {}, "identity": {}} | known | content
-    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
-    attributes = known | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
-    group = zarr.create_group(store=LocalStore(folder), zarr_format=3, attributes=attributes)
+    group = zarr.create_group(store=LocalStore(folder), zarr_format=3, attributes=sealed(known))
     for name, array in arrays.items():
         plain = array.view("<u4").reshape(*array.shape, -1) if array.dtype.kind == "U" else array
         chunks = {"chunks": ArrayContent(array.dtype, array.shape, "").chunk}

@@ -61,8 +61,8 @@ def test_so_little_that_stands_for_so_much_is_kept_as_it_is_and_read_back(opened
 FOUR = b"abcd"
 FORGED = {
     "nothing": b"",
-    "no arrays but bytes": payload([], after=b"x"),
-    "bytes behind the last buffer": payload([("x", "|u1", (4,), 0, 4, FOUR)], after=b"x"),
+    "no arrays but bytes": payload([]) + b"x",
+    "bytes behind the last buffer": payload([("x", "|u1", (4,), 0, 4, FOUR)]) + b"x",
     "fewer arrays than said": struct.pack("<4sBH", b"ARPL", 1, 3),
     "format 0": payload([], version=0),
     "a terabyte": payload([("x", "<f8", (2**37,), 0, 2**40, b"")]),

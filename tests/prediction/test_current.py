@@ -141,7 +141,7 @@ def test_no_prediction_fits_in_the_foreground_while_touches_come_one_by_one(monk
     learner.predict(stream(*PROBES[0]))
     fitted = []
     monkeypatch.setattr(Draft, "fit", lambda draft: fitted.append(threading.current_thread()) or FIT(draft))
-    for i in range(24):
+    for i in range(12):
         learner.observe("abcd"[i % 4], stream("abcd"[i % 4], 100 + i))
         learner.predict(stream(*PROBES[0]))
     assert len(fitted) >= 3

@@ -30,7 +30,15 @@ if TYPE_CHECKING:
     from scroll_tactile.embeddings.frames import Frames
     from scroll_tactile.embeddings.vision import Vision
 
-__all__ = ["MOST_DEPTH", "MOST_PARTS", "configuration_of", "from_configuration", "guess", "picture_to_json"]
+__all__ = [
+    "MOST_DEPTH",
+    "MOST_PARTS",
+    "configuration_of",
+    "from_configuration",
+    "guess",
+    "picture_to_json",
+    "require_configuration",
+]
 
 MOST_DEPTH: Final = 16  # mappings and lists within each other
 LIKELY_SEEDS = 8  # of kernels, a few milliseconds each
@@ -170,6 +178,11 @@ def from_configuration(configuration: Mapping[str, Any]) -> Embedding:
     cannot be had or read, InputError where a package for its runtime is missing.
     """
     return _made(_validated(configuration))
+
+
+def require_configuration(configuration: Mapping[str, Any]) -> None:
+    """Raise EmbeddingError for what `from_configuration` would make nothing of; nothing is made or fetched."""
+    _validated(configuration)
 
 
 def guess(name: str, dimension: int, fingerprint: str, sensor: Sensor) -> Embedding | None:

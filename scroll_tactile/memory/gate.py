@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.errors import MismatchError
+from scroll_tactile.embeddings.registry import require_configuration
+from scroll_tactile.errors import EmbeddingError, MismatchError
 from scroll_tactile.memory.expected import Unexpected
 from scroll_tactile.memory.generation_checks import GenerationChecks
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
@@ -189,7 +190,9 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
             identity = Identity.read(store)
             plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
             store.read_with(plan, thorough=True)
-        except (DamageError, MismatchError) as error:
+            if identity.embedding.configuration is not None and not identity.embedding.gone:
+                require_configuration(identity.embedding.configuration)
+        except (DamageError, EmbeddingError, MismatchError) as error:
             return [str(error)]
         heads, wrong = _in_rows(store)
         return [*_in_generations(store, heads), *wrong]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from touches import PAD, SETTINGS, contents, filled, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner
-from scroll_tactile.errors import MismatchError, ScrollTactileError
+from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.signals.stream import validate
@@ -525,6 +525,16 @@ def test_an_identity_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_p
     part[data.draw(st.sampled_from(sorted(part)))] = data.draw(JUNK)
     set_identity(path, json.dumps(identity))
     require_typed_or_equal(path)
+
+
+@pytest.mark.parametrize("configuration", [{}, {"kind": "no such"}, {"kind": "kernels", "dimension": 64, "more": 1}])
+def test_a_configuration_that_makes_nothing_is_found_before_it_is_opened(path, configuration):
+    identity = get_identity(path)
+    identity["embedding"]["configuration"] = configuration
+    set_identity(path, json.dumps(identity))
+    assert any("configuration" in found for found in check_memory(path))
+    with pytest.raises(EmbeddingError):
+        opened(path)
 
 
 def test_copies_have_bounds():

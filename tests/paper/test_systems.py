@@ -112,13 +112,13 @@ QUICK = Course(epochs=12, batch=8)
 @pytest.fixture(scope="module")
 def catalogue(weights: str) -> Catalogue:
     """One for all tests: what was embedded is remembered."""
-    return Catalogue(weights, QUICK, every=4)
+    return Catalogue(weights, QUICK, every=4, channels=PATCH.channels)
 
 
 @pytest.fixture(scope="module")
 def new(weights: str) -> Catalogue:
     """Of which nothing was fitted."""
-    return Catalogue(weights, QUICK)
+    return Catalogue(weights, QUICK, channels=PATCH.channels)
 
 
 @pytest.mark.parametrize("key", SYSTEMS)

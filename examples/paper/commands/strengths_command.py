@@ -134,7 +134,9 @@ def strengths(
                 recordings = subset(recordings, materials)
             every = columns_averaged(recordings.sensor) if quick else 1
             recordings = thinned(recordings, thin)
-            makes, settings = _systems(keys, Catalogue(weights, course, device.value, every, seed), recordings, seed)
+            channels = recordings.sensor.channels
+            catalogue = Catalogue(weights, course, device.value, every, seed, channels=channels)
+            makes, settings = _systems(keys, catalogue, recordings, seed)
             folder = None if run is None else run / recordings.name
             studies = _studies(study, recordings)
             task = Strengths(recordings, makes, settings, studies, plain=(OURS,), seed=seed, quick=quick, folder=folder)

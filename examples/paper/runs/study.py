@@ -134,8 +134,9 @@ class SystemStudy:
 
     def _catalogue(self, recordings: Recordings) -> Catalogue:
         every = columns_averaged(recordings.sensor) if self.quick else 1
-        camera = recordings.sensor.camera
-        return Catalogue(self.weights, self.course, self.device, every, self.seed, camera=camera)
+        sensor = recordings.sensor
+        made = self.weights, self.course, self.device, every, self.seed
+        return Catalogue(*made, channels=sensor.channels, camera=sensor.camera)
 
 
 def require_code(notes: RunFile, key: str) -> None:

@@ -10,8 +10,9 @@ from functools import cached_property
 from torch import nn
 
 from examples.paper.runs.cached import Cached
-from examples.paper.studies.peers import StreamingLDA
-from examples.paper.systems.controls import NearestNeighbour, OnFeatures, random_conv1d
+from examples.paper.studies.peers import NearestNeighbour, StreamingLDA
+from examples.paper.studies.random_convolution import random_convolution
+from examples.paper.systems.controls import OnFeatures
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
@@ -75,8 +76,9 @@ class Catalogue:
     course: of the networks' training, in whose precision the residual ones alone are trained: the others are small.
     device: of all networks but ours. every: columns that the residual networks' images are averaged over (1: as
     recorded). seed: of the control's random weights. augmentation: of every touch that a network is trained on, in
-    every epoch; the paper's table has none. camera: whether frames are read: then ours are `Frames`, by its counts in
-    place of kernels, and by its network in place of vision.
+    every epoch; the paper's table has none. channels: of the sensor, which the control's filters are for. camera:
+    whether frames are read: then ours are `Frames`, by its counts in place of kernels, and by its network in place of
+    vision.
     """
 
     weights: str | os.PathLike[str] | None = None
@@ -85,6 +87,7 @@ class Catalogue:
     every: int = 1
     seed: int = 0
     augmentation: Augmentation | None = None
+    channels: int = 1
     camera: bool = False
     _embeddings: dict[str, Embedding] = field(default_factory=dict, repr=False)
 
@@ -169,7 +172,7 @@ class Catalogue:
 
     @cached_property
     def _random_conv1d(self) -> Embedding:
-        return Cached(random_conv1d(self.seed))
+        return Cached(random_convolution(self.channels, self.seed))
 
     @cached_property
     def _both(self) -> Embedding:

@@ -1,26 +1,18 @@
-"""Controls beside ours: plain rules on the features that ours reads, and features that nobody designed or trained."""
+"""Controls beside ours: plain rules on the features that ours reads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-import numpy.typing as npt
-import torch
-from torch import nn
-
 from examples.paper.studies.peers import ContinualPeer, touch_features
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile import Embedding
-from scroll_tactile.embeddings.modules import ModuleEmbedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["NearestNeighbour", "OnFeatures", "random_conv1d"]
-
-FloatArray = npt.NDArray[np.float64]
+__all__ = ["OnFeatures"]
 
 
 class OnFeatures:
@@ -54,61 +46,3 @@ class OnFeatures:
         if self._learned is None:
             raise InputError(f"{self.name} has learned nothing yet: call fit first")
         return self._learned.predict(touch_features(self._embedding, streams)) if streams else []
-
-
-class NearestNeighbour(ContinualPeer):
-    """The material of the nearest touch of all that were met, by the angle between features."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._met: list[FloatArray] = []
-        self._places: list[int] = []
-
-    def observe(self, features: FloatArray, material: str) -> None:
-        """Keep the touch."""
-        self._met.append(_unit(features))
-        self._places.append(self._place(material))
-
-    def scores(self, features: FloatArray) -> FloatArray:
-        """The cosine of the angle to the nearest touch of each material."""
-        likeness = _unit(features) @ np.stack(self._met).T
-        places = np.array(self._places)
-        return np.stack([likeness[:, places == i].max(axis=1) for i in range(len(self.materials))], axis=1)
-
-
-def _unit(features: FloatArray) -> FloatArray:
-    length = np.linalg.norm(features, axis=-1, keepdims=True)
-    unit: FloatArray = features / np.where(length > 0, length, 1.0)
-    return unit
-
-
-CHANNELS = 64  # at most, of a sensor
-FILTERS = 256
-WIDTH = 9
-
-
-class _RandomConv1d(nn.Module):
-    """Two layers of normally distributed filters along time; their means and maxima over it, through tanh."""
-
-    first: torch.Tensor
-    second: torch.Tensor
-
-    def __init__(self, seed: int) -> None:
-        super().__init__()
-        random = torch.Generator().manual_seed(seed)
-        self.register_buffer("first", torch.randn(FILTERS, CHANNELS, WIDTH, generator=random))
-        self.register_buffer("second", torch.randn(FILTERS, FILTERS, WIDTH, generator=random))
-
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        channels = image.shape[1]
-        # √(2 / inputs): He's scale, at which responses neither die nor grow.
-        found = nn.functional.conv1d(image, self.first[:, :channels], padding=WIDTH // 2, stride=2)
-        found = torch.relu(found * (2 / (channels * WIDTH)) ** 0.5)
-        found = nn.functional.conv1d(found, self.second, padding=WIDTH // 2, stride=2)
-        found = torch.relu(found * (2 / (FILTERS * WIDTH)) ** 0.5)
-        return torch.tanh(torch.cat([found.mean(dim=-1), found.amax(dim=-1)], dim=1))
-
-
-def random_conv1d(seed: int = 0) -> ModuleEmbedding:
-    """An untrained network as an embedding of 512 features, for sensors of at most 64 channels."""
-    return ModuleEmbedding(_RandomConv1d(seed), name="random Conv1d", dimension=2 * FILTERS)

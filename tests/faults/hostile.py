@@ -196,7 +196,7 @@ class Hostile:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many cases as asked."""
-    cases = min(500, options.cases) if options.quick else options.cases
+    cases = min(2000, options.cases) if options.quick else options.cases
     if options.quick:
         options.seconds = max(options.seconds, 60)  # with the tests, which may run on any machine
     if options.without == "gate":

@@ -50,12 +50,15 @@ def test_noise_hides_how_touches_differ(likelihood):
     assert certainty[-1] < 0.01
 
 
-def test_only_the_latest_tables_are_kept(likelihood):
+def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):
+    make, made = Likelihood._made, []
+    monkeypatch.setattr(Likelihood, "_made", lambda self, noise: made.append(noise) or make(self, noise))
     first = likelihood.table(Noise(0)).logs
     for step in range(1, MOST_TABLES + 2):
         likelihood.table(Noise(step))
-    assert likelihood.table(Noise(0)).logs is not first
     assert np.array_equal(likelihood.table(Noise(0)).logs, first)
+    assert likelihood.table(Noise(0)).logs is likelihood.table(Noise(0)).logs
+    assert made == [*map(Noise, range(MOST_TABLES + 2)), Noise(0)]
 
 
 def test_neighbours_of_a_noise_stay_between_the_least_and_the_whole_range():

@@ -25,7 +25,9 @@ def state(upto):
 
 
 def add(opened, number):
-    return opened.append("a", f"row {number}", bytes([number]), arrays={"x": values(number)}, attributes={"n": number})
+    return opened.append(
+        "a", f"row {number}", bytes([number % 256]), arrays={"x": values(number)}, attributes={"n": number}
+    )
 
 
 def commit(call, upto):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-FAULTS = Path(__file__).parent / "faults"
+FAULTS = Path(__file__).parent
 COUNTS = {
     "kill": "kills",
     "each_call": "calls",

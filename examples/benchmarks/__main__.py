@@ -15,11 +15,12 @@ from rich.table import Table
 from examples.benchmarks.buffers import run_buffers
 from examples.benchmarks.fleet import run_fleet
 from examples.benchmarks.interleaved import run_interleaved
-from examples.benchmarks.live_decision import RECORDED, run_decisions, show_decisions
+from examples.benchmarks.live_decision import run_decisions, show_decisions
 from examples.benchmarks.live_shift import run_shifts, show_shifts
 from examples.benchmarks.node_latency import run_node, show_node
 from examples.benchmarks.show_speed import show_interleaved, show_speed, show_vision
 from examples.benchmarks.speed import Sizes, run_speed
+from examples.benchmarks.timing import circumstances
 from examples.benchmarks.vision_speed import run_vision
 from examples.paper.commands.sets import Dataset, parse_folds, read, require_folders, write_result
 from scroll_tactile import Kernels
@@ -132,7 +133,7 @@ def decisions(
             chosen = parse_folds(folds, recordings)
             results.append(run_decisions(recordings, chosen, every=every, folder=folder, progress=progress))
     show_decisions(results)
-    _written(context, json, {"sets": results, "recorded": RECORDED})
+    _written(context, json, {"bench": "decisions", **circumstances(seed), "sets": results})
 
 
 @app.command()

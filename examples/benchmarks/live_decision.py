@@ -28,7 +28,7 @@ from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["RECORDED", "run_decisions", "show_decisions"]
+__all__ = ["run_decisions", "show_decisions"]
 
 Record = dict[str, Any]
 Progress = Callable[[str, int, int], object]
@@ -40,15 +40,7 @@ TWICE = 0.7  # the probability of the untuned rule, that has to be reached twice
 TOGETHER = (1, 2, 3)  # touches of one thing, for novelty
 ECE_AT = (0.1, 0.2, 0.3, 0.5, 1.0)  # seconds
 
-RECORDED = {
-    "aeon: TEASER, BioTac-20 fold 0": {"accuracy": 0.905, "seconds": 0.55, "harmonic": 0.883, "fit_seconds": 119},
-    "probability ≥ 0.7 twice running, before calibration, fold 0": {
-        "accuracy": 0.935,
-        "seconds": 0.54,
-        "harmonic": 0.899,
-    },
-}
-"""Of the same touches and fold, measured once in an environment of their own (aeon is not one of the packages here)."""
+PEERS = Path(__file__).parent / "results" / "aeon-early.json"  # aeon goes with other packages: see `aeon_early`
 
 
 def run_decisions(
@@ -234,9 +226,9 @@ def show_decisions(results: Sequence[Record]) -> None:
             wrong = f"{percent(found['wrong'])} ± {percent(found['standard_error'])}"
             shares = (percent(found["undecided"]), percent(found["accuracy"]), f"{found['seconds']:.2f}")
             table.add_row(result["set"], name, wrong, *shares, f"{found['harmonic']:.3f}")
-    for name, recorded in RECORDED.items():
-        table.add_row(name, "recorded", "", "", percent(recorded["accuracy"]), f"{recorded['seconds']:.2f}",
-                      f"{recorded['harmonic']:.3f}")  # fmt: skip
+    for peer in json.loads(PEERS.read_text(encoding="utf-8"))["means"]:
+        shares = percent(peer["accuracy"]), f"{peer['seconds']:.2f}", f"{peer['harmonic']:.3f}"
+        table.add_row("BioTac-20, as recorded", peer["system"], "", "", *shares)
     console().print(table)
     table = Table("set", *(f"ECE at {seconds} s" for seconds in ECE_AT), *(f"AUROC, {n}" for n in TOGETHER), "coverage",
                   "least of a material", "mean size")  # fmt: skip

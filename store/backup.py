@@ -5,20 +5,21 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from tempfile import mkdtemp
 
 from store.exceptions import DamageError, NotAStoreError, reported
-from store.files import is_real_folder, read_regular, remove_tree, same_folder, sync_folder, sync_tree
+from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
 from store.groups import PARTIAL, folder_name
 from store.reader import JournalReader
 from store.schema import GENERATIONS, JOURNAL_FILE
 from store.survey import Progress, check_store
 
 __all__ = ["back_up"]
+
+LARGEST_FILE = 2**30  # of a generation
 
 
 def back_up(source: Path, destination: Path, named: Callable[[], set[int]], progress: Progress | None) -> None:
@@ -80,7 +81,7 @@ def _copy_tree(source: Path, target: Path) -> None:
         if is_real_folder(entry):
             _copy_tree(entry, target / entry.name)
         else:
-            (target / entry.name).write_bytes(read_regular(entry, sys.maxsize))
+            copy_regular(entry, target / entry.name, LARGEST_FILE)
 
 
 def _verify(source: Path, draft: Path, progress: Progress | None) -> None:

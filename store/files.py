@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from store.exceptions import DamageError, NotAStoreError, StoreFullError
 
@@ -19,6 +21,7 @@ else:
 
 __all__ = [
     "CAREFULLY",
+    "copy_regular",
     "file_size",
     "is_real_folder",
     "read_regular",
@@ -34,6 +37,8 @@ __all__ = [
 
 # Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
 CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+PART = 2**20  # bytes that are copied at once
 
 
 def sync_file(path: Path) -> None:
@@ -109,6 +114,18 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
             break
         if folder.is_symlink():
             raise DamageError(f"{folder} is a symbolic link, where a store has a folder of its own", path=folder)
+    with _regular(path, limit) as (file, size):
+        return file.read(size)
+
+
+def copy_regular(path: Path, target: Path, limit: int) -> None:
+    """Copy a regular file of at most `limit` bytes, a part at a time. Raises DamageError, OSError."""
+    with _regular(path, limit) as (file, _), target.open("xb") as copy:
+        shutil.copyfileobj(file, copy, PART)
+
+
+@contextmanager
+def _regular(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
     # Before it is opened: to open a device can already do something.
     if not stat.S_ISREG(path.lstat().st_mode):
         raise DamageError(f"{path} is no regular file", path=path)
@@ -117,7 +134,7 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
             raise DamageError(f"{path} has {found.st_size} bytes; at most {limit} are read there", path=path)
-        return file.read(found.st_size)
+        yield file, found.st_size
 
 
 def require_room(folder: Path, *files: Path) -> None:

@@ -568,3 +568,12 @@ def test_a_file_of_holes_fills_no_disk(tmp_path):
     os.truncate(crashed / JOURNAL, 2**43)
     with pytest.raises(StoreFullError, match="copy of"):
         read_all(crashed)
+
+
+def test_a_file_of_holes_is_not_copied(tmp_path):
+    path = build(tmp_path / "s")
+    with (path / "generations" / "00000002" / "rows" / "zarr.json").open("r+b") as file:
+        file.truncate(2**40)
+    with Store.open(path, mode="read") as reader, pytest.raises(DamageError, match="at most"):
+        reader.backup(tmp_path / "copy")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]

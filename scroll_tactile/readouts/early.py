@@ -6,10 +6,10 @@ model in 54, after 0.5 s in 83 and 94. So at each moment t of a touch that may g
     p_y = (1 − ε_t) q_y + ε_t / C,    q_y ∝ exp(g_t log d_y + β_t S_y),
 
 d the model's probabilities, S the log-likelihoods of the kept touches, and (g_t, β_t) ≥ 0 of least log loss on the
-beginnings of touches left out, at this moment and those next to it: two weights of 64 touches alone were at times so
-sure that a tenth was decided wrongly where a twentieth may be. So a probability is what it says at each moment; ε_t is
-the share of touches that are unlike all others of their material, and no less than n of them can rule out. Novelty has
-the mean and the spread of theirs. A beginning is judged as at the latest moment that it reached.
+beginnings of touches left out, drawn to those of this moment and of the ones next to it together: by themselves they
+are at times too sure, and shared alone they lose answers. So a probability is what it says at each moment; ε_t is the
+share of touches that are unlike all others of their material, and no less than n of them can rule out. Novelty has the
+mean and the spread of theirs. A beginning is judged as at the latest moment that it reached.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ MOST_MOMENTS = 12  # of a touch
 NEAR = 1.25  # times a milestone, or one over it: then that is the moment
 PRIOR = np.array([0.5, 0.03])  # g and β: about what both sensors' beginnings come to
 PRIOR_TOUCHES = 0.05  # that it counts as: of short touches with few channels β is ten times as much
+SHARED_TOUCHES = 10.0  # that the weights of a moment and those next to it count as
+LEAST_PRIOR = 1e-3
 ODD = 0.5  # touches more than those left out that are odd
 LEAST_SPREAD = 1e-9
 STEPS = 100  # of EM
@@ -163,16 +165,21 @@ def early_of(heard: Sequence[Heard], targets: npt.NDArray[np.intp]) -> Early | N
 
 
 def _fitted(said: Heard, near: Sequence[Heard]) -> Moment:
-    """A moment, with the weights of what was said there and at the moments near it, this one among them."""
-    scores = np.concatenate([np.stack([other.logs, other.scores], axis=1) for other in near])
-    targets = np.concatenate([other.targets for other in near]).tolist()
-    trusted, steepness = fit_weights(scores, targets, PRIOR, PRIOR_TOUCHES).tolist()
+    """A moment; near: what was said at the moments near it, this one among them."""
+    shared = np.maximum(_weights(near, PRIOR, PRIOR_TOUCHES), LEAST_PRIOR)
+    trusted, steepness = _weights([said], shared, SHARED_TOUCHES).tolist()
     # r, of which β is 1 / (1 + (1/r − 1) c) where the certainty is that of these beginnings.
     recalled = 1 / (1 + max(1 / max(steepness, LEAST_SPREAD) - 1, 0.0) / said.certainty)
     usual, spread = float(said.novelty.mean()), max(float(said.novelty.std()), LEAST_SPREAD)
     moment = Moment(said.columns, trusted, recalled, 0.0, usual, spread, np.sort((said.novelty - usual) / spread))
     own = moment.chances(said)[np.arange(len(said.targets)), said.targets]
     return replace(moment, odd=_odd(own, said.logs.shape[1]))
+
+
+def _weights(said: Sequence[Heard], prior: FloatArray, touches: float) -> FloatArray:
+    """g and β for what was said at some moments together."""
+    scores = np.concatenate([np.stack([heard.logs, heard.scores], axis=1) for heard in said])
+    return fit_weights(scores, np.concatenate([heard.targets for heard in said]).tolist(), prior, touches)
 
 
 def _odd(own: FloatArray, materials: int) -> float:

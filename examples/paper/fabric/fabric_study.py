@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import over_folds
+from examples.paper.runs.cells import over_folds, require_folds
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Maps
 from scroll_tactile.datasets import Recordings
@@ -68,9 +68,7 @@ class Letters:
 
         Raises InputError for a fold that is not there, and what learning raises.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "letters.json", self.plan)
         names = np.array(self.recordings.materials)
         parts: list[tuple[str, str, int, Mask]] = [

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from examples.paper.fabric.unseen import fit_heads
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import data_digest, over_folds
+from examples.paper.runs.cells import data_digest, over_folds, require_folds
 from examples.paper.runs.study import weights_digest
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Frames
@@ -91,9 +91,7 @@ class Objects:
 
         Raises InputError for a fold that is not there or where scikit-learn is missing, and what learning raises.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "objects.json", self.plan)
         for by in self._embeddings:
             for fold in folds:

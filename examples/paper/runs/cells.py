@@ -9,6 +9,7 @@ from hashlib import blake2b
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
@@ -26,6 +27,7 @@ __all__ = [
     "over_folds",
     "pooled",
     "require_data",
+    "require_folds",
     "run_cells",
     "split",
     "thinned",
@@ -183,6 +185,13 @@ def data_digest(recordings: Recordings) -> str:
     for stream, material, fold in zip(recordings.streams, recordings.materials, recordings.fold.tolist(), strict=True):
         digest.update(stream.key + f"{material}\n{fold}\n".encode())
     return digest.hexdigest()
+
+
+def require_folds(fold: npt.NDArray[np.intp], folds: Sequence[int]) -> None:
+    """Raise InputError for folds that are not there, and for none. fold: of each touch."""
+    there = sorted(set(fold.tolist()))
+    if not folds or set(folds) - set(there):
+        raise InputError(f"expected folds out of {there}; came {list(folds)}")
 
 
 def require_data(notes: RunFile, recordings: Recordings) -> None:

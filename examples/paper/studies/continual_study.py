@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from examples.paper.runs.cached import Cached
+from examples.paper.runs.cells import require_folds
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
@@ -94,9 +95,7 @@ class Continual:
 
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "continual.json", self.plan)
         embedding = Cached(self.embedding)
         for fold in folds:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
+from examples.paper.runs.cells import Cell, Figures, require_data, require_folds, run_cells
 from examples.paper.studies.continual_metrics import METRICS, metrics
 from examples.paper.studies.fleet_study import Fleet
 from examples.paper.studies.peers import (
@@ -102,9 +102,7 @@ class ContinualMetrics:
 
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "metrics.json", self.plan)
         require_data(notes, self.recordings)
         for fold in folds:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.cells import over_folds
+from examples.paper.runs.cells import over_folds, require_folds
 from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile import Kernels
 from scroll_tactile.datasets import Recordings
@@ -79,9 +79,7 @@ class Replay:
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
         places = self.recordings.blocked() if self.blocked else self.recordings.fold
-        there = sorted(set(places.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(places, folds)
         notes = RunFile(None if self.folder is None else self.folder / "replay.json", self.plan)
         for fold in folds:
             name = f"fold-{fold}"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.cells import over_folds, require_data
+from examples.paper.runs.cells import over_folds, require_data, require_folds
 from examples.paper.studies.default_learner import Answering, Answers, answers
 from examples.paper.studies.replay import novelty_area, rotations
 from scroll_tactile.datasets import Recordings
@@ -142,9 +142,7 @@ class Robustness:
 
         Raises InputError for a fold that is not there or a folder of another run.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "robustness.json", self.plan)
         require_data(notes, self.recordings)
         for fold in folds:

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from examples.paper.runs.cells import over_folds, require_data
+from examples.paper.runs.cells import over_folds, require_data, require_folds
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
@@ -160,9 +160,7 @@ class Strengths:
         Raises InputError for a fold that is not there, a folder of another run, or one that holds what a system gave
         under other settings.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "strengths.json", self.plan)
         require_data(notes, self.recordings)
         for name in self.systems:

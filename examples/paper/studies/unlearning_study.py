@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, require_data, run_cells
+from examples.paper.runs.cells import Cell, Figures, require_data, require_folds, run_cells
 from examples.paper.studies.peers import touch_features
 from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.studies.replay import Progress
@@ -157,9 +157,7 @@ class Unlearning:
 
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
-        there = sorted(set(self.recordings.fold.tolist()))
-        if not folds or set(folds) - set(there):
-            raise InputError(f"expected folds out of {there}; came {list(folds)}")
+        require_folds(self.recordings.fold, folds)
         notes = RunFile(None if self.folder is None else self.folder / "unlearning.json", self.plan)
         require_data(notes, self.recordings)
         cells = [Cell(self.recordings.name, fold, "requests") for fold in folds]

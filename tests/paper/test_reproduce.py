@@ -107,6 +107,11 @@ class TestTable1:
         assert found["paper"] == PAPER["svm-spikes"]["RoboSkin-20"] == 0.633
         assert found["difference"] == pytest.approx(found["mean"] - 0.633)
         assert found["folds"] == 2
+        # A network's accuracy after each epoch, over the folds: the first epochs are the curves of efficiency.
+        network = {row["key"]: row for row in rows(whole)}["conv-lstm"]["sets"]["RoboSkin-20"]
+        first = [figures["epochs"][0]["accuracy"] for cell, figures in whole if cell.system == "conv-lstm"]
+        assert [point[0] for point in network["points"]] == [1, 2] and "points" not in found
+        assert network["points"][0][1:] == [pytest.approx(np.mean(first)), pytest.approx(np.std(first, ddof=1))]
         # Blocked folds, and the control of random weights, are not in the paper.
         ours = {"right": 3, "tested": 4, "seconds": 1.0}
         cells = [Cell("BioTac-20 blocked", 0, "svm"), Cell("BioTac-20", 0, "least-squares-random")]
@@ -163,6 +168,7 @@ def patched(monkeypatch: pytest.MonkeyPatch) -> None:
         "biotac-20": lambda data, seed: recorded(name="BioTac-20", ordered=True),
         "biotac-20-blocked": lambda data, seed: blocked(recorded(name="BioTac-20", ordered=True)),
         "roboskin-20": lambda data, seed: recorded(),
+        "roboskin-20-unmixed": lambda data, seed: recorded(name="RoboSkin-20, unmixed"),
     }
     for name, reader in sets.items():
         monkeypatch.setitem(SETS, name, reader)
@@ -185,11 +191,19 @@ class TestCommand:
         assert "snntorch" in kept["versions"]
         assert kept["command"].startswith("python -m examples.paper table1") and "--quick" in kept["command"]
         assert len(kept["cells"]) == 6
+        assert len(kept["cells"]["RoboSkin-20, fold 0, conv-lstm"]["epochs"]) == 6
         assert kept["systems"]["svm"] == {"name": "SVM", "library": "scikit-learn"}
         assert {system["library"] for system in kept["systems"].values()} <= kept["versions"].keys()
         first = {row["key"]: row for row in kept["rows"]}["svm"]["sets"]["BioTac-20"]
         assert first["difference"] == pytest.approx(first["mean"] - 0.942)
         assert "epochs 6 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")
+
+    def test_the_order_of_time_is_a_set_of_table1(self, tmp_path: Path):
+        words = ("--systems", "svm-spikes", "--sets", "roboskin-20-unmixed", "--folds", "0", "--json", tmp_path / "a")
+        result = run("table1", "--data", tmp_path, *words)
+        assert result.exit_code == 0, result.output
+        row = json.loads((tmp_path / "a").read_text())["rows"][0]["sets"]["RoboSkin-20, unmixed"]
+        assert row["paper"] is None  # which is of the file as it is published
 
     def test_ones_own_stand_in_the_table_and_in_the_noted_command(self, tmp_path: Path):
         own = ("--system", "examples.own_system:NearestMean", "--embedding", "examples.own_system:Strengths")

@@ -59,6 +59,7 @@ SETS: dict[str, Callable[[Path, int], Recordings]] = {
     "biotac-20": lambda data, seed: load(data, "biotac", seed),
     "biotac-20-blocked": lambda data, seed: blocked(load(data, "biotac", seed)),
     "roboskin-20": lambda data, seed: load(data, "roboskin", seed),
+    "roboskin-20-unmixed": lambda data, seed: load(data, "roboskin", seed, unmixed=True),
     "gelsight": physiclear.load,
 }
 QUICK_SETS = ("biotac-20", "roboskin-20")

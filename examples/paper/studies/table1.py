@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from examples.paper.runs.cells import Cell, Figures, pooled
+from examples.paper.runs.cells import Cell, Figures, over_folds, pooled
 from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
@@ -15,7 +15,7 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import accuracy
 
-__all__ = ["PAPER", "Table1", "blocked", "rows"]
+__all__ = ["PAPER", "Table1", "blocked", "rows", "without_losses"]
 
 PAPER: dict[str, dict[str, float]] = {
     "svm": {"BioTac-20": 0.942, "RoboSkin-20": 0.505},
@@ -98,12 +98,28 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
                 "difference": None if paper is None else ours["mean"] - paper,
                 "seconds": sum(cell["seconds"] for cell in cells),
             }
+            if "epochs" in cells[0]:
+                sets[dataset]["points"] = _curve(cells)
             if "recordings" in cells[0]:
                 asked = sum(cell["recordings"] for cell in cells)
                 sets[dataset]["vote"] = sum(cell["recordings_right"] for cell in cells) / asked
         if sets:
             found.append({"key": key, "system": name_of(key), "sets": sets})
     return found
+
+
+def _curve(cells: Sequence[Figures]) -> list[list[float | None]]:
+    """[epoch, mean accuracy, standard deviation over the folds] after each epoch of a network, as `curves` has them."""
+    shares = ([epoch["accuracy"] for epoch in cell["epochs"]] for cell in cells)
+    found = [over_folds(list(column)) for column in zip(*shares, strict=True)]
+    return [[i, figure["mean"], figure["sd"]] for i, figure in enumerate(found, start=1)]
+
+
+def without_losses(figures: Figures) -> Figures:
+    """The figures of a cell as a result keeps them: of each epoch the accuracy only, which are most of the file."""
+    if "epochs" not in figures:
+        return figures
+    return figures | {"epochs": [epoch["accuracy"] for epoch in figures["epochs"]]}
 
 
 def blocked(recordings: Recordings) -> Recordings:

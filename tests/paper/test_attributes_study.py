@@ -128,4 +128,8 @@ def test_the_command_reports_and_writes(recordings, tmp_path, monkeypatch):
     assert set(found["sets"]) == {"roboskin-20"}
     assert set(found["sets"]["roboskin-20"]["means"]["shaking"]) == {"ours", "inferred", "trees", "always"}
     assert found["command"].startswith("python -m examples.paper fabric attributes --data")
+    assert found["sets"]["roboskin-20"]["streams"] == len(kept)
+    assert run(*words, "--sets", "roboskin-20", "--quick").exit_code == 0
+    quick = json.loads((tmp_path / "out.json").read_text())
+    assert "--quick" in quick["command"] and quick["sets"]["roboskin-20"]["streams"] < len(kept)
     assert "gelsight" in refused(*words, "--sets", "gelsight")

@@ -235,3 +235,12 @@ class TestCommand:
         assert result.exit_code == 0, result.output
         (fold,) = json.loads((tmp_path / "r.json").read_text())["folds"]
         assert (fold["learned"], fold["tested"], fold["equals_offline"]) == (80, 20, True)
+
+    def test_a_quick_one_is_a_fold_of_every_fifth_touch(self, real_data: Path, tmp_path: Path) -> None:
+        options = ["--data", real_data, "--quick", "--materials", 2, "--features", 64, "--sizes", 0, "--curve", 0]
+        result = run("continual", "roboskin-20", *options, "--json", tmp_path / "r.json")
+        assert result.exit_code == 0, result.output
+        found = json.loads((tmp_path / "r.json").read_text())
+        (fold,) = found["folds"]
+        assert (fold["learned"], fold["tested"]) == (16, 4)
+        assert "quick:" in result.output and "--quick" in found["command"]

@@ -11,7 +11,18 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from examples.paper.commands.options import Data, Device, FewMaterials, Folds, Json, Plot, Run, Seed, Where
+from examples.paper.commands.options import (
+    QUICK_EVERY,
+    Data,
+    Device,
+    FewMaterials,
+    Folds,
+    Json,
+    Plot,
+    Run,
+    Seed,
+    Where,
+)
 from examples.paper.commands.sets import (
     Dataset,
     command_line,
@@ -23,6 +34,7 @@ from examples.paper.commands.sets import (
     write_result,
 )
 from examples.paper.plots import draw_continual
+from examples.paper.runs.cells import thinned
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
 from examples.paper.systems.own import is_own, own_embedding
@@ -61,7 +73,7 @@ def continual(
     ] = EmbeddingChoice.KERNELS,
     schedule: Annotated[Order, typer.Option(help="The order in which touches are learned.")] = Order.CLASSES,
     sizes: Annotated[str, typer.Option(help="Exemplars in the buffer; all: every touch.")] = "0,20,50,100,200,400,all",
-    folds: Folds = "all",
+    folds: Folds = None,
     seed: Seed = 0,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Of a fine-tune; the learner's own choice unless given.")
@@ -74,6 +86,7 @@ def continual(
     ] = False,
     peers: Annotated[bool, typer.Option(help="Measure other methods on the same features.")] = True,
     device: Where = Device.CPU,
+    quick: Annotated[bool, typer.Option("--quick", help="One fold of every fifth touch: for a look.")] = False,
     run: Run = None,
     json: Json = None,
     plot: Plot = None,
@@ -97,6 +110,8 @@ def continual(
         recordings = read(dataset, data, seed)
         if materials < 20:
             recordings = subset(recordings, materials)
+        if quick:
+            recordings = thinned(recordings, QUICK_EVERY)
         task = Continual(
             recordings,
             frozen,
@@ -110,18 +125,20 @@ def continual(
             device=device.value,
             folder=run,
         )
-        chosen = parse_folds(folds or "all", recordings)
+        chosen = parse_folds(folds or ("0" if quick else "all"), recordings)
         results: list[dict[str, Any]] = []
         for done in task.run(chosen, lambda what, i, of: progress(f"fold {chosen[len(results)]}: {what}", i, of)):
             results.append(done)
     published = PUBLISHED.get(recordings.name) if materials == 20 else None
     _show(recordings, results, published)
+    if quick:
+        say(f"[yellow]quick:[/] one touch of {QUICK_EVERY}, in training and test")
     if json is not None:
         settings: dict[str, Any] = {"embedding": str(embedding), "weights": None if weights is None else Path(weights)}
         of_kernels = embedding in (EmbeddingChoice.KERNELS, EmbeddingChoice.BOTH)
         settings |= {"features": kernels if of_kernels else None}
-        settings |= {"schedule": schedule.value, "sizes": ",".join(map(str, chosen_sizes)), "folds": folds or "all"}
-        settings |= {"seed": seed, "curve": curve, "device": device.value, "epochs": epochs}
+        settings |= {"schedule": schedule.value, "sizes": ",".join(map(str, chosen_sizes)), "folds": folds}
+        settings |= {"quick": quick, "seed": seed, "curve": curve, "device": device.value, "epochs": epochs}
         settings |= {"tuned_curve": tuned_curve, "no_peers": not peers, "run": None if run is None else "RUN"}
         command = command_line("continual", dataset.value, data="DATA", **settings)
         rows = summary(results)

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from examples.paper.commands.contactile_command import contactile
-from examples.paper.commands.options import Data, Folds, Json, Run, Seed, Weights
+from examples.paper.commands.options import QUICK_EVERY, Data, Folds, Json, Run, Seed, Weights
 from examples.paper.commands.sets import (
     Dataset,
     command_line,
@@ -26,6 +26,7 @@ from examples.paper.fabric import objects
 from examples.paper.fabric.attributes_study import Attributes
 from examples.paper.fabric.attributes_study import summary as summary_of_attributes
 from examples.paper.fabric.fabric_study import FIGURES, Letters, SlideTransfer, summary
+from examples.paper.runs.cells import thinned
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar
 from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
 from scroll_tactile.datasets.grades import read_grades
@@ -111,6 +112,7 @@ def attributes(
     ],
     sets: Annotated[str, typer.Option(help="Which sensors touch: biotac-20, roboskin-20.")] = "biotac-20,roboskin-20",
     dimension: Annotated[int, typer.Option(min=64, help="Of the kernels.")] = 504,
+    quick: Annotated[bool, typer.Option("--quick", help="One touch of five: for a look.")] = False,
     seed: Seed = 0,
     json: Json = None,
     run: Run = None,
@@ -123,6 +125,8 @@ def attributes(
         listed = read_grades(grades)
         for name in asked:
             recordings = read(Dataset(name), data, seed)
+            if quick:
+                recordings = thinned(recordings, QUICK_EVERY)
             task = Attributes(recordings, listed, dimension, seed, run)
             results = list(task.run(progress))
             found[name] = task.plan | {"means": summary_of_attributes(results), "parts": results}
@@ -133,7 +137,8 @@ def attributes(
             table.add_row(name, attribute, *cells)
     console().print(table)
     if json is not None:
-        settings: dict[str, Any] = {"grades": grades, "sets": sets, "dimension": dimension, "seed": seed}
+        settings: dict[str, Any] = {"grades": grades, "sets": sets, "dimension": dimension, "quick": quick}
+        settings |= {"seed": seed, "run": None if run is None else "RUN"}
         command = command_line("fabric", "attributes", data="DATA", **settings)
         write_result(json, origin(command) | {"seed": seed, "sets": found})
 

@@ -122,6 +122,7 @@ def test_ours_learns_as_it_is_and_others_with_augmentation_too():
 
 def test_the_picture(tmp_path):
     rows = summary([record for fold in study().run([0, 1]) for record in fold])
+    assert all(row["mean"] == pytest.approx(sum(row["by_fold"]) / 2) and len(row["by_fold"]) == 2 for row in rows)
     lines = robustness_curves(rows)
     assert list(lines) == ["length", "speed", "noise", "dead", "drift", "session"]
     assert [strength for strength, *_ in lines["speed"]["loudest", True]] == [0.5, 1, 2]
@@ -153,4 +154,5 @@ def test_the_command_on_real_touches(real_data, tmp_path):
     reported = json.loads((tmp_path / "r.json").read_text())
     assert {row["strength"] for row in reported["means"]} == {0.0, 0.2}
     assert min(row["mean"] for row in reported["means"]) > 0.8
+    assert reported["seconds"] > 0
     assert run(*words, "--run", tmp_path / "run").exit_code == 0

@@ -6,6 +6,7 @@ import json
 import math
 import platform
 import shlex
+import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -147,7 +148,7 @@ def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result as JSON, whole or not at all: short values on one line, numbers to eight digits, NaN as null.
+    """Write a result as JSON, whole or not at all: short values and numbers side by side, of eight digits, NaN as null.
 
     Raises InputError where the file cannot be written.
     """
@@ -173,6 +174,9 @@ def _laid_out(value: Any, indent: str = "") -> str:
     if len(indent) + len(line) <= 120 or not isinstance(value, dict | list):
         return line
     inner = indent + " "
+    if isinstance(value, list) and '"' not in line:  # of numbers, or lists of them: a line each would be the most of it
+        rows = textwrap.wrap(line[1:-1], 120 - len(inner), break_on_hyphens=False)
+        return "[\n" + "\n".join(inner + row for row in rows) + "\n" + indent + "]"
     if isinstance(value, dict):
         rows = [f"{json.dumps(key, ensure_ascii=False)}: {_laid_out(part, inner)}" for key, part in value.items()]
     else:

@@ -125,7 +125,7 @@ def strengths(
     course = Course.in_proportion(passes, precision.value)
     kept: dict[str, Any] = {}
     means: list[dict[str, Any]] = []
-    records: list[dict[str, Any]] = []
+    seconds = 0.0
     with progress_bar() as progress:
         for name in named("--sets", sets, list(Dataset)):
             progress("reading", 0, 1)
@@ -145,7 +145,7 @@ def strengths(
             found = [about | record for fold in task.run(chosen, progress) for record in fold]
             sensor = recordings.sensor.model_dump(mode="json")
             kept[recordings.name] = {**task.plan, "settings": settings, "sensor": sensor}
-            records += found
+            seconds += sum(record["seconds"] for record in found)
             means += [about | row for row in summary(found)]
     for name in kept:
         _show(name, [row for row in means if row["dataset"] == name])
@@ -161,7 +161,7 @@ def strengths(
         options |= {"seed": seed, "quick": quick, "weights": None if weights is None else Path(weights)}
         made = origin(command_line("strengths", study.value, **options, **networks)) | {"seed": seed, "quick": quick}
         made |= {"systems": systems_of(keys)}
-        write_result(json, made | {"sets": kept, "means": means, "records": records})
+        write_result(json, made | {"seconds": seconds, "sets": kept, "means": means})
     _draw(plot, means)
 
 

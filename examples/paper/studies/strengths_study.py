@@ -234,7 +234,7 @@ class Strengths:
 
 
 def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Mean and standard deviation over folds of each (study, strength, system, augmented), in the records' order."""
+    """Mean, standard deviation and all folds' shares of each (study, strength, system, augmented), in their order."""
     groups: dict[tuple[Any, ...], list[float]] = {}
     for record in records:
         cell = tuple(record[name] for name in ("study", "strength", "system", "augmented"))
@@ -242,5 +242,5 @@ def summary(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for (study, strength, system, augmented), values in groups.items():
         about = {"study": study, "strength": strength, "system": system, "augmented": augmented}
-        rows.append(about | over_folds(values))
+        rows.append(about | over_folds(values) | {"by_fold": values})
     return rows

@@ -185,18 +185,18 @@ class TestCommand:
         result = run(*words, "--json", file, "--run", tmp_path / "run")
         assert result.exit_code == 0, result.output
         assert "94.2 %" in result.output and "50.5 %" in result.output and "BioTac-20 blocked" not in result.output
-        assert "quick:" in result.output and "6 epochs where the paper has 100" in result.output
+        assert "quick:" in result.output and "15 epochs where the paper has 100" in result.output
         kept = json.loads(file.read_text())
         assert {"command", "seed", "versions", "machine", "seconds", "device", "threads"} <= kept.keys()
         assert "snntorch" in kept["versions"]
         assert kept["command"].startswith("python -m examples.paper table1") and "--quick" in kept["command"]
         assert len(kept["cells"]) == 6
-        assert len(kept["cells"]["RoboSkin-20, fold 0, conv-lstm"]["epochs"]) == 6
+        assert len(kept["cells"]["RoboSkin-20, fold 0, conv-lstm"]["epochs"]) == 15
         assert kept["systems"]["svm"] == {"name": "SVM", "library": "scikit-learn"}
         assert {system["library"] for system in kept["systems"].values()} <= kept["versions"].keys()
         first = {row["key"]: row for row in kept["rows"]}["svm"]["sets"]["BioTac-20"]
         assert first["difference"] == pytest.approx(first["mean"] - 0.942)
-        assert "epochs 6 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")
+        assert "epochs 15 there, 4 here" in refused(*words, "--epochs", "4", "--run", tmp_path / "run")
 
     def test_the_order_of_time_is_a_set_of_table1(self, tmp_path: Path):
         words = ("--systems", "svm-spikes", "--sets", "roboskin-20-unmixed", "--folds", "0", "--json", tmp_path / "a")

@@ -101,7 +101,8 @@ def strengths(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="The first of these folds, every fifth touch, few strengths, 6 epochs on small images."
+            "--quick",
+            help=f"The first of these folds, every fifth touch, few strengths, {QUICK_EPOCHS} epochs on small images.",
         ),
     ] = False,
     every: Annotated[

@@ -30,7 +30,7 @@ IN_DATA = ("--series", "--grades")
 """Options for files of one's own; they are looked for in the folder of the data."""
 ELSEWHERE = ("--before",)
 """Options for what `all` has not; measured without."""
-LESS = ("--epochs", "--biotac-epochs", "--every", "--take", "--draws")
+LESS = ("--epochs", "--biotac-epochs", "--every", "--take", "--draws", "--sizes")
 """Options that a quick run chooses itself."""
 
 Only = Annotated[str | None, typer.Option(help="Which results, by the names of their files, with commas between.")]

@@ -21,7 +21,7 @@ from scroll_tactile.errors import InputError
 
 __all__ = ["contactile"]
 
-QUICK = {"epochs": 4, "biotac_epochs": 2, "every": 12, "take": 4}
+QUICK = {"epochs": 4, "biotac_epochs": 2, "every": 12, "take": 8}
 
 Data = Annotated[Path | None, typer.Option(help="Folder of a published set: touches and compositions.csv.")]
 Simulated = Annotated[bool, typer.Option("--simulated", help="Simulated fabrics in the place of a published set.")]

@@ -46,6 +46,9 @@ from scroll_tactile.pipelines.continual import summary
 
 __all__ = ["continual"]
 
+SIZES = "0,20,50,100,200,400,all"
+QUICK_SIZES = "0,40"
+
 
 class EmbeddingChoice(StrEnum):
     """The embeddings."""
@@ -72,7 +75,9 @@ def continual(
         str, typer.Option(help=f"The frozen features: {', '.join(EmbeddingChoice)}, or one's own, as module:factory.")
     ] = EmbeddingChoice.KERNELS,
     schedule: Annotated[Order, typer.Option(help="The order in which touches are learned.")] = Order.CLASSES,
-    sizes: Annotated[str, typer.Option(help="Exemplars in the buffer; all: every touch.")] = "0,20,50,100,200,400,all",
+    sizes: Annotated[
+        str | None, typer.Option(help=f"Exemplars in the buffer, all: every touch. {SIZES}, unless given.")
+    ] = None,
     folds: Folds = None,
     seed: Seed = 0,
     epochs: Annotated[
@@ -101,7 +106,7 @@ def continual(
     them: the ridge floor, what was published, and other continual learners on the same features and folds.
     """
     require_folders(json, plot)
-    chosen_sizes = parse_sizes(sizes)
+    chosen_sizes = parse_sizes(sizes or (QUICK_SIZES if quick else SIZES))
     # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 have 98.6; both have 99.5 of BioTac.
     kernels = features or (1260 if embedding == EmbeddingChoice.BOTH else 1008)
     frozen = _embedding(embedding, weights, kernels)
@@ -142,7 +147,7 @@ def continual(
         settings |= {"tuned_curve": tuned_curve, "no_peers": not peers, "run": None if run is None else "RUN"}
         command = command_line("continual", dataset.value, data="DATA", **settings)
         rows = summary(results)
-        write_result(json, origin(command, recordings) | task.plan | {"sizes": sizes, "means": rows, "folds": results})
+        write_result(json, origin(command, recordings) | task.plan | {"means": rows, "folds": results})
     if plot is not None:
         _plot(plot, f"{recordings.name}, {frozen.name}, {schedule.value}", results, published)
 

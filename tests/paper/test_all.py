@@ -9,7 +9,7 @@ from paper_touches import recorded
 
 from examples.paper.commands import all_command
 from examples.paper.commands.all_command import Part, _left, read_parts
-from examples.paper.commands.options import SETS
+from examples.paper.commands.options import QUICK_EPOCHS, SETS
 from examples.paper.studies.table1 import Table1
 from examples.tables import main
 
@@ -80,7 +80,7 @@ class TestAll:
         result = run(*words, "--weights", Path(__file__))
         assert result.exit_code == 1 and "not made: third" in result.stderr.splitlines()[-1]
         kept = json.loads((run_folder / "results" / "second.json").read_text())
-        assert kept["quick"] and kept["epochs"] == 6
+        assert kept["quick"] and kept["epochs"] == QUICK_EPOCHS
         assert "other weights" in refused(*words)
         assert "first, second, third; came fourth" in refused(*words[:-2], tmp_path / "b", "--only", "fourth")
 

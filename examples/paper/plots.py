@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.drawing import picture
+from examples.paper.systems.catalogue import name_of
 from scroll_tactile.errors import InputError
 
 __all__ = [
@@ -130,7 +131,7 @@ def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
     colours = {system: f"C{i % 10}" for i, system in enumerate(dict.fromkeys(row["system"] for row in rows))}
     wide = min(3, len(drawn))
     tall = -(-len(drawn) // wide)
-    with picture(path, 5 * wide, 4 * tall) as figure:
+    with picture(path, 5 * wide, 4 * tall + 1) as figure:
         for i, (study, lines) in enumerate(drawn.items()):
             panel = figure.add_subplot(tall, wide, i + 1)
             for (system, augmented), points in lines.items():
@@ -144,7 +145,7 @@ def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
                     marker="o",
                     markersize=4,
                     capsize=2,
-                    label=f"{system}, augmented" if augmented else system,
+                    label=f"{name_of(system)}, augmented" if augmented else name_of(system),
                 )
             panel.set(xlabel=LABELS[study], ylabel="accuracy, %", ylim=(0, 102))
             if study in ("length", "speed"):
@@ -152,8 +153,8 @@ def draw_robustness(path: Path, rows: Rows, *, title: str) -> None:
             if study == "session":
                 panel.set_xticks([])
             panel.grid(alpha=0.3)
-            if not i:
-                panel.legend(fontsize=8)
+        handles, labels = panel.get_legend_handles_labels()  # all panels have the same lines
+        figure.legend(handles, labels, loc="outside lower center", ncols=2 * wide, fontsize=8, handlelength=4)
         figure.suptitle(title)
 
 

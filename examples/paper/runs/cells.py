@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import Any
@@ -24,6 +24,7 @@ __all__ = [
     "Split",
     "data_digest",
     "held_back",
+    "mean_curve",
     "over_folds",
     "pooled",
     "require_data",
@@ -208,6 +209,13 @@ def over_folds(values: Sequence[float], weights: Sequence[float] | None = None) 
     """Over folds: "mean", weighted by their sizes, "sd", the standard deviation, None of one fold, and "folds"."""
     sd = mean_and_spread(values)[1] if len(values) > 1 else None
     return {"mean": float(np.average(values, weights=weights)), "sd": sd, "folds": len(values)}
+
+
+def mean_curve(folds: Iterable[Iterable[tuple[int, float]]]) -> list[list[Any]]:
+    """[place, mean, standard deviation] at each place of some folds' curves, which are (place, share) at the same."""
+    columns = zip(*folds, strict=True)
+    found = [(column[0][0], over_folds([share for _, share in column])) for column in columns]
+    return [[place, figure["mean"], figure["sd"]] for place, figure in found]
 
 
 def pooled(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.runs.cells import Cell, Figures, Split, over_folds
+from examples.paper.runs.cells import Cell, Figures, Split, mean_curve
 from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import EPOCHAL, name_of
 from scroll_tactile.finetune.training import Progress
@@ -80,11 +80,7 @@ def curves(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     for dataset, key in dict.fromkeys((cell.dataset, cell.system) for cell, _ in results):
         cells = [figures for cell, figures in results if (cell.dataset, cell.system) == (dataset, key)]
-        points = [
-            [column[0][0], figure["mean"], figure["sd"]]
-            for column in zip(*(cell["points"] for cell in cells), strict=True)
-            for figure in [over_folds([share for _, share in column])]
-        ]
+        points = mean_curve(cell["points"] for cell in cells)
         found.append(
             {"dataset": dataset, "key": key, "system": name_of(key), "by": cells[0]["by"], "folds": len(cells)}
             | {"points": points, "seconds": sum(cell["seconds"] for cell in cells)}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from examples.paper.runs.cells import Cell, Figures, over_folds, pooled
+from examples.paper.runs.cells import Cell, Figures, mean_curve, pooled
 from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
@@ -99,20 +99,14 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
                 "seconds": sum(cell["seconds"] for cell in cells),
             }
             if "epochs" in cells[0]:
-                sets[dataset]["points"] = _curve(cells)
+                shares = ([epoch["accuracy"] for epoch in cell["epochs"]] for cell in cells)
+                sets[dataset]["points"] = mean_curve(enumerate(column, start=1) for column in shares)
             if "recordings" in cells[0]:
                 asked = sum(cell["recordings"] for cell in cells)
                 sets[dataset]["vote"] = sum(cell["recordings_right"] for cell in cells) / asked
         if sets:
             found.append({"key": key, "system": name_of(key), "sets": sets})
     return found
-
-
-def _curve(cells: Sequence[Figures]) -> list[list[float | None]]:
-    """[epoch, mean accuracy, standard deviation over the folds] after each epoch of a network, as `curves` has them."""
-    shares = ([epoch["accuracy"] for epoch in cell["epochs"]] for cell in cells)
-    found = [over_folds(list(column)) for column in zip(*shares, strict=True)]
-    return [[i, figure["mean"], figure["sd"]] for i, figure in enumerate(found, start=1)]
 
 
 def without_losses(figures: Figures) -> Figures:

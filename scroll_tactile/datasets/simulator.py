@@ -14,11 +14,16 @@ A surface is a height over one coordinate: a few sine waves of its own wavelengt
 relief. A channel at place x on the pad reads, at time t, the height at x + speed · t, so that what passes one
 channel passes those behind it a little later. How strongly it responds depends on the force, and on how near
 the middle of the contact it lies. Force and speed vary from touch to touch, and slowly within one.
+
+Sensors respond to that in three ways, so that nothing is tuned to one of them: "pressure" reads it, as most do;
+"events" is 1 in the reading in which a taxel's pressure has risen by a step, and 0 otherwise, under a contact so narrow
+that most taxels stay quiet; "light" reads a contact of a tenth of the range on an offset that wanders.
 """
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +32,17 @@ from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["MATERIALS", "Scene"]
+__all__ = ["EVENT_SKIN", "LIGHT_PAD", "MATERIALS", "Response", "Scene"]
+
+Response = Literal["pressure", "events", "light"]
+
+EVENT_SKIN = Sensor(
+    name="event-skin", channels=78, rate=50.0, low=0.0, high=1.0, unit="events", duration=4.0, layout=(6, 13)
+)
+"""A skin of binary taxels, to be touched with the response "events"."""
+
+LIGHT_PAD = Sensor(name="light-pad", channels=38, rate=100.0, low=0.0, high=4095.0, unit="counts", duration=2.0)
+"""A capacitive pad that is hardly pressed, to be touched with the response "light"."""
 
 # fmt: off
 MATERIALS = (
@@ -43,6 +58,10 @@ _PAD = 14.0  # mm across
 _SPEED, _FORCE = 40.0, 1.0  # mm/s and N of a usual touch
 _WAVES = 4
 _NOISE = 0.006  # of the range: white noise, and a touch's own offset
+_RISE = 0.04  # of the range: a rise of the pressure that a taxel of events reports
+_NARROW = _PAD / 8  # mm: the contact under which most taxels of events stay quiet
+_LIGHT = 0.1  # of a usual contact
+_WANDER = 0.02  # of the range in a second's square root: a random walk of the offset, each channel's own
 # First word of every seed: a texture, a pad and a touch must never draw the same numbers.
 _TEXTURE, _PADS, _TOUCH = 1, 2, 3
 
@@ -86,14 +105,18 @@ class Scene:
 
     sensor: any but a camera.
     seed: 0 or more.
+    response: how the sensor responds to the surface: "pressure", "events" or "light".
 
-    Raises InputError for a camera, whose pictures are not modelled, and for a negative seed.
+    Raises InputError for a camera, whose pictures are not modelled, for a negative seed, and for another response.
     """
 
     sensor: Sensor
     seed: int = 0
+    response: Response = "pressure"
 
     def __post_init__(self) -> None:
+        if self.response not in get_args(Response):
+            raise InputError(f"expected a response of {', '.join(get_args(Response))}; came {self.response!r}")
         if self.sensor.camera:
             raise InputError(
                 f"expected a sensor with channels; {self.sensor.name!r} is a camera, which the simulator "
@@ -110,16 +133,20 @@ class Scene:
     @property
     def rest(self) -> _Floats:
         """The channels' readings at rest, as shares of the range, (n,)."""
-        return _pad(self.seed, self.sensor).rest
+        rest = _pad(self.seed, self.sensor).rest
+        return np.zeros_like(rest) if self.response == "events" else rest
 
     @property
     def step(self) -> _Floats:
         """Of the sensor's converter, in its unit: one for all channels, or one for each."""
+        if self.response == "events":
+            return np.asarray(self.sensor.high) - np.asarray(self.sensor.low)
         return _step(self.sensor)
 
     def noise(self, random: np.random.Generator, count: int) -> _Floats:
-        """Noise of so many readings, as shares of the range, (count, n)."""
-        return _NOISE * random.standard_normal((count, self.sensor.channels))
+        """Noise of so many readings, as shares of the range, (count, n); events have none."""
+        noise = _NOISE * random.standard_normal((count, self.sensor.channels))
+        return np.zeros_like(noise) if self.response == "events" else noise
 
     def touch(
         self,
@@ -152,8 +179,14 @@ class Scene:
         count = max(1, round(seconds * self.sensor.rate))  # validate refuses too few, as for any stream
         times = np.arange(count) / self.sensor.rate
         pad = _pad(self.seed, self.sensor)
-        shares = _slide(_texture(self.seed, index), pad, times, random, speed, force)
-        return validate(_quantise(shares, self.sensor), self.sensor)
+        width = _NARROW if self.response == "events" else _PAD / 2
+        shares = _slide(_texture(self.seed, index), pad, times, random, speed, force, width)
+        if self.response == "events":
+            shares = _events(shares)
+        elif self.response == "light":
+            wander = np.cumsum(random.standard_normal(shares.shape), axis=0) / math.sqrt(self.sensor.rate)
+            shares = pad.rest + _LIGHT * (shares - pad.rest) + _WANDER * wander
+        return validate(_quantise(shares, self.sensor, self.step), self.sensor)
 
 
 @lru_cache(maxsize=256)
@@ -199,8 +232,9 @@ def _slide(
     random: np.random.Generator,
     speed: float | None,
     force: float | None,
+    width: float,
 ) -> _Floats:
-    """Readings as shares of the range, shape (T, n)."""
+    """Pressures as shares of the range, shape (T, n). width: of the contact, a standard deviation in mm."""
     # Drawn even where they are given, so that a touch at another speed is otherwise the same touch.
     usual_speed = _SPEED * math.exp(random.normal(0, 0.025))
     usual_force = _FORCE * math.exp(random.normal(0, 0.06))
@@ -215,7 +249,7 @@ def _slide(
     height = _height(texture, place, random)
 
     distance = (pad.along - middle[0]) ** 2 + (pad.across - middle[1]) ** 2
-    contact = pad.gain * np.exp(-distance / (2 * (_PAD / 2) ** 2))
+    contact = pad.gain * np.exp(-distance / (2 * width**2))
     press = -np.expm1(-times / texture.onset)
     drift = 1 + random.normal(0, 0.02) * times
     load = (press * drift * math.sqrt(force))[:, None]
@@ -236,10 +270,19 @@ def _height(texture: _Texture, place: _Floats, random: np.random.Generator) -> _
     return height
 
 
-def _quantise(shares: _Floats, sensor: Sensor) -> _Floats:
-    """In the sensor's unit, within its range, at the resolution of its converter."""
+def _events(shares: _Floats) -> _Floats:
+    """1 where a pressure is a step higher than all since its last event or its last fall by a step, 0 elsewhere."""
+    events = np.zeros_like(shares)
+    reported = shares[0].copy()
+    for event, now in zip(events[1:], shares[1:], strict=True):
+        event[now >= reported + _RISE] = 1.0
+        reported = np.where(np.abs(now - reported) >= _RISE, now, reported)
+    return events
+
+
+def _quantise(shares: _Floats, sensor: Sensor, step: _Floats) -> _Floats:
+    """In the sensor's unit, within its range, in steps of its converter."""
     low, high = np.asarray(sensor.low), np.asarray(sensor.high)
-    step = _step(sensor)
     readings: _Floats = np.clip(low + np.round(shares * (high - low) / step) * step, low, high)
     return readings
 

@@ -12,7 +12,14 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
-from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage, common_names, judged_touches
+from scroll_tactile.readouts.calibration import (
+    PRIOR_WEIGHT,
+    Calibration,
+    calibrate,
+    calibrate_stage,
+    common_names,
+    judged_touches,
+)
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.deviation import recall_of
@@ -135,7 +142,7 @@ class Draft:
             if calibrations:
                 told = self._left_out(apart, last, calibrations[last] if whole is None else whole)
             if whole is not None and self.kept:
-                pooled = pool(recall_of(self.kept), told)
+                pooled = pool(recall_of(self.kept), told, float(whole.weights.sum()) / PRIOR_WEIGHT[self.kind])
         give_back_scratch()
         return Model(self, readouts, calibrations, apart, whole, pooled, dependence_of(told))
 

@@ -26,9 +26,8 @@ from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.readouts.early import Moment
 from scroll_tactile.readouts.pooled import Pooled
 
-__all__ = ["SURE", "judged", "together"]
+__all__ = ["judged", "together"]
 
-SURE = 0.99  # of the probability: less than that is looked up
 COUNTED = 30.0  # values, as which the evidence for a way to compare a touch counts: neighbours say the same
 
 
@@ -37,7 +36,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     judgement = model.judge(candidates, encoded.means, encoded.columns)
     pooled = model.pooled
     if pooled is None or (
-        judgement.probability.max() >= SURE
+        judgement.probability.max() >= pooled.sure
         and judgement.strange <= pooled.familiar
         and model.least <= len(encoded.stream) <= model.longest
     ):
@@ -57,8 +56,9 @@ def together(pooled: Pooled, candidates: Sequence[str], way: Compared, moment: M
     """What the model and the kept touches say of a touch, compared in one way; moment: of a beginning."""
     judgement, recollection = way.judgement, way.recollection
     beside = pooled if moment is None else moment.believed(pooled)
-    heard = beside.familiarity(judgement.strange, way.own_time) * beside.trusted * way.logs
-    logits = heard + way.scores(pooled, candidates) * beside.steepness(recollection)
+    familiarity = beside.familiarity(judgement.strange, way.own_time)
+    heard = familiarity * beside.trusted * way.logs
+    logits = heard + way.scores(pooled, candidates) * beside.steepness(recollection, familiarity)
     chances = np.exp(logits - logits.max())
     chances /= chances.sum()
     novelty, calibration = way.novelty(pooled), judgement.calibration

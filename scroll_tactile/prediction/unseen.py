@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.prediction.comparing import Compared
 from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.prediction.recalling import SURE, together
+from scroll_tactile.prediction.recalling import together
 from scroll_tactile.readouts.calibration import Calibration, common_names
 from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.signals.windows import Scale
@@ -75,7 +75,7 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
             continue
         said, pooled = _said(apart, names, touch, stage, calibration), model.pooled
         kept = pooled is not None and (material, key) in held
-        if pooled is not None and kept and (said.probability.max() < SURE or said.strange > pooled.familiar):
+        if pooled is not None and kept and (said.probability.max() < pooled.sure or said.strange > pooled.familiar):
             recollection = pooled.recall.recollect(pooled.recall.levels(rows[key]), left_out=rows[key])
             said = together(pooled, names, Compared(said, recollection, own_time=True), None)
         threshold = calibration.threshold(false_alarms)

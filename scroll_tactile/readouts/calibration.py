@@ -6,9 +6,12 @@ arXiv 1706.04599):
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
-w⁰ the prior and ρ the touches that it counts as. Where a touch is viewed in several ways, each is believed less the
-stranger the touch looks in it: its scores count as min(1, u_k / r_k) s_k, r_k its `strangeness` and u_k the median of
-that of touches left out. So the view that a change of speed, of zero or of length has spoilt leaves the word to others.
+w⁰ the prior and ρ the touches that it counts as: first one weight is fitted that all scales have in common, and then
+one each that is drawn to it. Scores of left-out touches are nearly collinear, and by themselves the weights run into a
+corner: all on one scale, that a longer touch may spoil. Where a touch is viewed in several ways, each is believed less
+the stranger the touch looks in it: its scores count as min(1, u_k / r_k) s_k, r_k its `strangeness` and u_k the median
+of that of touches left out. So the view that a change of speed, of zero or of length has spoilt leaves the word to
+others.
 
 The novelty of known materials' touches is measured likewise, and an alarm's threshold is their conformal quantile (Vovk
 et al. 2005). All are functions of the statistics and the sample, so of what was observed and nothing else.
@@ -28,6 +31,7 @@ from scroll_tactile.signals.windows import Scale
 
 __all__ = [
     "FEWEST",
+    "PRIOR_WEIGHT",
     "UNMEASURED",
     "Calibration",
     "calibrate",
@@ -35,6 +39,7 @@ __all__ = [
     "common_names",
     "fit_weights",
     "judged_touches",
+    "scale_weights",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,8 +49,14 @@ PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
 }  # of the scores of all scales together: what both sensors' data come to
+# Logits by which the mean of a material is ahead of the next one's where no touch can be left out, see `_unheld`: of
+# one touch of each, log loss was least from 1.5 to 2 on fifteen sets (BioTac, RoboSkin, letters, simulated events and
+# light contacts, eight series).
+AHEAD = 2.0
 MOST_STEPS = 100
 PRIOR_TOUCHES = 0.5  # the prior counts as much as these
+COMMON_TOUCHES = 2.0  # that the weight common to all scales counts as
+LEAST_COMMON = 1e-3  # of the prior
 
 
 @dataclass(frozen=True)
@@ -126,10 +137,10 @@ def calibrate_stage(
     apart = [left for _, left in scales]
     names = common_names(apart)
     touches = judged_touches(stage, apart) if len(names) > 1 else []
-    prior = np.full(len(apart), PRIOR_WEIGHT[kind] / len(apart))
     usual = np.full(len(apart), np.inf)
     if not touches:
-        return Calibration(prior, _assumed([readout for readout, _ in scales]), np.zeros(0), usual)
+        unheld = np.full(len(apart), _unheld(names, scales, kind))
+        return Calibration(unheld, _assumed([readout for readout, _ in scales]), np.zeros(0), usual)
     scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
     distances = np.stack([_picked(left, left.distances, names, touches, stage).min(axis=1) for left in apart], axis=1)
     own = {name: i for i, name in enumerate(names)}
@@ -137,7 +148,7 @@ def calibrate_stage(
         strange = np.stack([left.strangeness[[left.rows[touch, stage] for touch in touches]] for left in apart], axis=1)
         usual = np.median(strange, axis=0)
         scores *= np.minimum(1.0, usual / np.maximum(strange, TINY))[:, :, None]
-    weights = fit_weights(scores, [own[materials[touch]] for touch in touches], prior)
+    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(apart))
     if len(distances) < FEWEST:
         return Calibration(weights, _assumed([readout for readout, _ in scales]), np.zeros(0), usual)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
@@ -169,14 +180,26 @@ def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[i
     return picked
 
 
+def scale_weights(scores: FloatArray, targets: Sequence[int], prior: float) -> FloatArray:
+    """The weights of scales, each drawn to the one that all have in common, as of `fit_weights`; prior: of that one."""
+    common = fit_weights(scores.sum(axis=1, keepdims=True), targets, np.array([prior]))
+    drawn_to = np.repeat(np.maximum(common, LEAST_COMMON * prior), scores.shape[1])
+    return fit_weights(scores, targets, drawn_to, COMMON_TOUCHES)
+
+
 def fit_weights(
-    scores: FloatArray, targets: Sequence[int], prior: FloatArray, touches: float = PRIOR_TOUCHES
+    scores: FloatArray,
+    targets: Sequence[int],
+    prior: FloatArray,
+    touches: float = PRIOR_TOUCHES,
+    counts: FloatArray | None = None,
 ) -> FloatArray:
     """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
 
     scores: of touches left out, shape (touches, scales, classes). targets: the class of each. touches: that the prior
-    counts as.
+    counts as. counts: how many touches each of them stands for, shape (touches,); 1 unless given.
     """
+    counted = np.ones(len(scores)) if counts is None else counts
     gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -186,10 +209,11 @@ def fit_weights(
         total = chances.sum(axis=1, keepdims=True)
         chances /= total
         mean = np.einsum("tsc,tc->ts", gap, chances)
+        chances *= counted[:, None]
         pull = weights / prior - 1
-        value = float((np.log(total) + top).sum()) + touches * float(pull @ pull) / 2
-        curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ mean
-        return value, mean.sum(axis=0) + touches * pull / prior, curve + np.diag(touches / prior**2)
+        value = float(counted @ (np.log(total) + top)[:, 0]) + touches * float(pull @ pull) / 2
+        curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ (counted[:, None] * mean)
+        return value, counted @ mean + touches * pull / prior, curve + np.diag(touches / prior**2)
 
     # Newton's steps, projected (Bertsekas 1982), in one to three weights: scipy.optimize is 20 MB and a tenth of a
     # second to import, of the quarter of a second in which a memory that was just opened answers.
@@ -210,6 +234,26 @@ def fit_weights(
             size /= 2
         weights, (value, slope, curve) = tried, after
     return weights
+
+
+def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kind: ReadoutName) -> float:
+    """The weight of each scale where no touch can be left out, most materials having one.
+
+    Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
+    scores are to be believed nothing says but the scores between the materials. So a touch that is the mean of its
+    material is ahead by so many logits, and what lies between two materials is as likely to be either.
+    """
+    share = PRIOR_WEIGHT[kind] / len(scales)
+    if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
+        return share
+    ahead = np.zeros((len(names), len(names)))
+    for readout, left in scales:
+        own = [left.names.index(name) for name in names]
+        gram = readout.derived().gram[np.ix_(own, own)]
+        sizes = np.diagonal(gram)
+        ahead += (sizes[:, None] + sizes - 2 * gram) / 2
+    np.fill_diagonal(ahead, np.inf)
+    return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
 def _assumed(readouts: Sequence[Readout]) -> FloatArray:

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import FEWEST, Calibration, fit_weights
-from scroll_tactile.readouts.pooled import Pooled
+from scroll_tactile.readouts.pooled import Pooled, recalled_of
 
 __all__ = ["Early", "Heard", "Moment", "early_of", "moments_of"]
 
@@ -168,8 +168,7 @@ def _fitted(said: Heard, near: Sequence[Heard]) -> Moment:
     """A moment; near: what was said at the moments near it, this one among them."""
     shared = np.maximum(_weights(near, PRIOR, PRIOR_TOUCHES), LEAST_PRIOR)
     trusted, steepness = _weights([said], shared, SHARED_TOUCHES).tolist()
-    # r, of which β is 1 / (1 + (1/r − 1) c) where the certainty is that of these beginnings.
-    recalled = 1 / (1 + max(1 / max(steepness, LEAST_SPREAD) - 1, 0.0) / said.certainty)
+    recalled = recalled_of(steepness, said.certainty)
     usual, spread = float(said.novelty.mean()), max(float(said.novelty.std()), LEAST_SPREAD)
     moment = Moment(said.columns, trusted, recalled, 0.0, usual, spread, np.sort((said.novelty - usual) / spread))
     own = moment.chances(said)[np.arange(len(said.targets)), said.targets]

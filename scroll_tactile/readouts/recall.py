@@ -4,8 +4,9 @@ A mean over windows forgets where a reading passes the noise's edge; kept touche
 
     score_c = max over kept i of c of Σ L_a[y, x_i],    a the noise under which a kept touch is likeliest.
 
-The sum is over all values that were read. A channel that never changes says nothing of its own and is left out, as are
-values that are missing. Beside the kept touches of a material stand blends of those that are likely: what is felt lies
+The sum is over all values that were read. A channel that never changes, where hardly any kept touch has it so, is
+stuck: it says nothing of its own and is left out, as are values that are missing. A channel that is often quiet says
+something by being so. Beside the kept touches of a material stand blends of those that are likely: what is felt lies
 between them. A touch is compared with the beginnings of kept ones, in their own time, or with the whole of each brought
 to its length: made at another speed, it has another length.
 
@@ -42,14 +43,15 @@ COARSE = tuple(Noise(step) for step in range(120, 924, 32)), tuple(Noise(step, T
 STRIDE = 4  # coarse amplitudes in one at first: the likelihood has one peak over them
 WARMTHS = (0.03, 0.1, 0.3)  # of blends: how steeply a kept touch's part falls with its likelihood
 BLENDED = 6  # materials, the likeliest, that have blends
+RARELY = 20  # kept touches, of which fewer than one has a channel unchanging: then one that is so is stuck
 
 
 @dataclass(frozen=True)
 class _Asked:
     """A touch that is compared: its levels (C, T), as far as the longest kept touch goes where it is not `whole`.
 
-    shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that never change. full: the
-    columns that it is a part of. values: how many count. share: the part of all that do.
+    shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that are. full: the columns that
+    it is a part of. values: how many count. share: the part of all that do.
     """
 
     levels: LevelArray
@@ -60,11 +62,11 @@ class _Asked:
     whole: bool
 
     @classmethod
-    def of(cls, levels: LevelArray, columns: int, whole: bool) -> _Asked:
+    def of(cls, levels: LevelArray, columns: int, whole: bool, quiet: npt.NDArray[np.bool_]) -> _Asked:
+        """quiet: the channels that are no less whole where they never change, (C,)."""
         full = levels.shape[1] if whole else columns
         grid = levels[:, :full].copy()
-        read = grid != MISSING
-        stuck = np.where(read, grid, 0).max(axis=1) <= np.where(read, grid, LEVELS).min(axis=1)
+        stuck = _unchanging(grid) & ~quiet
         grid[stuck] = MISSING
         return cls(grid, grid.ravel().astype(np.intp) << 8, grid != MISSING, stuck, full, whole)
 
@@ -106,6 +108,7 @@ class _Room:
     squares: npt.NDArray[np.float32]
     columns: npt.NDArray[np.intp]
     gapless: npt.NDArray[np.bool_]
+    unchanging: npt.NDArray[np.bool_]
 
     @classmethod
     def of(cls, count: int, channels: int, blocks: int, wider: int) -> _Room:
@@ -115,6 +118,7 @@ class _Room:
             np.empty((count, channels), np.float32),
             np.empty(count, np.intp),
             np.empty(count, np.bool_),
+            np.empty((count, channels), np.bool_),
         )
 
     def take(self, other: _Room, count: int) -> None:
@@ -212,6 +216,7 @@ class Recall:
         held.blocks[row], held.squares[row] = means.ravel(), (means**2).sum(axis=1)
         held.brought[row] = np.rint(_means(touch.levels, self._wider(touch.levels.shape[1]))[0]).ravel()
         held.columns[row], held.gapless[row] = touch.levels.shape[1], not bool((whole == MISSING).any())
+        held.unchanging[row] = _unchanging(touch.levels)
         self._touches.append((touch.material, touch.key))
         self._levels.append(touch.levels)
 
@@ -222,6 +227,7 @@ class Recall:
         self._labels = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
         self._blocks, self._brought, self._squares = held.blocks[:count], held.brought[:count], held.squares[:count]
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
+        self._often_quiet = held.unchanging[:count].sum(axis=0)
 
     def recollect(
         self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None, noise: Noise | None = None
@@ -235,7 +241,7 @@ class Recall:
         """
         if levels.ndim != 2 or len(levels) != self.channels:
             raise InputError(f"expected levels of shape ({self.channels}, T); came {levels.shape}")
-        asked = _Asked.of(levels, self.longest, whole)
+        asked = _Asked.of(levels, self.longest, whole, self._quiet(left_out))
         given, noise = noise, self._roughly(asked, left_out) if noise is None else noise
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
@@ -249,7 +255,7 @@ class Recall:
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
-        asked = _Asked.of(self._levels[row], self.longest, whole=False)
+        asked = _Asked.of(self._levels[row], self.longest, whole=False, quiet=self._quiet(row))
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
         best = beside[np.argmax(self._pairs(beside, asked).logs(self._table(CLEAN)))]
         return shape_of(*self._deviation(asked, best, CLEAN))
@@ -264,6 +270,11 @@ class Recall:
         )
         own, other = self._rows([row, int(others[np.argmin(far)])])
         return own, other
+
+    def _quiet(self, left_out: int | None) -> npt.NDArray[np.bool_]:
+        """The channels that never change in one of RARELY kept touches or more, (C,)."""
+        own = 0 if left_out is None else self._held.unchanging[left_out]
+        return np.asarray(RARELY * (self._often_quiet - own) >= max(len(self) - (left_out is not None), 1))
 
     def _rows(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
         """The levels of kept touches one below the other, (rows, C · T); T: columns, or those of the longest."""
@@ -413,6 +424,15 @@ class Recall:
                 pairs = self._pairs(blends, asked)
                 best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
         return best
+
+
+def _unchanging(levels: LevelArray) -> npt.NDArray[np.bool_]:
+    """The channels of a touch that read one level throughout, or nothing, (C,)."""
+    read = levels != MISSING
+    unchanging: npt.NDArray[np.bool_] = np.where(read, levels, 0).max(axis=1) <= np.where(read, levels, LEVELS).min(
+        axis=1
+    )
+    return unchanging
 
 
 def _product(blocks: LevelArray, guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

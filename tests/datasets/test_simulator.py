@@ -8,7 +8,7 @@ from sklearn.neighbors import NearestCentroid
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from scroll_tactile.datasets.simulator import MATERIALS, Scene
+from scroll_tactile.datasets.simulator import EVENT_SKIN, LIGHT_PAD, MATERIALS, Scene
 from scroll_tactile.errors import InputError, StreamTooShortError, UnknownMaterialError
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
 
@@ -100,3 +100,30 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason():
                 SCENE.touch("bark", 0, **{name: value})
     with pytest.raises(StreamTooShortError, match="at least 2 readings"):
         SCENE.touch("bark", 0, seconds=0.001)
+
+
+def test_a_skin_of_events_is_binary_and_mostly_quiet():
+    scene = Scene(sensor=EVENT_SKIN, response="events")
+    touches = np.stack([scene.touch(material, i).readings for material in MATERIALS for i in range(3)])
+    assert set(np.unique(touches)) == {0.0, 1.0}
+    assert 0.4 < np.mean(touches.max(axis=1) == 0) < 0.9  # of the channels of a touch
+    assert touches.sum(axis=(1, 2)).min() > 20
+    assert not scene.rest.any()
+    assert not scene.noise(np.random.default_rng(0), 5).any()
+
+
+def test_a_light_contact_is_a_tenth_of_a_usual_one_on_an_offset_that_wanders():
+    light, usual = (Scene(sensor=LIGHT_PAD, response=response) for response in ("light", "pressure"))
+    spans = [np.ptp(scene.touch("cork", 0).readings, axis=0).mean() / 4095 for scene in (light, usual)]
+    assert spans[0] < spans[1] / 2
+    offsets = [light.touch("cork", i).readings[-1] - light.touch("cork", i + 1).readings[-1] for i in range(5)]
+    assert 0.01 < np.abs(offsets).mean() / 4095 < 0.1
+
+
+def test_a_response_that_there_is_not():
+    with pytest.raises(InputError, match="pressure, events, light; came 'loud'"):
+        Scene(sensor=BIOTAC, response="loud")
+
+
+def test_what_is_read_as_pressure_stays_what_it_was():
+    assert SCENE.touch("cork", 3).key == Scene(sensor=BIOTAC, response="pressure").touch("cork", 3).key

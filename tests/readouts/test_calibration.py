@@ -10,12 +10,14 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from scroll_tactile.readouts.calibration import (
+    AHEAD,
     FEWEST,
     PRIOR_WEIGHT,
     Calibration,
     calibrate,
     calibrate_stage,
     fit_weights,
+    scale_weights,
 )
 from scroll_tactile.readouts.leave_one_out import left_out
 from scroll_tactile.readouts.readout import Readout, Task
@@ -98,6 +100,39 @@ def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
     np.testing.assert_allclose(found / prior, np.abs(expected.x), atol=2e-3)
 
 
+def test_a_touch_that_stands_for_many_weighs_as_so_many():
+    rng = np.random.default_rng(3)
+    scores, targets, counts = rng.normal(size=(9, 2, 4)), rng.integers(4, size=9), rng.integers(1, 5, size=9)
+    once = fit_weights(scores, targets.tolist(), np.ones(2), 1.0, counts.astype(float))
+    repeated = fit_weights(np.repeat(scores, counts, axis=0), np.repeat(targets, counts).tolist(), np.ones(2), 1.0)
+    np.testing.assert_allclose(once, repeated, rtol=1e-6)
+
+
+def test_scales_that_say_the_same_share_the_weight():
+    """However far their common weight lies from the prior, and none runs into a corner."""
+    rng = np.random.default_rng(0)
+    common = rng.normal(size=(200, 1, 5)) * 3
+    targets = [int(rng.choice(5, p=np.exp(row) / np.exp(row).sum())) for row in common[:, 0]]
+    scores = common + rng.normal(size=(200, 4, 5)) * 0.05
+    weights = scale_weights(scores, targets, 0.1 / 4)
+    assert weights.sum() == pytest.approx(1, abs=0.25)
+    assert weights.min() > 0.1
+
+
+@pytest.mark.parametrize("unit", [40_000, 160_000])
+def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(unit):
+    """However far the materials lie apart: within-class scatter is of one touch alone and says nothing of others."""
+    statistics, sample = scene(materials=6, touches=6, unit=unit)
+    for stage, scales in zip(stages_of(statistics, sample), STAGES, strict=True):
+        ahead = np.zeros((6, 6))
+        for weight, scale in zip(stage.weights, scales, strict=True):
+            readout = Readout(Task.of(statistics, scale, statistics.names(scale)), statistics)
+            own = [readout.scores(mean, range(6), "lda") for mean in readout.means_solved()[0] + readout.origin]
+            ahead += weight * (np.diagonal(own)[:, None] - own)
+        np.fill_diagonal(ahead, np.inf)
+        assert np.median(ahead.min(axis=1)) == pytest.approx(AHEAD, rel=1e-6)
+
+
 @pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
 def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
@@ -139,9 +174,9 @@ def test_novelty_is_measured_by_eight_touches_or_more_of_materials_that_have_oth
     for stage in stages_of(statistics, sample):
         assert len(stage.novelties) == (left_out if left_out >= FEWEST else 0)
         if not left_out:
-            # The prior is of the scores of all scales together.
-            share = PRIOR_WEIGHT["lda"] / len(stage.weights)
-            assert stage.weights.tolist() == pytest.approx([share] * len(stage.weights))
+            # All scales alike, and no more than by the prior, which is of the scores of all of them together.
+            assert len(set(stage.weights.tolist())) == 1
+            assert 0 < stage.weights.sum() <= PRIOR_WEIGHT["lda"] * (1 + 1e-12)
 
 
 def test_a_touch_counts_only_where_every_scale_left_it_out():
@@ -211,8 +246,8 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     scores = np.array([[left.scores[left.rows[i, 1]] for left in apart] for i in range(60)])
     doubted = scores * np.minimum(1, viewed.usual / strange)[:, :, None]
     targets = [apart[0].names.index(material) for material in materials]
-    prior = np.full(2, PRIOR_WEIGHT[kind] / 2)
-    np.testing.assert_allclose(viewed.weights, fit_weights(doubted, targets, prior), rtol=1e-9)
+    expected = scale_weights(doubted, targets, PRIOR_WEIGHT[kind] / 2)
+    np.testing.assert_allclose(viewed.weights, expected, rtol=1e-9)
     # Every scale has a part in the novelty, viewed or not.
     near, by_first, by_second = np.array([3.0, 5.0]), np.array([10.0, 5.0]), np.array([3.0, 12.0])
     for calibration in (viewed, plain):

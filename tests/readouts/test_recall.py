@@ -206,6 +206,23 @@ def test_stuck_channels_and_missing_values_are_left_out_exactly(recall):
     assert np.abs(found.expected[2] - levels[2]).mean() < 8
 
 
+@pytest.mark.parametrize(("quiet", "stuck"), [(0, True), (1, True), (2, False), (8, False)])
+def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
+    """One of twenty kept touches or more: of an array of binary taxels most are quiet."""
+    touches = kept()
+    for each in touches[:quiet]:
+        each.levels[3] = 0
+    recall = recall_of(touches)
+    asked = touch(1, 100)
+    asked[3] = 0
+    assert recall.recollect(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
+    if quiet == 2:  # without one of those there is one of 39
+        row = recall.rows()[touches[0].key]
+        assert recall.recollect(asked, left_out=row).stuck[3]
+        recall.follow([], {(touches[0].material, touches[0].key)})
+        assert recall.recollect(asked).stuck[3]
+
+
 def test_scores_are_sums_over_all_values():
     alone = kept(each=1)
     recall = recall_of(alone)

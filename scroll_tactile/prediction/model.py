@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.prediction.measurement import Measurement
 from scroll_tactile.readouts.calibration import Calibration, calibrate, calibrate_stage, common_names, judged_touches
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
@@ -25,18 +27,10 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Beginnings", "Draft", "Judgement", "Measures", "Model", "enough_memory"]
+__all__ = ["Draft", "Judgement", "Measures", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Measures = Callable[["Model"], Early | None]
-
-
-@dataclass(frozen=True)
-class Beginnings:
-    """How beginnings are judged, None where nothing could be measured; touches: of the memory when that was done."""
-
-    early: Early | None
-    touches: int
 
 
 # Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
@@ -98,6 +92,7 @@ class Draft:
     sample: list[tuple[str, bytes, SampledTouch]]
     kept: list[Kept]
     longest: int
+    least: int
     touches: int
 
     @classmethod
@@ -117,7 +112,8 @@ class Draft:
         # What was compacted before there were views cannot be viewed: then it is judged by its windows alone.
         views = [view for view in memory.plan.views if len(statistics.names(view)) == len(names)]
         kept = memory.kept.touches() if memory.kept is not None and views else []
-        return cls(kind, memory, names, stages, views, tasks, sample, kept, statistics.longest, statistics.touches)
+        lengths = statistics.longest, statistics.usual_least
+        return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
 
     def fit(self) -> Model:
         """Solve the readouts and calibrate them, once: the tasks are let go."""
@@ -173,9 +169,12 @@ class Model:
     views: the views that judge beside them; whole: the calibration of both, for whole touches at the last stage.
     pooled: the kept touches beside it, if any; conformal: how typical others are of them. least: the columns of all but
     the shortest touches that were learned. readouts: scale → its readout. calibrations: of the stages, as far as any
-    touch reached them. apart: scale → the sampled touches left out; sample: these. measures: by what beginnings were
-    measured, None before they were. dependence: how far touches of one thing say the same. longest: the columns of the
-    longest touch that was learned. fitted_to: the touches that it was fitted to.
+    touch reached them. apart: scale → the sampled touches left out; sample: these. beginnings: how they are judged.
+    dependence: how far touches of one thing say the same. longest: the columns of the longest touch that was learned.
+    fitted_to: the touches that it was fitted to.
+
+    Any number of threads may ask at once; where it `reads_memory` only one, which holds the memory's lock. It follows
+    where nobody asks: otherwise a copy does.
     """
 
     def __init__(
@@ -201,26 +200,29 @@ class Model:
         self.pooled = pooled
         self.dependence = dependence
         self.conformal = Conformal(draft.kept) if pooled else None
-        self.least = draft.memory.statistics.usual_least
+        self.least = draft.least
         self.sample = draft.sample
-        self._early: list[Beginnings] = []
-        self.measures: Measures | None = None
+        self.beginnings: Measurement[Model] = Measurement()
 
     def early(self, measures: Measures) -> Early | None:
         """How beginnings are judged: as it `measures` when it is first asked for, and the same from then on."""
-        if not self._early:
-            self._early.append(Beginnings(measures(self), self.fitted_to))
-            self.measures = measures
-        return self._early[0].early
+        return self.beginnings.of(self, self.fitted_to, measures)
 
     @property
-    def beginnings(self) -> Beginnings | None:
-        """How beginnings are judged, once that was asked for."""
-        return self._early[0] if self._early else None
+    def reads_memory(self) -> bool:
+        """Whether it has so many materials that it reads those that are asked for from the memory."""
+        return len(self.names) > EAGER
 
-    def judge_beginnings(self, by: Beginnings, measures: Measures | None) -> None:
-        """Judge beginnings as an earlier model of the same memory does, until they are measured anew."""
-        self._early, self.measures = [by], measures
+    def copy(self) -> Model:
+        """Another model of the same state, for one of the two to follow; what following never changes, they share."""
+        other = copy.copy(self)
+        other.readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
+        other._of_all = {}
+        if self.pooled is not None and self.conformal is not None:
+            other.pooled = replace(self.pooled, recall=self.pooled.recall.copy())
+            other.conformal = self.conformal.copy()
+        other.beginnings = Measurement(self.beginnings)
+        return other
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.

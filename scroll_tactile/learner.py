@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -520,8 +520,14 @@ class TactileLearner:
             with ledger.lock, enough_memory():
                 return current.frozen(ledger)
 
-        def turn(model: Model) -> AbstractContextManager[object]:
-            return ledger.lock if model.reads_memory else nullcontext()
+        @contextmanager
+        def turn(model: Model) -> Iterator[None]:
+            if not model.reads_memory:
+                yield
+                return
+            with ledger.lock:
+                current.take_in(ledger)  # the model then keeps what has changed as it was
+                yield
 
         def answered(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
             with turn(model), enough_memory():

@@ -34,10 +34,7 @@ MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardl
 
 
 class FrozenModel:
-    """Holds a model as it is, whatever is observed meanwhile: a copy is followed, for as long as somebody has this.
-
-    Of more than 1024 materials, those that few touches resembled are read from the memory as it is.
-    """
+    """Holds a model as it is, whatever is observed meanwhile: a copy is followed, for as long as somebody has this."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -57,7 +54,7 @@ class CurrentModel:
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
-        self._lent: ReferenceType[FrozenModel] | None = None
+        self._lent: list[ReferenceType[FrozenModel]] = []
 
     def frozen(self, ledger: Ledger) -> FrozenModel:
         """The present model, which stays as it is for as long as what is returned is held."""
@@ -65,18 +62,17 @@ class CurrentModel:
         lent = self._holder(model)
         if lent is None:
             lent = FrozenModel(model)
-            self._lent = ref(lent)
+            self._lent = [*(one for one in self._lent if one() is not None), ref(lent)]
         return lent
 
     def _holder(self, model: Model) -> FrozenModel | None:
         """What holds a model as it is, if anything does."""
-        lent = None if self._lent is None else self._lent()
-        return lent if lent is not None and lent.model is model else None
+        return next((lent for one in self._lent if (lent := one()) is not None and lent.model is model), None)
 
     def present(self, ledger: Ledger) -> Model:
         """The model that predictions are made with."""
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
-        self._take_in(ledger)
+        self.take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
         before = None if model is None else model.beginnings
@@ -100,7 +96,7 @@ class CurrentModel:
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin to fit the next model where enough has come since the last. Raises nothing: an observation is kept."""
-        self._take_in(ledger)
+        self.take_in(ledger)
         model, touches = self._model, ledger.memory.statistics.touches
         if model is None or self._behind is None or self._coming is not None:
             return
@@ -115,7 +111,7 @@ class CurrentModel:
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
         memory = ledger.memory
-        self._take_in(ledger)
+        self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
             self._model, self._coming = None, None
             self._model, self._behind = self._fitted(memory), []
@@ -127,12 +123,13 @@ class CurrentModel:
         if worker is not None:
             worker.shutdown()
 
-    def _take_in(self, ledger: Ledger) -> None:
+    def take_in(self, ledger: Ledger) -> None:
         """Note what has changed since it was last noted."""
         if self._process != os.getpid():  # a forked process has not the thread
             self._process, self._worker, self._coming = os.getpid(), None, None
         if ledger.version == self._version:
             return
+        self._keep_lent(ledger.added or [])
         added = ledger.added if self._model is not None else None
         # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
         (behind, coming), (self._behind, self._coming) = (self._behind, self._coming), (None, None)
@@ -141,6 +138,13 @@ class CurrentModel:
         if added is not None:
             coming = coming if coming is not None and _with(self._since, added) is not None else None
             self._behind, self._coming = _with(behind, added), coming
+
+    def _keep_lent(self, added: Sequence[Added]) -> None:
+        """Have models that are held, and read the memory, keep what changed there as it was before."""
+        for one in self._lent:
+            if (lent := one()) is not None and lent.model.reads_memory:
+                with suppress(MemoryError):  # who asks for what changed is told
+                    lent.model.hold_before(added)
 
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""

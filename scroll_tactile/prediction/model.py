@@ -21,7 +21,7 @@ from scroll_tactile.readouts.deviation import recall_of
 from scroll_tactile.readouts.early import Early
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
 from scroll_tactile.readouts.pooled import Apart, Pooled, pool
-from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
+from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName, Task
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
@@ -224,13 +224,20 @@ class Model:
         other.beginnings = Measurement(self.beginnings)
         return other
 
+    def hold_before(self, added: Sequence[Added]) -> None:
+        """Hold the materials of touches that came and went in the memory as they were before."""
+        with one_thread():
+            for scale, readout in self.readouts.items():
+                readout.hold_before(_changes(scale, added))
+                readout.lasting = True
+
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
 
         The readouts are then those of all that was observed; calibration, and how far the scatter is shrunk, stay.
         """
         for scale in memory.statistics.scales:
-            changes = [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
+            changes = _changes(scale, added)
             if not changes or (scale in memory.plan.views and scale not in self.views):
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
@@ -393,6 +400,11 @@ class Model:
 
     def _calibration(self, stage: int, whole: bool) -> Calibration:
         return self.whole if self.whole is not None and self._is_whole(stage, whole) else self.calibrations[stage]
+
+
+def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:
+    """What of touches that came and went is of a scale."""
+    return [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
 
 
 def _chances(logits: FloatArray) -> FloatArray:

@@ -133,6 +133,7 @@ class Readout:
         matrix[np.diag_indices(dimension)] += self.penalty
         self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix)
         self._held: dict[int, int] = {}  # place → row of these
+        self.lasting = False  # whether none is let go: the memory has others by now
         self._room = np.empty((0, 2, dimension))
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
         self._sizes = np.empty(0)  # mᵀ K⁻¹ m
@@ -188,7 +189,7 @@ class Readout:
         """Where the materials at some places are held; those that were not are from now on."""
         absent = [int(place) for place in places if int(place) not in self._held]
         if absent:
-            if len(self._held) + len(absent) > MOST_HELD:
+            if len(self._held) + len(absent) > MOST_HELD and not self.lasting:
                 self._let_go()
                 absent = [int(place) for place in places if int(place) not in self._held]
             names = [self.names[place] for place in absent]
@@ -216,7 +217,7 @@ class Readout:
             if sign > 0:
                 come.setdefault(material, []).append(rows - self.origin)
         with one_thread():
-            self._hold_before(changes)
+            self.hold_before(changes)
             self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
             for material, rows, sign in changes:
                 if sign < 0:
@@ -229,7 +230,7 @@ class Readout:
     def copy(self) -> Readout:
         """Another readout of the same: what comes to it does not come to this one."""
         other = self._branch()
-        other.names, other.places = [*self.names], dict(self.places)
+        other.names, other.places, other.lasting = [*self.names], dict(self.places), False
         other._derived, other._coarse = self._derived, None if self._coarse is None else self._coarse.copy()
         return other
 
@@ -253,7 +254,7 @@ class Readout:
         other._derived = other._compared = other._coarse = None
         return other
 
-    def _hold_before(self, changes: Sequence[Change]) -> None:
+    def hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
         absent: dict[str, list[Change]] = {}
         for change in changes:
@@ -401,10 +402,13 @@ class Readout:
 
     def _all_coarsely(self) -> Coarse:
         means, sizes = np.empty((len(self.names), len(self.origin)), np.float32), np.empty(len(self.names))
-        for first in range(0, len(means), EAGER):
-            block = self.names[first : first + EAGER]
+        places, rows = list(self._held), list(self._held.values())
+        means[places], sizes[places] = self._means[rows], self._sizes[rows]
+        absent = [place for place in range(len(means)) if place not in self._held]
+        for first in range(0, len(absent), EAGER):
+            places = absent[first : first + EAGER]
+            block = [self.names[place] for place in places]
             counts, sums = self._statistics.counts(self.scale, block), self._statistics.sums(self.scale, block)
             own = _class_means(counts, sums, self.origin)
-            means[first : first + EAGER] = own
-            sizes[first : first + EAGER] = np.einsum("hd,hd->h", own, self.system.solve(own))
+            means[places], sizes[places] = own, np.einsum("hd,hd->h", own, self.system.solve(own))
         return Coarse(means, sizes)

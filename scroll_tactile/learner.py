@@ -33,7 +33,7 @@ from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.answer import Touch, answer
-from scroll_tactile.prediction.current import CurrentModel, Snapshot
+from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.model import Draft, Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
@@ -178,12 +178,22 @@ class TactileLearner:
         extractor = self._verified()
         return extractor.codes(extractor.image(touch), touch.key)
 
+    @contextmanager
+    def _locked(self) -> Iterator[Ledger]:
+        """The ledger, and its lock: the one that is there when the lock is had, for `reembed` puts another in place."""
+        while True:
+            ledger = self._ledger
+            with ledger.lock:
+                if ledger is self._ledger:
+                    yield ledger
+                    return
+
     def __getstate__(self) -> dict[str, Any]:
-        with self._ledger.lock:
-            arrays, attributes = self._ledger.snapshot()
+        with self._locked() as ledger:
+            arrays, attributes = ledger.snapshot()
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
-            held = arrays, attributes, self._ledger.memory.sequence
+            held = arrays, attributes, ledger.memory.sequence
             return {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -231,14 +241,14 @@ class TactileLearner:
     @property
     def memory(self) -> Memory:
         """What it has learned: statistics, sample, exemplars, descriptions and f*. Read it; never change it."""
-        with self._ledger.lock:
-            return self._ledger.memory
+        with self._locked() as ledger:
+            return ledger.memory
 
     @property
     def materials(self) -> dict[str, int]:
         """Material → number of observations, in alphabetical order."""
-        with self._ledger.lock:
-            return self._ledger.memory.statistics.materials
+        with self._locked() as ledger:
+            return ledger.memory.statistics.materials
 
     def stream(self, readings: Readings) -> Stream:
         """What `observe` makes of readings before it learns them: sound, and of a camera's the frames in contact.
@@ -259,12 +269,14 @@ class TactileLearner:
         source that is none (nothing was kept), CapacityError, or StoreError.
         """
         material, source = require_name(material), None if source is None else require_source(source)
-        touch = self._verified().stream(stream)
-        image = self._extractor.image(touch)
-        codes = self._extractor.codes(image, touch.key)
-        receipt = self._ledger.observe(material, touch, image.shape[1], codes, source)
-        with self._ledger.lock:
-            self._current.prepare(self._ledger)
+        ledger = self._ledger  # first: `reembed` exchanges it last, and the one before is closed then
+        extractor = self._verified()
+        touch = extractor.stream(stream)
+        image = extractor.image(touch)
+        codes = extractor.codes(image, touch.key)
+        receipt = ledger.observe(material, touch, image.shape[1], codes, source)
+        with self._locked() as ledger:
+            self._current.prepare(ledger)
         return receipt
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
@@ -286,8 +298,8 @@ class TactileLearner:
     @property
     def descriptions(self) -> dict[str, Description]:
         """Material → its description, in alphabetical order, whether it was observed or not."""
-        with self._ledger.lock:
-            described = self._ledger.memory.descriptions
+        with self._locked() as ledger:
+            described = ledger.memory.descriptions
             return {name: dict(description) for name, description in sorted(described.items())}
 
     @contextmanager
@@ -420,14 +432,15 @@ class TactileLearner:
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.
         """
         require_arguments({}, {"embedding": embedding, "progress": progress})
-        store = self._ledger.require_store("be embedded again")
-        self._ledger.require_writing()
+        with self._locked() as ledger:  # not in the midst of another thread's batch
+            store = ledger.require_store("be embedded again")
+            ledger.require_writing()
         chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
         carried = reembedding(store, chosen)
         try:
             carried.copy(progress or _silent)
-            with self._ledger.lock:
-                self._ledger.require_writing()
+            with self._locked() as ledger:
+                ledger.require_writing()
                 carried.copy(progress or _silent)
                 self.close()
                 before = carried.put_in_place()
@@ -461,26 +474,21 @@ class TactileLearner:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self._extractor.stream(stream) for stream in streams]
 
-        def evaluate() -> tuple[int, Callable[[], Prediction]]:
-            with self._ledger.lock:
-                model = self._current.present(self._ledger)
-                version, reader = self._ledger.version, self._reader() if tuned else None
-                candidates = candidates_of(wanted, model.names, model.known)
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Prediction]:
+            reader, candidates = self._reader() if tuned else None, candidates_of(wanted, model.names, model.known)
             if not candidates:
                 seconds = math.fsum({touch.key: touch.seconds for touch in touches}.values())
-                return version, lambda: Prediction(None, 0.0, (), float("inf"), False, seconds)
-            encoded = [self._encoded(model, candidates, touch, reader) for touch in touches]
-            return version, lambda: self._answer(model, candidates, encoded)
+                return lambda: Prediction(None, 0.0, (), float("inf"), False, seconds)
 
-        return self._of_one_state(evaluate)
+            def read(touch: Stream) -> Touch:
+                encoded = extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
+                if reader is None or not model.is_last(encoded.columns):
+                    return encoded, None
+                return encoded, reader.logits_of(encoded.image, candidates)
 
-    def _encoded(
-        self, model: Model, candidates: Sequence[str], touch: Stream, reader: TunedReader | None
-    ) -> tuple[Encoded, Mapping[str, float] | None]:
-        """A touch, and the logits of f* where it answers."""
-        encoded = self._extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
-        answers = reader is not None and model.is_last(encoded.columns)
-        return encoded, reader.logits_of(encoded.image, candidates) if reader is not None and answers else None
+            return lambda: self._answer(model, extractor, candidates, [read(touch) for touch in touches])
+
+        return self._of_one_state(begin)
 
     def live(
         self,
@@ -504,28 +512,48 @@ class TactileLearner:
         """
         from scroll_tactile.live.session import LiveSession, Memory
 
-        def snapshot() -> Snapshot:
-            with self._ledger.lock, enough_memory():
-                return self._current.snapshot(self._ledger)
+        self._verified()
+        with self._locked() as ledger:
+            current, extractor, embedding = self._current, self._extractor, self._embedding
+
+        def frozen() -> FrozenModel:
+            with ledger.lock, enough_memory():
+                return current.frozen(ledger)
+
+        @contextmanager
+        def turn(model: Model) -> Iterator[None]:
+            if not model.reads_memory:
+                yield
+                return
+            with ledger.lock:
+                current.take_in(ledger)  # the model then keeps what has changed as it was
+                yield
 
         def answered(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
-            with self._ledger.lock, enough_memory():
-                return self._answer(model, candidates, [(touch, None) for touch in touches])
+            with turn(model), enough_memory():
+                return self._answer(model, extractor, candidates, [(touch, None) for touch in touches])
 
-        memory = Memory(self._sensor, self._embedding, self._verified(), snapshot, answered)
+        def require_current() -> None:
+            if self._ledger is not ledger:
+                raise InputError(
+                    "the memory was embedded again: close this session, and begin another with learner.live()"
+                )
+
+        memory = Memory(self._sensor, embedding, extractor, frozen, turn, answered, require_current)
         return LiveSession(memory, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
 
-    def _of_one_state(self, evaluate: Callable[[], tuple[int, Callable[[], Answer]]]) -> Answer:
-        """An answer that rests on one state of the memory, though others may change it while a touch is embedded.
+    def _of_one_state(self, begin: Callable[[Model, FeatureExtractor], Callable[[], Answer]]) -> Answer:
+        """An answer that rests on one state of the memory, which others may change while a touch is embedded.
 
-        evaluate: reads the memory and embeds the touch; gives the version that it read, and what answers.
+        begin: reads what it needs of the memory beside its model, and gives what reads the touch and answers.
         """
         with self._verifying(), enough_memory():
-            version, answer = evaluate()
-            with self._ledger.lock:
-                if self._ledger.version != version:
-                    _, answer = evaluate()
-                return answer()
+            with self._locked() as ledger:
+                frozen = self._current.frozen(ledger)
+                answer = begin(frozen.model, self._extractor)
+                if frozen.model.reads_memory:
+                    return answer()
+            return answer()
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
@@ -547,37 +575,35 @@ class TactileLearner:
         named = names_of("constituents", constituents, DescriptionError)
         touch = self._extractor.stream(stream)
 
-        def evaluate() -> tuple[int, Callable[[], Composition]]:
-            with self._ledger.lock:
-                wanted = require_constituents(self._ledger.memory.descriptions, named)
-                model, version = self._current.present(self._ledger), self._ledger.version
-                if not model.names:
-                    nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
-                    unknown = Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
-                    return version, lambda: Composition(nothing, 1.0, unknown)
-                composer = self._current.composer(self._ledger, model)
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Composition]:
+            wanted = require_constituents(self._ledger.memory.descriptions, named)
+            if not model.names:
+                nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
+                unknown = Prediction(None, 0.0, (), float("inf"), False, touch.seconds)
+                return lambda: Composition(nothing, 1.0, unknown)
+            composer = self._current.composer(self._ledger, model)
 
             def needed(columns: int) -> list[Scale]:
                 return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
 
-            encoded = self._extractor.encode(touch, model.longest, needed)
-
             def composed() -> Composition:
-                prediction = self._answer(model, model.names, [(encoded, None)])
+                encoded = extractor.encode(touch, model.longest, needed)
+                prediction = self._answer(model, extractor, model.names, [(encoded, None)])
                 made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
                 return Composition(made_of, new, prediction)
 
-            return version, composed
+            return composed
 
-        return self._of_one_state(evaluate)
+        return self._of_one_state(begin)
 
     @contextmanager
     def _verifying(self) -> Iterator[None]:
         """Compare the fingerprint of an embedding that was made again, beside what the block does: it embeds, too."""
-        if self._unverified is None:
+        unverified = self._unverified
+        if unverified is None:
             yield
             return
-        identity, path = self._unverified
+        identity, path = unverified
         with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
             compared = beside.submit(identity.require_embedding, path, self._embedding)
             try:
@@ -588,14 +614,17 @@ class TactileLearner:
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""
-        if self._unverified is not None:
-            identity, path = self._unverified
+        unverified = self._unverified
+        if unverified is not None:
+            identity, path = unverified
             identity.require_embedding(path, self._embedding)
             self._unverified = None
         return self._extractor
 
-    def _answer(self, model: Model, candidates: Sequence[str], touches: Sequence[Touch]) -> Prediction:
-        return answer(model, self._extractor, candidates, touches, self._settings.false_alarms)
+    def _answer(
+        self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Touch]
+    ) -> Prediction:
+        return answer(model, extractor, candidates, touches, self._settings.false_alarms)
 
     def settle(self) -> None:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.
@@ -605,26 +634,26 @@ class TactileLearner:
 
         Raises CapacityError where the system has no memory left for it; `predict` does, too.
         """
-        with self._ledger.lock, enough_memory():
-            self._current.settle(self._ledger)
+        with self._locked() as ledger, enough_memory():
+            self._current.settle(ledger)
 
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in it."""
-        with self._ledger.lock, enough_memory():
-            return Draft.of(self._ledger.memory, self._settings.readout).fit()
+        with self._locked() as ledger, enough_memory():
+            return Draft.of(ledger.memory, self._settings.readout).fit()
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
-        with self._ledger.lock:
-            return self._ledger.memory.statistics.digest()
+        with self._locked() as ledger:
+            return ledger.memory.statistics.digest()
 
     def observations(self) -> list[Observation]:
         """Every observation in the journal, in order, and its state; none in a memory without a path.
 
         Raises StoreError.
         """
-        with self._ledger.lock:
-            return [] if self._ledger.store is None else observations(self._ledger.store)
+        with self._locked() as ledger:
+            return [] if ledger.store is None else observations(ledger.store)
 
     @property
     def exemplars(self) -> dict[str, list[bytes]]:
@@ -636,8 +665,8 @@ class TactileLearner:
 
         Raises StoreError; CompactedError in a memory opened to read that was compacted since: `refresh` it first.
         """
-        with self._ledger.lock:
-            return self._ledger.ranked_exemplars()
+        with self._locked() as ledger:
+            return ledger.ranked_exemplars()
 
     def fine_tune(
         self,
@@ -663,9 +692,9 @@ class TactileLearner:
 
         require_arguments({}, {"progress": progress})
         self._verified()
-        with self._ledger.lock:
-            self._ledger.require_writing()
-            model, ranked, memory = self.model(), self.ranked_exemplars(), self._ledger.memory
+        with self._locked() as ledger:
+            ledger.require_writing()
+            model, ranked, memory = self.model(), self.ranked_exemplars(), ledger.memory
             upto, retractions = memory.sequence, memory.retractions
             statistics = copy.deepcopy(memory.statistics)
         tuned, report = fine_tune(
@@ -679,13 +708,13 @@ class TactileLearner:
             device=device,
             progress=progress or _silent,
         )
-        self._ledger.keep_tuned(tuned, memory, upto, retractions)
+        ledger.keep_tuned(tuned, memory, upto, retractions)
         return report
 
     def tuned_digest(self) -> str | None:
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
-        with self._ledger.lock:
-            tuned = self._ledger.memory.tuned
+        with self._locked() as ledger:
+            tuned = ledger.memory.tuned
             return None if tuned is None else tuned.digest()
 
     def _reader(self) -> TunedReader | None:
@@ -704,9 +733,9 @@ class TactileLearner:
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
-        with self._ledger.lock:
+        with self._locked() as ledger:
             self._current.close()
-            self._ledger.close()
+            ledger.close()
 
     def __enter__(self) -> Self:
         return self

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -21,7 +21,7 @@ from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
 from scroll_tactile.live.pressing import PressDetector
 from scroll_tactile.live.readings import Recent, Rows
-from scroll_tactile.prediction.current import Snapshot
+from scroll_tactile.prediction.current import FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Prediction
@@ -41,17 +41,20 @@ EARLIER = 7  # touches of one thing before a touch: more hardly say more, and ea
 
 @dataclass(frozen=True)
 class Memory:
-    """What a session needs of a learner.
+    """What a session needs of a learner, of the memory as it is embedded when the session begins.
 
-    snapshot: its model, which stays as it is while it is held. answer: what a model says, of candidates, of touches of
-    one thing.
+    frozen: its model, which stays as it is while it is held. turn: to be held while a model is asked. answer: what a
+    model says, of candidates, of touches of one thing. require_current: raises InputError where the memory was embedded
+    again.
     """
 
     sensor: Sensor
     embedding: Embedding
     extractor: FeatureExtractor
-    snapshot: Callable[[], Snapshot]
+    frozen: Callable[[], FrozenModel]
+    turn: Callable[[Model], AbstractContextManager[object]]
     answer: Callable[[Model, Sequence[str], Sequence[Encoded]], Prediction]
+    require_current: Callable[[], None]
 
 
 @dataclass
@@ -63,7 +66,7 @@ class _Touch:
 
     rows: Rows
     at: float
-    snapshot: Snapshot
+    frozen: FrozenModel
     rule: DecisionRule
     cache: WindowCache
     moments: list[int]  # that are to come, in readings; the next is the last of them
@@ -98,7 +101,8 @@ class LiveSession:
             raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
         self._memory, self._risk = memory, risk
         self.sensor = sensor = memory.sensor
-        model = memory.snapshot().model
+        frozen = memory.frozen()  # until the rule is measured, which takes seconds
+        model = frozen.model
         candidates_of(scene, model.names, model.known)
         self._scene = scene
         self._manual = contact == "manual"
@@ -135,7 +139,8 @@ class LiveSession:
         prediction and whether it was decided, and `ended` says whether there are any.
 
         Raises StreamError for readings that are not this sensor's, or not finite where it refuses them; InputError for
-        times that are no seconds, and after `close`. Nothing was taken then, and the session goes on.
+        times that are no seconds, and after `close`. Nothing was taken then, and the session goes on. InputError also
+        where the memory was embedded again: then only `close` is left, which ends the touch under way.
         """
         self._require_open()
         rows = self._rows(reading)
@@ -214,6 +219,7 @@ class LiveSession:
     def _require_open(self) -> None:
         if self._closed:
             raise InputError("the live session is closed: begin another with learner.live()")
+        self._memory.require_current()
 
     def _require_manual(self, what: str) -> None:
         self._require_open()
@@ -269,8 +275,8 @@ class LiveSession:
     def _begin(self, rows: Array) -> None:
         """A touch began with these readings."""
         self._recent.clear()
-        snapshot = self._memory.snapshot()
-        model = snapshot.model
+        frozen = self._memory.frozen()
+        model = frozen.model
         rule = self._rule(model)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame = 0, 1
@@ -283,7 +289,7 @@ class LiveSession:
         moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
         earlier, self._again = self._thing if self._again else (), False
-        self._under_way = _Touch(Rows(rows, limit), at, snapshot, rule, WindowCache(), moments, before, earlier)
+        self._under_way = _Touch(Rows(rows, limit), at, frozen, rule, WindowCache(), moments, before, earlier)
         self._predict_in_time(self._under_way)
 
     def _leave(self, touch: _Touch | None) -> None:
@@ -296,7 +302,8 @@ class LiveSession:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
-            known[self._risk] = decision_rule(model, self._memory.extractor, self._risk)
+            with self._memory.turn(model):
+                known[self._risk] = decision_rule(model, self._memory.extractor, self._risk)
         return known[self._risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:
@@ -330,7 +337,7 @@ class LiveSession:
 
     def _predict(self, touch: _Touch, stream: Stream) -> Prediction:
         """The prediction for the beginning of a touch, as `learner.predict` gives it."""
-        model = touch.snapshot.model
+        model = touch.frozen.model
         candidates = model.names
         if self._scene is not None:
             candidates = sorted({name for name in self._scene if name in model.known})

@@ -61,7 +61,7 @@ def early_answers(model: Model, extractor: FeatureExtractor) -> Early | None:
 
 @dataclass(frozen=True)
 class _Measured:
-    """Measures how models judge beginnings; a copy of a model shares it, and with it the embedding."""
+    """Measures how models judge beginnings."""
 
     extractor: FeatureExtractor
 
@@ -71,9 +71,6 @@ class _Measured:
         sensor, least = self.extractor.sensor, min(model.least, model.pooled.recall.longest)
         moments = moments_of(sensor.rate, model.plan.milestones(), least, fewest_readings(sensor))
         return early_of(*_heard(model, self.extractor, model.pooled, moments))
-
-    def __deepcopy__(self, memo: object) -> _Measured:
-        return self
 
 
 def _heard(

@@ -13,7 +13,6 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from copy import deepcopy
 from weakref import ReferenceType, ref
 
 from scroll_tactile.errors import InputError
@@ -21,10 +20,11 @@ from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
+from scroll_tactile.prediction.measurement import Measurement
 from scroll_tactile.prediction.model import Draft, Measures, Model
 from scroll_tactile.settings import Settings
 
-__all__ = ["CurrentModel", "Snapshot"]
+__all__ = ["CurrentModel", "FrozenModel"]
 
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
@@ -33,11 +33,8 @@ MEASURED = 1.5  # times as many touches as when beginnings were last measured: u
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
-class Snapshot:
-    """A model that stays as it is, whatever is observed meanwhile: the memory's own until that changes, then a copy.
-
-    Of more than 1024 materials, those that few touches resembled are read from the memory as it is.
-    """
+class FrozenModel:
+    """Holds a model as it is, whatever is observed meanwhile: a copy is followed, for as long as somebody has this."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -57,42 +54,41 @@ class CurrentModel:
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
-        self._lent: ReferenceType[Snapshot] | None = None
+        self._lent: list[ReferenceType[FrozenModel]] = []
 
-    def snapshot(self, ledger: Ledger) -> Snapshot:
-        """The present model, for as long as the snapshot is held."""
-        model, lent = self.present(ledger), None if self._lent is None else self._lent()
-        if lent is None or lent.model is not model:
-            lent = Snapshot(model)
-            self._lent = ref(lent)
+    def frozen(self, ledger: Ledger) -> FrozenModel:
+        """The present model, which stays as it is for as long as what is returned is held."""
+        model = self.present(ledger)
+        lent = self._holder(model)
+        if lent is None:
+            lent = FrozenModel(model)
+            self._lent = [*(one for one in self._lent if one() is not None), ref(lent)]
         return lent
 
-    def _leave_lent(self, model: Model, memory: Memory) -> None:
-        """Give who holds a model a copy of it, before it changes."""
-        lent = None if self._lent is None else self._lent()
-        if lent is not None and lent.model is model:
-            lent.model = deepcopy(model, {id(memory.statistics): memory.statistics})
-        self._lent = None
+    def _holder(self, model: Model) -> FrozenModel | None:
+        """What holds a model as it is, if anything does."""
+        return next((lent for one in self._lent if (lent := one()) is not None and lent.model is model), None)
 
     def present(self, ledger: Ledger) -> Model:
         """The model that predictions are made with."""
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
-        self._take_in(ledger)
+        self.take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
-        before, measures = (None, None) if model is None else (model.beginnings, model.measures)
+        before = None if model is None else model.beginnings
         if model is not None and (behind is None or self._due(model, memory)):
             model = None
         if model is not None and behind:
             self._exact = False
-            self._leave_lent(model, memory)
+            # In place where nobody holds it: to copy one takes as long as half a prediction.
+            model = model.copy() if self._holder(model) is not None else model
             if not model.follow(memory, behind):
                 model = None
         # The last one is let go first, and its memory given back: each is some tens of MB.
         present = self._adopted(memory) if model is None else model
-        if before is not None and not present.beginnings and MEASURED * before.touches >= memory.statistics.touches:
+        if before is not None and before is not present.beginnings and _serves(before, present, memory):
             # Measuring takes seconds, and a call would wait for it.
-            present.judge_beginnings(before, measures)
+            present.beginnings = Measurement(before)
             self._exact = False
         self._model, self._behind = present, []
         self.prepare(ledger)
@@ -100,7 +96,7 @@ class CurrentModel:
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin to fit the next model where enough has come since the last. Raises nothing: an observation is kept."""
-        self._take_in(ledger)
+        self.take_in(ledger)
         model, touches = self._model, ledger.memory.statistics.touches
         if model is None or self._behind is None or self._coming is not None:
             return
@@ -110,12 +106,12 @@ class CurrentModel:
             with suppress(MemoryError, InputError, RuntimeError):
                 self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
                 self._since = []
-                self._coming = self._worker.submit(_fit, Draft.of(ledger.memory, self._kind), model.measures)
+                self._coming = self._worker.submit(_fit, Draft.of(ledger.memory, self._kind), model.beginnings.measures)
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
         memory = ledger.memory
-        self._take_in(ledger)
+        self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
             self._model, self._coming = None, None
             self._model, self._behind = self._fitted(memory), []
@@ -127,12 +123,13 @@ class CurrentModel:
         if worker is not None:
             worker.shutdown()
 
-    def _take_in(self, ledger: Ledger) -> None:
+    def take_in(self, ledger: Ledger) -> None:
         """Note what has changed since it was last noted."""
         if self._process != os.getpid():  # a forked process has not the thread
             self._process, self._worker, self._coming = os.getpid(), None, None
         if ledger.version == self._version:
             return
+        self._keep_lent(ledger.added or [])
         added = ledger.added if self._model is not None else None
         # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
         (behind, coming), (self._behind, self._coming) = (self._behind, self._coming), (None, None)
@@ -141,6 +138,13 @@ class CurrentModel:
         if added is not None:
             coming = coming if coming is not None and _with(self._since, added) is not None else None
             self._behind, self._coming = _with(behind, added), coming
+
+    def _keep_lent(self, added: Sequence[Added]) -> None:
+        """Have models that are held, and read the memory, keep what changed there as it was before."""
+        for one in self._lent:
+            if (lent := one()) is not None and lent.model.reads_memory:
+                with suppress(MemoryError):  # who asks for what changed is told
+                    lent.model.hold_before(added)
 
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""
@@ -183,6 +187,14 @@ def _fit(draft: Draft, measures: Measures | None) -> Model:
     if measures is not None:
         model.early(measures)
     return model
+
+
+def _serves(before: Measurement[Model], present: Model, memory: Memory) -> bool:
+    """Whether a model judges beginnings as one before it does, which was measured, or is being measured."""
+    if not before.asked_for or present.beginnings.asked_for:
+        return False
+    found = before.found
+    return found is None or MEASURED * found.touches >= memory.statistics.touches
 
 
 def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.prediction.measurement import Measurement
 from scroll_tactile.readouts.calibration import (
     PRIOR_WEIGHT,
     Calibration,
@@ -26,24 +28,16 @@ from scroll_tactile.readouts.deviation import recall_of
 from scroll_tactile.readouts.early import Early
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
 from scroll_tactile.readouts.pooled import Apart, Pooled, pool
-from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
+from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName, Task
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Beginnings", "Draft", "Judgement", "Measures", "Model", "enough_memory"]
+__all__ = ["Draft", "Judgement", "Measures", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Measures = Callable[["Model"], Early | None]
-
-
-@dataclass(frozen=True)
-class Beginnings:
-    """How beginnings are judged, None where nothing could be measured; touches: of the memory when that was done."""
-
-    early: Early | None
-    touches: int
 
 
 # Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
@@ -105,6 +99,7 @@ class Draft:
     sample: list[tuple[str, bytes, SampledTouch]]
     kept: list[Kept]
     longest: int
+    least: int
     touches: int
 
     @classmethod
@@ -124,7 +119,8 @@ class Draft:
         # What was compacted before there were views cannot be viewed: then it is judged by its windows alone.
         views = [view for view in memory.plan.views if len(statistics.names(view)) == len(names)]
         kept = memory.kept.touches() if memory.kept is not None and views else []
-        return cls(kind, memory, names, stages, views, tasks, sample, kept, statistics.longest, statistics.touches)
+        lengths = statistics.longest, statistics.usual_least
+        return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
 
     def fit(self) -> Model:
         """Solve the readouts and calibrate them, once: the tasks are let go."""
@@ -180,9 +176,12 @@ class Model:
     views: the views that judge beside them; whole: the calibration of both, for whole touches at the last stage.
     pooled: the kept touches beside it, if any; conformal: how typical others are of them. least: the columns of all but
     the shortest touches that were learned. readouts: scale → its readout. calibrations: of the stages, as far as any
-    touch reached them. apart: scale → the sampled touches left out; sample: these. measures: by what beginnings were
-    measured, None before they were. dependence: how far touches of one thing say the same. longest: the columns of the
-    longest touch that was learned. fitted_to: the touches that it was fitted to.
+    touch reached them. apart: scale → the sampled touches left out; sample: these. beginnings: how they are judged.
+    dependence: how far touches of one thing say the same. longest: the columns of the longest touch that was learned.
+    fitted_to: the touches that it was fitted to.
+
+    Any number of threads may ask at once; where it `reads_memory` only one, which holds the memory's lock. It follows
+    where nobody asks: otherwise a copy does.
     """
 
     def __init__(
@@ -208,26 +207,36 @@ class Model:
         self.pooled = pooled
         self.dependence = dependence
         self.conformal = Conformal(draft.kept) if pooled else None
-        self.least = draft.memory.statistics.usual_least
+        self.least = draft.least
         self.sample = draft.sample
-        self._early: list[Beginnings] = []
-        self.measures: Measures | None = None
+        self.beginnings: Measurement[Model] = Measurement()
 
     def early(self, measures: Measures) -> Early | None:
         """How beginnings are judged: as it `measures` when it is first asked for, and the same from then on."""
-        if not self._early:
-            self._early.append(Beginnings(measures(self), self.fitted_to))
-            self.measures = measures
-        return self._early[0].early
+        return self.beginnings.of(self, self.fitted_to, measures)
 
     @property
-    def beginnings(self) -> Beginnings | None:
-        """How beginnings are judged, once that was asked for."""
-        return self._early[0] if self._early else None
+    def reads_memory(self) -> bool:
+        """Whether it has so many materials that it reads those that are asked for from the memory."""
+        return len(self.names) > EAGER
 
-    def judge_beginnings(self, by: Beginnings, measures: Measures | None) -> None:
-        """Judge beginnings as an earlier model of the same memory does, until they are measured anew."""
-        self._early, self.measures = [by], measures
+    def copy(self) -> Model:
+        """Another model of the same state, for one of the two to follow; what following never changes, they share."""
+        other = copy.copy(self)
+        other.readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
+        other._of_all = {}
+        if self.pooled is not None and self.conformal is not None:
+            other.pooled = replace(self.pooled, recall=self.pooled.recall.copy())
+            other.conformal = self.conformal.copy()
+        other.beginnings = Measurement(self.beginnings)
+        return other
+
+    def hold_before(self, added: Sequence[Added]) -> None:
+        """Hold the materials of touches that came and went in the memory as they were before."""
+        with one_thread():
+            for scale, readout in self.readouts.items():
+                readout.hold_before(_changes(scale, added))
+                readout.lasting = True
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
@@ -235,7 +244,7 @@ class Model:
         The readouts are then those of all that was observed; calibration, and how far the scatter is shrunk, stay.
         """
         for scale in memory.statistics.scales:
-            changes = [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
+            changes = _changes(scale, added)
             if not changes or (scale in memory.plan.views and scale not in self.views):
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
@@ -398,6 +407,11 @@ class Model:
 
     def _calibration(self, stage: int, whole: bool) -> Calibration:
         return self.whole if self.whole is not None and self._is_whole(stage, whole) else self.calibrations[stage]
+
+
+def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:
+    """What of touches that came and went is of a scale."""
+    return [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
 
 
 def _chances(logits: FloatArray) -> FloatArray:

@@ -7,6 +7,8 @@ that of exact scores alone.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import numpy.typing as npt
 
@@ -27,6 +29,13 @@ class Coarse:
         self._means, self._sizes = means, sizes
         self._lengths = _lengths(means)
         self._slack = np.zeros(len(sizes))
+
+    def copy(self) -> Coarse:
+        """Another of the same materials: what is put there is not put here."""
+        other = copy.copy(self)
+        other._means, other._sizes = self._means.copy(), self._sizes.copy()
+        other._lengths, other._slack = self._lengths.copy(), self._slack.copy()
+        return other
 
     def put(self, place: int, mean: FloatArray, size: float) -> None:
         """The material at a place has another mean, or is new there."""

@@ -16,6 +16,7 @@ predictor. The values compared are whole numbers, and sums of their squares are 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
@@ -40,7 +41,8 @@ APART = 2.0  # times that a touch's being nearer to another material counts
 class Conformal:
     """Kept touches, and how typical another is of each of their materials.
 
-    touches: of one number of channels; lengths may differ. Not for several threads at once.
+    touches: of one number of channels; lengths may differ. Any number of threads may ask at once. It follows where
+    nobody asks: otherwise a copy does.
     """
 
     def __init__(self, touches: Sequence[Kept]) -> None:
@@ -62,7 +64,7 @@ class Conformal:
             self._steps, self._lengths = self._steps[staying], self._lengths[staying]
             self._near = {}
         first = len(self._touches)
-        self._touches += [(touch.material, touch.key) for touch in added]
+        self._touches = [*self._touches, *((touch.material, touch.key) for touch in added)]
         steps = [
             self._steps_of([touch.levels for touch in added[i : i + AT_ONCE]]) for i in range(0, len(added), AT_ONCE)
         ]
@@ -73,6 +75,12 @@ class Conformal:
         self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
         for reach in list(self._near):
             self._near[reach] = self._nearer(reach, *self._near[reach], first)
+
+    def copy(self) -> Conformal:
+        """Another of the same touches: what comes to it does not come to this one."""
+        other = copy.copy(self)
+        other._near = dict(self._near)  # all else is replaced when it follows, and never changed
+        return other
 
     @property
     def materials(self) -> list[str]:

@@ -12,6 +12,7 @@ Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same byte
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -96,7 +97,7 @@ class Table:
 
 
 class Likelihood:
-    """The tables of one set of touches.
+    """The tables of one set of touches, for any number of threads.
 
     spread: standard deviation of a reading among touches of one material, in levels, for each level; shape (255,).
     weights: how often each level is read, shape (255,).
@@ -106,13 +107,19 @@ class Likelihood:
         self.spread = np.maximum(spread, NARROWEST)
         self.weights = weights / weights.sum()
         self._tables: OrderedDict[Noise, Table] = OrderedDict()
+        self._lock = threading.Lock()  # of the order of the tables; never held while one is made
 
     def table(self, noise: Noise) -> Table:
         """The table of a kind of noise; the latest are kept."""
-        found = self._tables.pop(noise, None) or self._made(noise)
-        self._tables[noise] = found
-        if len(self._tables) > MOST_TABLES:
-            self._tables.popitem(last=False)
+        with self._lock:
+            if (found := self._tables.get(noise)) is not None:
+                self._tables.move_to_end(noise)
+                return found
+        found = self._made(noise)
+        with self._lock:
+            self._tables[noise] = found
+            if len(self._tables) > MOST_TABLES:
+                self._tables.popitem(last=False)
         return found
 
     def _made(self, noise: Noise) -> Table:

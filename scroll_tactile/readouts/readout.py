@@ -103,7 +103,10 @@ class Readout:
 
     names: the materials; one is known by its place among them. reference: places. origin: shape (d,), in codes.
     counts: rows, shape (C,). share: ρ. penalty: P. precision: one over the variance of each feature within materials as
-    it was solved, shape (d,). Not for several threads at once.
+    it was solved, shape (d,).
+
+    Any number of threads may ask one of at most EAGER materials at once, and one thread one of more. It follows where
+    nobody asks: otherwise a copy does.
 
     Some materials are held, with all that scores need: the reference first.
 
@@ -130,6 +133,7 @@ class Readout:
         matrix[np.diag_indices(dimension)] += self.penalty
         self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix)
         self._held: dict[int, int] = {}  # place → row of these
+        self.lasting = False  # whether none is let go: the memory has others by now
         self._room = np.empty((0, 2, dimension))
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
         self._sizes = np.empty(0)  # mᵀ K⁻¹ m
@@ -185,7 +189,7 @@ class Readout:
         """Where the materials at some places are held; those that were not are from now on."""
         absent = [int(place) for place in places if int(place) not in self._held]
         if absent:
-            if len(self._held) + len(absent) > MOST_HELD:
+            if len(self._held) + len(absent) > MOST_HELD and not self.lasting:
                 self._let_go()
                 absent = [int(place) for place in places if int(place) not in self._held]
             names = [self.names[place] for place in absent]
@@ -213,7 +217,7 @@ class Readout:
             if sign > 0:
                 come.setdefault(material, []).append(rows - self.origin)
         with one_thread():
-            self._hold_before(changes)
+            self.hold_before(changes)
             self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
             for material, rows, sign in changes:
                 if sign < 0:
@@ -223,22 +227,34 @@ class Readout:
                     self._follow({material: rows - self.origin}, -1)
         return self.system.sound
 
+    def copy(self) -> Readout:
+        """Another readout of the same: what comes to it does not come to this one."""
+        other = self._branch()
+        other.names, other.places, other.lasting = [*self.names], dict(self.places), False
+        other._derived, other._coarse = self._derived, None if self._coarse is None else self._coarse.copy()
+        return other
+
     def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
         """Another readout, that never had a touch of these rows, codes (k, d); of a material that has others.
 
         Whoever calls has BLAS on one thread.
         """
+        other = self._branch()
+        other.held([other.places[material]])
+        other._follow({material: rows - self.origin}, -1)
+        return other
+
+    def _branch(self) -> Readout:
+        """Another readout, which follows by itself as long as no material is new to it."""
         other = copy.copy(self)
         other.system = self.system.branch()
         other.counts, other._held, other._sizes = self.counts.copy(), dict(self._held), self._sizes.copy()
         other._room = np.stack([self._means, self._solved], axis=1)
         other._means, other._solved = other._room[:, 0], other._room[:, 1]
         other._derived = other._compared = other._coarse = None
-        other.held([other.places[material]])
-        other._follow({material: rows - self.origin}, -1)
         return other
 
-    def _hold_before(self, changes: Sequence[Change]) -> None:
+    def hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
         absent: dict[str, list[Change]] = {}
         for change in changes:
@@ -299,9 +315,10 @@ class Readout:
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
-        if self._derived is None:
-            self._derived = Derived.of(self)
-        return self._derived
+        found = self._derived
+        if found is None:
+            self._derived = found = Derived.of(self)
+        return found
 
     def _reference_z(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about the origin, shape (R,)."""
@@ -373,21 +390,25 @@ class Readout:
 
     def coarse(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scores "lda" of all materials by place, in single precision, and bounds of their errors, each (C,)."""
-        if self._compared is None or self._compared[0] is not codes:
+        found = self._compared
+        if found is None or found[0] is not codes:
             with one_thread():
                 if self._coarse is None:
                     self._coarse = self._all_coarsely()
                 solved = self.system.solve((codes - self.origin)[None])[0]
             scores, errors = self._coarse.scores(solved)
-            self._compared = codes, self.gamma * scores, self.gamma * errors
-        return self._compared[1:]
+            self._compared = found = codes, self.gamma * scores, self.gamma * errors
+        return found[1:]
 
     def _all_coarsely(self) -> Coarse:
         means, sizes = np.empty((len(self.names), len(self.origin)), np.float32), np.empty(len(self.names))
-        for first in range(0, len(means), EAGER):
-            block = self.names[first : first + EAGER]
+        places, rows = list(self._held), list(self._held.values())
+        means[places], sizes[places] = self._means[rows], self._sizes[rows]
+        absent = [place for place in range(len(means)) if place not in self._held]
+        for first in range(0, len(absent), EAGER):
+            places = absent[first : first + EAGER]
+            block = [self.names[place] for place in places]
             counts, sums = self._statistics.counts(self.scale, block), self._statistics.sums(self.scale, block)
             own = _class_means(counts, sums, self.origin)
-            means[first : first + EAGER] = own
-            sizes[first : first + EAGER] = np.einsum("hd,hd->h", own, self.system.solve(own))
+            means[places], sizes[places] = own, np.einsum("hd,hd->h", own, self.system.solve(own))
         return Coarse(means, sizes)

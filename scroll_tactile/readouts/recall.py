@@ -15,6 +15,7 @@ All is a function of the set of kept touches, in any order.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 
@@ -138,6 +139,8 @@ class Recall:
 
     touches: of one number of channels; lengths may differ. measured: of these touches, or of most of them.
 
+    Any number of threads may ask at once. It follows where nobody asks: otherwise a copy does.
+
     Raises InputError for touches of different channels, and for none.
     """
 
@@ -200,6 +203,15 @@ class Recall:
             self._add(touch)
         self._named()
         return bool(self._touches)
+
+    def copy(self) -> Recall:
+        """Another of the same touches: what comes to it does not come to this one."""
+        other = copy.copy(self)
+        other._touches, other._levels = [*self._touches], [*self._levels]
+        other._held = self._room(len(self._held.blocks))
+        other._held.take(self._held, len(self))
+        other._named()
+        return other
 
     def _room(self, count: int) -> _Room:
         return _Room.of(count, self.channels, len(self._edges) - 1, len(self._edges[::COARSER]) - 1)

@@ -20,7 +20,7 @@ from faults.model import warm
 from faults.shim import begin_again_watched
 
 HERE = Path(__file__).parent
-NAMES = ("kill", "each_call", "power_cut", "bit_flips", "disk", "processes", "latency", "space", "hostile")
+NAMES = ("kill", "each_call", "power_cut", "bit_flips", "disk", "processes", "latency", "space", "hostile", "threads")
 
 
 def study(name: str, arguments: list[str], record: Path) -> dict[str, Any]:

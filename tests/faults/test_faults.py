@@ -19,6 +19,7 @@ COUNTS = {
     "latency": "disk",
     "space": "large",
     "hostile": "cases",
+    "threads": "calls",
 }
 
 pytestmark = pytest.mark.skipif(

@@ -10,7 +10,7 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.prediction import beginnings
 from scroll_tactile.prediction.beginnings import early_answers
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import Beginnings
+from scroll_tactile.prediction.measurement import Beginnings, Measurement
 
 SKIN = Sensor(name="skin", channels=6, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.2)
 SCENE = Scene(sensor=SKIN, seed=2)
@@ -62,7 +62,7 @@ def test_what_is_said_of_touches_left_out_is_what_a_memory_without_them_says(mod
     left = beginnings._left(fresh, fresh.pooled)
     keys = {key for key, row in fresh.pooled.recall.rows().items() if row in [touch.row for touch in left]}
     without = learned([(name, touch) for name, touch in TOUCHES if touch.key not in keys])
-    without._current.present(without._ledger).judge_beginnings(Beginnings(early, 0), None)
+    without._current.present(without._ledger).beginnings = Measurement(found=Beginnings(early, 0))
     rows = {row: key for key, row in fresh.pooled.recall.rows().items()}
     readings = {touch.key: touch for _, touch in TOUCHES}
     for i, one in enumerate(left):

@@ -1,0 +1,729 @@
+"""Learner calls and live sessions in eight threads on one memory: `python tests/faults/threads.py --minutes 60`.
+
+Every answer must be that of the memory after one of the rows that it had between the call and its return; all that is
+said of a live touch, that of one row that it had while the call lasted in which the touch began. Each round has a
+memory of its own and some seconds; then the journal tells which states there were, and each answer is looked up.
+
+As strict as what is promised. Digest, materials, descriptions and exemplars are functions of the state. So is the
+typicality in every prediction, to the bit, for all touches are kept and of one length; and the touches of each material
+that the readouts count. Probability and novelty rest on a calibration that may lag behind (README), so of these it is
+asked that they are of exactly the materials of that state, and that the same model says the same again, to the bit,
+while others go on. Settled at the end, all is what a memory says that observed the same in one thread.
+
+Nothing may be raised but what is named here for each call. A call that takes longer than two minutes hangs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import faulthandler
+import math
+import random
+import sys
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+import numpy.typing as npt
+
+import scroll_tactile.learner
+import scroll_tactile.prediction.beginnings
+import scroll_tactile.readouts.pooled
+from faults.common import folder, parser, progress, run
+from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.errors import DescriptionError, InputError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.readouts.conformal import Conformal
+from scroll_tactile.readouts.likelihood import LEVELS, Likelihood
+from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.results import Prediction
+from scroll_tactile.signals.stream import Stream
+from store import CompactedError
+
+Array = npt.NDArray[np.float64]
+
+SKIN = Sensor(name="skin", channels=4, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.4)
+SETTINGS: dict[str, Any] = {"sensor": SKIN, "embedding": Kernels(seed=0, dimension=64), "exemplars": 4, "recall": 500}
+LENGTH, SHORT = 20, 12  # readings of a touch, and of the beginning of one
+PAUSE = 30  # readings between touches; two seconds before the first of a session that finds them itself
+MATERIALS, FIRST = "abcdef", "abcd"
+FEWEST, MOST = 24, 56  # touches in the memory
+NEW_AGAIN = 0.2  # of observations are of a material that comes and goes
+SAID = ({"silk": 1.0}, {"silk": 0.25, "wool": 0.75}, {"wool": 1.0})
+TAKEN_OUT = 8  # touches to calibrate on, in place of 96: many short fits, and not a few long ones
+HANGS = 120.0  # seconds
+SHOWN = 20  # failures of a round
+
+
+def touch(material: str, seed: int, readings: int = LENGTH) -> Array:
+    """A touch: its material's level and rhythm, in noise."""
+    rng, place = np.random.default_rng([ord(material), seed]), MATERIALS.index(material)
+    waves = np.sin(np.arange(readings)[:, None] * (0.2 + 0.15 * place) + rng.uniform(0, 6, SKIN.channels))
+    noisy = 0.35 + 0.08 * place + 0.1 * waves + 0.03 * rng.standard_normal((readings, SKIN.channels))
+    return np.asarray(noisy.clip(0, 1))
+
+
+def rest(seed: int, readings: int) -> Array:
+    """Readings while nothing touches."""
+    return np.asarray(0.1 + 0.004 * np.random.default_rng(seed).standard_normal((readings, SKIN.channels)))
+
+
+@dataclass(frozen=True)
+class State:
+    """What a memory holds after a row. touches: material and key of each. described: material → constituents."""
+
+    touches: tuple[tuple[str, bytes], ...]
+    described: Mapping[str, Any]
+
+    @cached_property
+    def materials(self) -> dict[str, int]:
+        """Material → touches."""
+        return dict(sorted(Counter(material for material, _ in self.touches).items()))
+
+
+class Truth:
+    """The states that there were, and what is to be said in each.
+
+    rows: heads of the journal. readings: by key. groups: first and last of rows that became visible at once.
+    """
+
+    def __init__(self, rows: Sequence[Any], readings: Mapping[bytes, Array], groups: Sequence[tuple[int, int]]) -> None:
+        self.rows, self._readings = rows, readings
+        self._learner = TactileLearner(**SETTINGS)
+        self._within = {row for first, last in groups for row in range(first, last)}
+        self._digests: dict[tuple[tuple[str, bytes], ...], str] = {}
+        self._conformal: dict[int, Conformal] = {}
+        self._codes: dict[bytes, Any] = {}
+        held: dict[int, tuple[str, bytes]] = {}
+        described: dict[str, Any] = {}
+        self.states = [State((), {})]
+        for row in rows:
+            if row.kind == OBSERVE:
+                held[row.sequence] = row.label, row.key
+            elif row.kind == RETRACT:
+                held = {at: one for at, one in held.items() if at not in set(unspanned(row.attributes["sequences"]))}
+            if row.kind == DESCRIBE or (row.kind == RETRACT and row.label):
+                said = row.attributes.get("constituents")
+                described = {name: of for name, of in described.items() if name != row.label}
+                described |= {} if said is None else {row.label: dict(said)}
+            self.states.append(State(tuple(sorted(held.values())), described))
+        scale_rows = self.codes(next(key for _, key in self.states[-1].touches))
+        self.rows_a_touch = {int(scale): len(codes) for scale, codes in scale_rows.items()}
+
+    def stream(self, key: bytes) -> Stream:
+        """A touch that was observed."""
+        return self._learner.stream(self._readings[key])
+
+    def codes(self, key: bytes) -> Any:
+        """What it added to the sums."""
+        if key not in self._codes:
+            extractor = self._learner._extractor
+            self._codes[key] = extractor.codes(extractor.image(self.stream(key)), key)
+        return self._codes[key]
+
+    def between(self, since: int, until: int, *, inside: bool) -> Iterator[int]:
+        """The states after which rows others could see; inside: or who made several rows at once."""
+        for row in range(since, min(until, len(self.rows)) + 1):
+            if inside or row not in self._within:
+                yield row
+
+    def digest(self, row: int) -> str:
+        """The digest after a row."""
+        touches = self.states[row].touches
+        if touches not in self._digests:
+            sums = self._learner._empty_memory().statistics
+            for material, key in touches:
+                sums.add(material, self.codes(key), LENGTH)
+            self._digests[touches] = sums.digest()
+        return self._digests[touches]
+
+    def typical(self, row: int, names: Sequence[str], streams: Sequence[Stream]) -> tuple[float, ...]:
+        """How typical touches of one thing are of some materials."""
+        keeping = self._learner._empty_memory().kept.made  # type: ignore[union-attr]
+        if row not in self._conformal:
+            kept = [
+                Kept(name, key, keeping.levels(self.stream(key).readings)) for name, key in self.states[row].touches
+            ]
+            self._conformal[row] = Conformal(kept)
+        once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
+        found = [self._conformal[row].p_values(keeping.levels(once[key].readings)) for key in sorted(once)]
+        if len(found) == 1:
+            return tuple(found[0][name] for name in names)
+        return tuple(min(1.0, 2 * math.fsum(of[name] for of in found) / len(found)) for name in names)
+
+
+@dataclass
+class Told:
+    """What a call said. since, until: rows of the memory before the call and after its return.
+
+    of: "digest", "materials" and so on, or "prediction": then streams are those that it is of, where they are known,
+    and counts the rows of each material at each scale that the readouts are of.
+    """
+
+    of: str
+    since: int
+    until: int
+    what: Any
+    inside: bool = False
+    streams: Sequence[Stream] = ()
+    counts: Any = None
+
+    def is_of(self, truth: Truth, row: int) -> bool:
+        """Whether it is what the memory says after a row."""
+        return self.differs(truth, row) is None
+
+    def differs(self, truth: Truth, row: int) -> str | None:
+        """What of it the memory does not say after a row."""
+        state = truth.states[row]
+        if self.of == "prediction":
+            return self._predicted(truth, row)
+        if self.of == "exemplars":
+            same = all((name, key) in state.touches for name, keys in self.what.items() for key in keys)
+        elif self.of == "digest":
+            same = self.what == truth.digest(row)
+        elif self.of == "materials":
+            same = self.what == state.materials
+        else:
+            same = repr(self.what) == repr(dict(sorted(state.described.items())))
+        return None if same else self.of
+
+    def _predicted(self, truth: Truth, row: int) -> str | None:
+        said: Prediction = self.what
+        materials, names = truth.states[row].materials, [name for name, _ in said.ranking]
+        if sorted(names) != list(materials):
+            return f"materials {sorted(names)} of {materials}"
+        counted = {
+            scale: {name: touches * of for name, touches in materials.items()}
+            for scale, of in truth.rows_a_touch.items()
+        }
+        if self.counts is not None and self.counts != counted:
+            return f"readouts of {self.counts}, and not {counted}"
+        if self.streams and said.typicality != truth.typical(row, names, self.streams):
+            return f"typicality {said.typicality}, and not {truth.typical(row, names, self.streams)}"
+        return None
+
+    def unsound(self) -> str | None:
+        """What is wrong with it by itself."""
+        if self.of == "prediction" and self.what.ranking:
+            said, total = self.what, math.fsum(share for _, share in self.what.ranking)
+            if not (abs(total - 1) < 1e-9 and math.isfinite(said.novelty)):
+                return f"a prediction whose shares sum to {total}, of novelty {said.novelty}"
+        return None
+
+
+@dataclass
+class LiveTold:
+    """All that was said of one live touch, which began while a call lasted."""
+
+    said: list[Told] = field(default_factory=list)
+
+
+@dataclass
+class Round:
+    """A memory under eight threads, until `stop`."""
+
+    learner: TactileLearner
+    reader: TactileLearner
+    others: list[Path]
+    seed: int
+    stop: threading.Event = field(default_factory=threading.Event)
+    failures: list[str] = field(default_factory=list)
+    told: list[Told | LiveTold] = field(default_factory=list)
+    readings: dict[bytes, Array] = field(default_factory=dict)
+    groups: list[tuple[int, int]] = field(default_factory=list)
+    calls: Counter[str] = field(default_factory=Counter)
+    busy: dict[str, tuple[str, float]] = field(default_factory=dict)
+    acknowledged: int = 0
+    made: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def fresh(self, material: str) -> Array:
+        """A touch that was never made before."""
+        with self.lock:
+            self.made += 1
+            seed = self.made
+        return touch(material, 1000 * self.seed + seed)
+
+    def fail(self, text: str) -> None:
+        """Something was wrong."""
+        with self.lock:
+            self.failures.append(text)
+
+    def tell(self, told: Told | LiveTold) -> None:
+        """Keep what a call said."""
+        with self.lock:
+            self.told.append(told)
+
+    def acknowledge(self, row: int) -> None:
+        """A call has returned that made this row."""
+        with self.lock:
+            self.acknowledged = max(self.acknowledged, row)
+
+
+def row_of(learner: TactileLearner) -> int:
+    """The last row that its memory has taken in, or is just taking in."""
+    return learner._ledger._memory.sequence
+
+
+def counts_of(model: Any) -> dict[int, dict[str, float]]:
+    """The rows of each material that the readouts of a model are of, by scale."""
+    return {
+        int(scale): {name: float(readout.counts[place]) for name, place in readout.places.items()}
+        for scale, readout in model.readouts.items()
+    }
+
+
+LOCAL = threading.local()
+
+
+@contextmanager
+def watched(fail: Callable[[str], None]) -> Iterator[None]:
+    """While it lasts each answer is asked for twice of the model that gives it, which must stay as it is."""
+    own = scroll_tactile.learner.answer
+
+    def answer(model: Any, *rest: Any) -> Prediction:
+        before, said = counts_of(model), own(model, *rest)
+        again = own(model, *rest)
+        if counts_of(model) != before:
+            fail("a model that an answer is of was changed meanwhile: it counts other touches")
+        elif again != said:
+            fail(f"a model said {said}, and asked again {again}")
+        LOCAL.counts = before
+        return said
+
+    with patch.object(scroll_tactile.learner, "answer", answer):
+        yield
+
+
+class Worker:
+    """One thread: random calls of its kinds, until the round is over."""
+
+    def __init__(self, round_: Round, number: int, kinds: Sequence[str]) -> None:
+        self.round, self.kinds, self.name = round_, kinds, f"{number}"
+        self.rng = random.Random(f"{round_.seed} {number}")
+        self.inside = False
+
+    def run(self) -> None:
+        """Call after call."""
+        while not self.round.stop.is_set():
+            kind = self.rng.choice(self.kinds)
+            self.round.busy[self.name] = kind, time.monotonic()
+            try:
+                getattr(self, kind)()
+            except Exception as error:  # what a call may raise is caught there
+                frames = traceback.extract_tb(error.__traceback__)[-4:]
+                at = ", ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames)
+                self.round.fail(f"{kind}: {type(error).__name__}: {error} ({at})")
+            with self.round.lock:
+                self.round.calls[kind] += 1
+            self.round.busy.pop(self.name, None)
+
+    def ask(self, of: str, call: Callable[[], Any], learner: TactileLearner | None = None) -> Any:
+        """What a call says, with the rows before and after."""
+        learner = learner or self.round.learner
+        since = row_of(learner)
+        what = call()
+        self.round.tell(Told(of, since, row_of(learner), what, self.inside))
+        return what
+
+    def material(self) -> str:
+        """A material: now and then one that comes and goes."""
+        return self.rng.choice(MATERIALS[len(FIRST) :] if self.rng.random() < NEW_AGAIN else FIRST)
+
+    # What changes the memory
+
+    def observe(self) -> None:
+        """A touch more; where there are enough, one is retracted in its place."""
+        if sum(self.round.learner.materials.values()) > MOST:
+            self.retract()
+            return
+        material = self.material()
+        readings = self.round.fresh(material)
+        with self.round.lock:
+            self.round.readings[self.round.learner.stream(readings).key] = readings
+        receipt = self.round.learner.observe(material, readings)
+        if not self.inside:
+            self.round.acknowledge(receipt.sequence)
+
+    def _loose(self) -> int | None:
+        if sum(self.round.learner.materials.values()) < FEWEST:
+            return None
+        own = [one for one in self.round.learner.observations() if one.state == "kept"]
+        return self.rng.choice(own).sequence if own else None
+
+    def retract(self) -> None:
+        """One less."""
+        if (sequence := self._loose()) is not None:
+            with suppress(ObservationError):  # another thread was faster, or compacted it
+                self.round.learner.retract(sequence)
+
+    def forget(self) -> None:
+        """All of a material that comes and goes."""
+        with suppress(ObservationError, UnknownMaterialError):
+            self.round.learner.forget(self.rng.choice(MATERIALS[len(FIRST) :]))
+
+    def relabel(self) -> None:
+        """One under another name."""
+        if (sequence := self._loose()) is None:
+            return
+        with self.round.learner._ledger.lock:
+            before = row_of(self.round.learner)
+            with suppress(ObservationError, InputError):  # it may have that name already
+                self.round.learner.relabel(sequence, self.material())
+            self._together(before)
+
+    def describe(self) -> None:
+        """What a material is made of."""
+        self.round.learner.describe(self.material(), self.rng.choice((None, *SAID)))
+
+    def batch(self) -> None:
+        """Several at once, with questions among them."""
+        if self.inside:
+            return
+        with self.round.learner._ledger.lock:
+            before = row_of(self.round.learner)
+            self.inside = True
+            try:
+                with self.round.learner.batch():
+                    for _ in range(self.rng.randrange(1, 5)):
+                        getattr(self, self.rng.choice(("observe", "observe", "retract", "predict", "digest")))()
+            finally:
+                self.inside = False
+            self._together(before)
+
+    def merge(self) -> None:
+        """Another memory's touches."""
+        if sum(self.round.learner.materials.values()) > MOST:
+            return
+        with self.round.learner._ledger.lock:
+            before = row_of(self.round.learner)
+            self.round.learner.merge(self.rng.choice(self.round.others), shared="once")
+            self._together(before)
+
+    def _together(self, before: int) -> None:
+        after = row_of(self.round.learner)
+        with self.round.lock:
+            self.round.groups.append((before + 1, after))
+        self.round.acknowledge(after)
+
+    def compact(self) -> None:
+        """Give up what is old."""
+        self.round.learner.compact(keep=self.rng.choice((20, 30, 40)))
+
+    # What asks
+
+    def predict(self, learner: TactileLearner | None = None) -> None:
+        """One touch, or its beginning."""
+        learner = learner or self.round.learner
+        readings = touch(self.rng.choice(FIRST), self.rng.randrange(10**6), self.rng.choice((LENGTH, LENGTH, SHORT)))
+        self._predict(learner, [readings])
+
+    def several(self) -> None:
+        """Several touches of one thing."""
+        material = self.rng.choice(FIRST)
+        self._predict(self.round.learner, [touch(material, self.rng.randrange(10**6)) for _ in range(3)])
+
+    def _predict(self, learner: TactileLearner, touches: Sequence[Array]) -> None:
+        since = row_of(learner)
+        said = learner.predict(*touches)
+        told = Told("prediction", since, row_of(learner), said, self.inside, [learner.stream(one) for one in touches])
+        told.counts = LOCAL.counts
+        self.round.tell(told)
+
+    def compose(self) -> None:
+        """What a touch is made of."""
+        readings, since = touch(self.rng.choice(FIRST), self.rng.randrange(10**6)), row_of(self.round.learner)
+        with suppress(DescriptionError):  # nothing was described
+            said = self.round.learner.compose(readings).prediction
+            until, streams = row_of(self.round.learner), [self.round.learner.stream(readings)]
+            self.round.tell(Told("prediction", since, until, said, self.inside, streams, LOCAL.counts))
+
+    def digest(self) -> None:
+        """The digest."""
+        self.ask("digest", self.round.learner.digest)
+
+    def copied(self) -> None:
+        """The digest of a copy."""
+        self.ask("digest", lambda: copy.deepcopy(self.round.learner).digest())
+
+    def materials(self) -> None:
+        """Materials and their counts."""
+        self.ask("materials", lambda: self.round.learner.materials)
+
+    def descriptions(self) -> None:
+        """Descriptions."""
+        self.ask("descriptions", lambda: self.round.learner.descriptions)
+
+    def exemplars(self) -> None:
+        """Exemplars."""
+        self.ask("exemplars", lambda: self.round.learner.exemplars)
+
+    def model(self) -> None:
+        """The materials and counts of a model that is fitted for who asks."""
+
+        def fitted() -> dict[str, int]:
+            scale, counts = min(counts_of(self.round.learner.model()).items())
+            return {name: int(rows) // ROWS[scale] for name, rows in sorted(counts.items())}
+
+        self.ask("materials", fitted)
+
+    def settle(self) -> None:
+        """All fitted to what is there."""
+        self.round.learner.settle()
+
+    # A reader of the same memory
+
+    def refresh(self) -> None:
+        """Take in what was acknowledged."""
+        acknowledged = self.round.acknowledged
+        self.round.reader.refresh()
+        if row_of(self.round.reader) < acknowledged:
+            self.round.fail(f"a reader refreshed to row {row_of(self.round.reader)}; {acknowledged} was acknowledged")
+
+    def read_digest(self) -> None:
+        """The digest that a reader sees."""
+        self.ask("digest", self.round.reader.digest, self.round.reader)
+
+    def read_materials(self) -> None:
+        """The materials that a reader sees."""
+        self.ask("materials", lambda: self.round.reader.materials, self.round.reader)
+
+    def read_exemplars(self) -> None:
+        """The exemplars that a reader sees."""
+        with suppress(CompactedError):
+            self.ask("exemplars", lambda: self.round.reader.exemplars, self.round.reader)
+
+    def read_predict(self) -> None:
+        """What a reader predicts."""
+        self.predict(self.round.reader)
+
+    # Live
+
+    def live_manual(self) -> None:
+        """Touches that are begun and ended by whoever pushes."""
+        learner = self.round.reader if self.rng.random() < 0.2 else self.round.learner
+        with learner.live(contact="manual", risk=self.rng.choice((0.05, 0.2, 1e-9))) as live:
+            for number in range(self.rng.randrange(1, 5)):
+                if number and self.rng.random() < 0.4:
+                    live.again()
+                since = row_of(learner)
+                now = live.begin()
+                window, said = (since, row_of(learner)), []
+                readings, first = touch(self.rng.choice(FIRST), self.rng.randrange(10**6)), 0
+                while first < LENGTH:
+                    size = self.rng.randrange(1, 9)
+                    now = live.push(readings[first : first + size])
+                    said += [] if now.prediction is None else [(now.prediction, LOCAL.counts)]
+                    first += size
+                ended = live.end().touches[0]
+                self._tell_live(window, said, ended)
+                if self.rng.random() < 0.3:
+                    self._observe_live(live.touch)
+
+    def live_auto(self) -> None:
+        """Touches that the session finds."""
+        learner = self.round.learner
+        with learner.live(false_contacts=1.0) as live:
+            live.push(rest(self.rng.randrange(10**6), 110))
+            window, said = (0, 0), []
+            for _ in range(self.rng.randrange(1, 4)):
+                material, seed = self.rng.choice(FIRST), self.rng.randrange(10**6)
+                rows, first = np.concatenate([touch(material, seed), rest(seed, PAUSE)]), 0
+                under_way = False
+                while first < len(rows):
+                    size, since = self.rng.randrange(1, 15), row_of(learner)
+                    now = live.push(rows[first : first + size])
+                    first += size
+                    if not under_way and (now.contact or now.touches):
+                        window, said = (since, row_of(learner)), []
+                    if now.prediction is not None and now.contact:
+                        said.append((now.prediction, LOCAL.counts))
+                    for ended in now.touches:
+                        self._tell_live(window, said, ended)
+                        window, said = (since, row_of(learner)), []
+                    under_way = now.contact
+
+    def _tell_live(self, window: tuple[int, int], said: list[tuple[Prediction, Any]], ended: Any) -> None:
+        live = LiveTold([Told("prediction", *window, what, counts=counts) for what, counts in said])
+        streams = [*ended.earlier, ended.stream]
+        live.said.append(Told("prediction", *window, ended.prediction, streams=streams, counts=LOCAL.counts))
+        self.round.tell(live)
+
+    def _observe_live(self, stream: Stream | None) -> None:
+        if stream is None or sum(self.round.learner.materials.values()) > MOST or len(stream) != LENGTH:
+            return
+        with self.round.lock:
+            self.round.readings[stream.key] = stream.readings.astype(np.float64)
+        self.round.acknowledge(self.round.learner.observe(self.rng.choice(FIRST), stream).sequence)
+
+
+ROWS: dict[int, int] = {}  # of a touch at each scale, once that is known
+ROLES: tuple[tuple[str, ...], ...] = (
+    ("observe",) * 6 + ("retract", "retract", "forget", "describe", "predict"),
+    ("observe",) * 4 + ("relabel", "batch", "merge", "compact", "predict", "forget"),
+    ("predict", "predict", "predict", "several", "observe"),
+    ("predict", "digest", "materials", "descriptions", "exemplars", "copied"),
+    ("predict", "compose", "compose", "settle", "several", "model"),
+    ("live_manual",),
+    ("live_auto", "live_manual"),
+    ("refresh", "refresh", "read_predict", "read_digest", "read_materials", "read_exemplars"),
+)
+
+
+def begun(home: Path, seed: int) -> Round:
+    """A memory that knows some materials, a reader of it, and others that are to be merged."""
+    learner = TactileLearner.open(home / "memory", **SETTINGS)
+    round_ = Round(learner, learner, [], seed)
+    worker = Worker(round_, -1, ())
+    for _ in range(7):
+        for material in FIRST:
+            readings = round_.fresh(material)
+            round_.readings[learner.stream(readings).key] = readings
+            round_.acknowledge(learner.observe(material, readings).sequence)
+    for number in range(3):
+        round_.others.append(home / f"other-{number}")
+        with TactileLearner.open(round_.others[-1], **SETTINGS) as other:
+            for _ in range(3):
+                material = worker.material()
+                readings = round_.fresh(material)
+                round_.readings[other.observe(material, readings).key] = readings
+    codes = learner._extractor.codes(learner._extractor.image(learner.stream(touch("a", 0))), b"")
+    ROWS.update({int(scale): len(rows) for scale, rows in codes.items()})
+    round_.reader = TactileLearner.open(home / "memory", mode="read")
+    return round_
+
+
+def under_threads(round_: Round, seconds: float, threads: int) -> bool:
+    """Have them all call until the time is over; whether they all came to an end."""
+    workers = [Worker(round_, number, ROLES[number % len(ROLES)]) for number in range(threads)]
+    running = [threading.Thread(target=worker.run, name=f"stress {worker.name}", daemon=True) for worker in workers]
+    for thread in running:
+        thread.start()
+    end = time.monotonic() + seconds
+    try:
+        while any(thread.is_alive() for thread in running):
+            time.sleep(0.1)
+            now = time.monotonic()
+            if now > end or len(round_.failures) >= SHOWN:
+                round_.stop.set()
+            hung = {name: kind for name, (kind, since) in dict(round_.busy).items() if now - since > HANGS}
+            if hung:
+                faulthandler.dump_traceback()
+                round_.fail(f"hangs for {HANGS:g} s: {hung}")
+                return False
+    except KeyboardInterrupt:
+        round_.stop.set()
+        for thread in running:
+            thread.join(HANGS)
+        raise
+    return True
+
+
+def looked_up(round_: Round) -> tuple[list[str], Counter[str]]:
+    """What was said that is of no state, and how many answers were looked up."""
+    store = round_.learner._ledger.store
+    assert store is not None
+    truth = Truth(list(store.heads()), round_.readings, round_.groups)
+    wrong, counted = [], Counter[str]()
+    for told in round_.told:
+        parts = [told] if isinstance(told, Told) else told.said
+        first, what = parts[0], "a live touch" if isinstance(told, LiveTold) else parts[0].of
+        counted[what] += len(parts)
+        wrong += [unsound for part in parts if (unsound := part.unsound()) is not None]
+        rows = list(truth.between(first.since, first.until, inside=first.inside))
+        if not any(all(part.is_of(truth, row) for part in parts) for row in rows):
+            anywhere = [row for row in range(len(truth.states)) if all(part.is_of(truth, row) for part in parts)]
+            where = f"of rows {anywhere[:5]}" if anywhere else "of no state that there was"
+            differ = [part.differs(truth, row) for row in rows[:1] for part in parts]
+            wrong.append(f"{what}: {where}, and not of {first.since} to {first.until}: {differ}")
+    return wrong, counted
+
+
+def at_the_end(round_: Round) -> list[str]:
+    """What is wrong when all threads have ended: the memory must be that of what was observed, in any order."""
+    learner, wrong = round_.learner, []
+    store = learner._ledger.store
+    assert store is not None
+    truth = Truth(list(store.heads()), round_.readings, round_.groups)
+    alone = TactileLearner(**SETTINGS)
+    for material, key in truth.states[-1].touches:
+        alone.observe(material, round_.readings[key])
+    if learner.digest() != alone.digest():
+        wrong.append("at the end the digest is not that of what was observed")
+    probes = [touch(material, 7, readings) for material in FIRST for readings in (LENGTH, SHORT)]
+    learner.settle()
+    said = [learner.predict(probe) for probe in probes]
+    if said != [alone.predict(probe) for probe in probes]:
+        wrong.append("at the end, settled, it says other than a memory that observed the same in one thread")
+    round_.reader.refresh()
+    if round_.reader.digest() != alone.digest():
+        wrong.append("at the end a reader sees another digest")
+    return wrong
+
+
+@contextmanager
+def short_fits() -> Iterator[None]:
+    """While it lasts a fit takes few touches out, and all have the tables of one set of touches: they take longest."""
+    of_one = Likelihood(np.full(LEVELS, 4.0), np.ones(LEVELS))
+    made = lru_cache(maxsize=256)(of_one._made)
+    with ExitStack() as patched:
+        for place in (scroll_tactile.readouts.pooled, scroll_tactile.prediction.beginnings):
+            patched.enter_context(patch.object(place, "LEFT_OUT", TAKEN_OUT))
+        patched.enter_context(patch.object(Likelihood, "_made", lambda _, noise: made(noise)))
+        yield
+
+
+def main(options: argparse.Namespace) -> dict[str, Any]:
+    """Round after round."""
+    failures: list[str] = []
+    calls, answers, rounds, ended = Counter[str](), Counter[str](), 0, time.monotonic() + 60 * options.minutes
+    seconds = 4.0 if options.quick else options.seconds
+    interrupted = False
+    with folder(options, in_memory=True) as home, short_fits():
+        while not interrupted and (not rounds or (time.monotonic() < ended and not options.quick)):
+            seed = options.seed * 10_000 + rounds
+            (where := home / f"round-{rounds}").mkdir()
+            round_ = begun(where, seed)
+            with watched(round_.fail):
+                try:
+                    whole = under_threads(round_, seconds, options.threads)
+                except KeyboardInterrupt:
+                    whole, interrupted = True, True
+            found = list(dict.fromkeys(round_.failures))
+            if whole:
+                wrong, counted = looked_up(round_)
+                found += [*wrong, *at_the_end(round_)]
+                answers += counted
+                round_.reader.close()
+                round_.learner.close()
+            failures += [f"seed {seed}: {text}" for text in found[:SHOWN]]
+            calls += round_.calls
+            rounds += 1
+            done = f"{sum(calls.values())} calls, {sum(answers.values())} answers, {len(failures)} failures"
+            progress(f"round {rounds}: {done}")
+            if not whole or len(failures) >= 5 * SHOWN:
+                break
+    return {
+        "threads": options.threads,
+        "rounds": rounds,
+        "calls": dict(sorted(calls.items())),
+        "answers looked up": dict(sorted(answers.items())),
+        "failures": failures,
+    }
+
+
+if __name__ == "__main__":
+    faulthandler.enable()
+    run("threads", parser(__doc__, minutes=1.0, seconds=20.0, threads=8).parse_args(), main)

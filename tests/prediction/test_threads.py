@@ -1,0 +1,308 @@
+"""A model that somebody holds stays as it is, whatever other threads do meanwhile; answers are of one state."""
+
+import copy
+import threading
+
+import numpy as np
+import pytest
+from live_touches import slide
+from touches import PAD, SMALL
+
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.errors import InputError
+from scroll_tactile.prediction import beginnings
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.model import Draft
+from scroll_tactile.readouts.likelihood import Likelihood, Noise
+from scroll_tactile.readouts.system import System
+from scroll_tactile.statistics.sample import TouchSample
+from store import StoreClosedError
+
+TOUCHES = 5  # of each material: a model is followed for some touches, and fitted anew after more
+
+
+def touch(material, seed, readings=50):
+    """A touch of material a, b or c; "n" is new, and like none of them."""
+    random = np.random.default_rng([ord(material), seed])
+    if material == "n":
+        return random.uniform(0, 1, (readings, 2))
+    return slide(material, readings, random)
+
+
+def learned(learner=None):
+    made = learner or TactileLearner(sensor=PAD, embedding=SMALL)
+    for seed in range(TOUCHES):
+        for material in "abc":
+            made.observe(material, touch(material, seed))
+    made.settle()
+    return made
+
+
+def beside(call):
+    """Do something in another thread, and wait for it; what it raises is raised here."""
+    raised = []
+
+    def run():
+        try:
+            call()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive()
+    if raised:
+        raise raised[0]
+
+
+def changing(learner, count=2):
+    """What changes the memory and has its model follow: a new material, and touches that answers depend on."""
+
+    def change():
+        for seed in range(100, 100 + count):
+            learner.observe("n", touch("n", seed))
+            learner.predict(touch("n", seed + 50))
+            learner.observe("a", touch("b", seed))
+            learner.predict(touch("b", seed + 50))
+
+    return change
+
+
+def once(monkeypatch, what, name, call):
+    """Have something done in the midst of the next call of a method, once."""
+    own, done = getattr(what, name), []
+
+    def method(*args, **kwargs):
+        result = own(*args, **kwargs)
+        if not done and threading.current_thread() is threading.main_thread():
+            done.append(True)
+            call()
+        return result
+
+    monkeypatch.setattr(what, name, method)
+    return done
+
+
+def test_a_session_begins_while_another_thread_observes_and_predicts(monkeypatch):
+    other, learner, measured, branches = learned(), learned(), [], []
+    own, branch = beginnings.early_of, System.branch
+
+    def early_of(*args):
+        measured.append(own(*args))
+        return measured[-1]
+
+    def branching(system):
+        branches.append(True)
+        if len(branches) == 9:  # in the midst of taking a touch out of a readout
+            beside(changing(learner))
+        return branch(system)
+
+    monkeypatch.setattr(beginnings, "early_of", early_of)
+    monkeypatch.setattr(beginnings, "LEFT_OUT", 9)
+    other.live(contact="manual").close()
+    monkeypatch.setattr(System, "branch", branching)
+    learner.live(contact="manual").close()
+    assert "n" in learner.materials
+    undisturbed, found = measured
+    assert found.fitted.chances.tobytes() == undisturbed.fitted.chances.tobytes()
+    assert found.fitted.novelty.tobytes() == undisturbed.fitted.novelty.tobytes()
+
+
+def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypatch):
+    learner, count = learned(), []
+    with learner.live(contact="manual") as live:
+        live.begin()
+        live.push(touch("a", 9, 30))
+        model = live._under_way.frozen.model
+        likelihood = model.pooled.recall.measured.likelihood
+
+        def copied(noise, memo):
+            if not count:
+                count.append(True)
+                beside(lambda: likelihood.table(Noise(777)))
+            return noise
+
+        monkeypatch.setattr(Noise, "__deepcopy__", copied, raising=False)
+        changing(learner)()
+        assert live.end().prediction.material == "a"
+
+
+def test_a_live_touch_is_answered_by_the_memory_as_it_was_when_it_began(monkeypatch):
+    learner = learned()
+    before = copy.deepcopy(learner)
+    with learner.live(contact="manual", risk=1e-12) as live:
+        live.begin()
+        live.push(touch("b", 9, 30))
+        done = once(monkeypatch, FeatureExtractor, "encode", lambda: beside(changing(learner)))
+        prediction = live.end().prediction
+    assert done
+    monkeypatch.undo()
+    assert "n" in learner.materials
+    assert prediction == before.predict(live.touch)
+
+
+class SampleOfTwo(TouchSample):
+    def __init__(self, capacity=2):
+        super().__init__(capacity)
+
+
+def test_of_many_materials_too_a_live_touch_is_answered_as_it_was_when_it_began(monkeypatch):
+    """Beyond a thousand, materials are read from the memory when they are asked for; here beyond two."""
+    for module in ("prediction.model", "readouts.readout"):
+        monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 2)
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SampleOfTwo)
+    learner, others = TactileLearner(sensor=PAD, embedding=SMALL), "pqrstu"
+
+    def other(name, seed):
+        return 0.15 * others.index(name) + 0.1 * touch("n", seed)
+
+    for seed in range(3):
+        for name in others:
+            learner.observe(name, other(name, seed))
+    learner.settle()
+    before = copy.deepcopy(learner)
+    with learner.live(contact="manual", risk=1e-12) as live:
+        live.begin()
+        readout = min(live._under_way.frozen.model.readouts.items())[1]
+        changed = [name for place, name in enumerate(readout.names) if place not in readout._held]
+        assert changed
+        for name in changed:
+            for seed in range(4):
+                learner.observe(name, touch("n", 10 + seed))
+        learner.predict(other("p", 90))
+        learner.observe(changed[0], other("p", 91))
+        live.push(other(changed[0], 9)[:30])
+        prediction = live.end().prediction
+    expected = before.predict(live.touch)
+    assert dict(prediction.ranking) == pytest.approx(dict(expected.ranking), rel=1e-9)  # solved for in another order
+    assert prediction.novelty == pytest.approx(expected.novelty, rel=1e-9)
+    assert prediction.typicality == expected.typicality
+
+
+@pytest.mark.parametrize("readings", [50, 12])
+def test_a_prediction_is_of_one_state_that_there_was(monkeypatch, readings):
+    learner = learned()
+    before = copy.deepcopy(learner)
+    done = once(monkeypatch, FeatureExtractor, "encode", lambda: beside(changing(learner)))
+    prediction = learner.predict(touch("b", 9, readings))
+    assert done
+    monkeypatch.undo()
+    assert prediction == before.predict(touch("b", 9, readings))
+
+
+def test_a_held_model_stays_as_it_is_and_what_nobody_holds_is_followed_in_place():
+    learner = learned()
+    held = learner._current.frozen(learner._ledger)
+    arrays = {name: value.copy() for name, value in _arrays(held.model).items()}
+    changing(learner)()
+    now = _arrays(held.model)
+    assert held.model.names == ["a", "b", "c"]
+    assert all(np.array_equal(now[name], arrays[name]) for name in arrays)
+    current = learner._current.frozen(learner._ledger).model
+    assert current is not held.model
+    learner.observe("c", touch("c", 70))
+    assert learner._current.present(learner._ledger) is current  # not fitted anew: what follows shows that
+    assert current.readouts[min(current.readouts)].counts.sum() > 0
+
+
+def _arrays(model):
+    found = {}
+    for scale, readout in model.readouts.items():
+        found |= {f"{scale} {name}": getattr(readout, name) for name in ("counts", "_means", "_solved", "_sizes")}
+        rank = readout.system.rank
+        found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
+    recall, conformal = model.pooled.recall, model.conformal
+    found |= {f"kept {name}": getattr(recall, name) for name in ("_blocks", "_brought", "_squares", "_labels")}
+    found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
+    return found
+
+
+def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
+    learner, other = learned(), learned()
+    draft = Draft.of(learner.memory, "lda")
+    for seed in range(12):
+        learner.observe("a", touch("a", 60 + seed, 20))
+    assert learner.memory.statistics.usual_least == 20
+    assert draft.fit().least == other.model().least == 50
+
+
+def test_tables_are_there_for_any_number_of_threads():
+    likelihood, raised = Likelihood(np.full(255, 3.0), np.ones(255)), []
+    expected = {step: likelihood._made(Noise(step)).logs.tobytes() for step in range(0, 420, 6)}
+
+    def ask(seed):
+        try:
+            for step in np.random.default_rng(seed).permutation(sorted(expected)).tolist():
+                assert likelihood.table(Noise(step)).logs.tobytes() == expected[step]
+        except BaseException as error:
+            raised.append(error)
+
+    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not raised
+
+
+# Embedded again
+
+
+@pytest.fixture
+def kept(tmp_path):
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+        yield learned(learner)
+
+
+OTHER = Kernels(seed=0, dimension=128)
+
+
+@pytest.mark.parametrize("contact", ["manual", "auto"])
+def test_a_session_ends_with_a_sentence_where_the_memory_is_embedded_again(kept, contact):
+    live = kept.live(contact=contact)
+    if contact == "manual":
+        live.begin()
+    live.push(touch("a", 9, 30))
+    before = copy.deepcopy(kept)
+    kept.reembed(OTHER)
+    for call in (lambda: live.push(touch("a", 9, 30)), lambda: live.push(np.zeros((0, 2)))):
+        with pytest.raises(InputError, match=r"embedded again.*begin another with learner\.live\(\)"):
+            call()
+    assert live.report.readings == 30
+    live.close()
+    if contact == "manual":
+        assert len(live.touch) == 30
+        assert before.predict(live.touch).material == "a"
+    with kept.live(contact="manual") as again:
+        again.begin()
+        again.push(touch("a", 9))
+        assert again.end().prediction == kept.predict(touch("a", 9))
+
+
+def test_a_touch_under_way_while_the_memory_is_embedded_again_is_answered_as_it_was_when_it_began(kept, monkeypatch):
+    before = copy.deepcopy(kept)
+    live = kept.live(contact="manual", risk=1e-12)
+    live.begin()
+    once(monkeypatch, FeatureExtractor, "encode", lambda: beside(lambda: kept.reembed(OTHER)))
+    now = live.push(touch("a", 9))
+    monkeypatch.undo()
+    assert now.prediction == before.predict(touch("a", 9)[: round(now.prediction.seconds * PAD.rate)])
+
+
+def test_an_observation_meets_a_memory_that_is_embedded_again(kept, monkeypatch):
+    once(monkeypatch, FeatureExtractor, "codes", lambda: beside(lambda: kept.reembed(OTHER)))
+    with pytest.raises(StoreClosedError):
+        kept.observe("n", touch("n", 1))
+    assert "n" not in kept.materials
+    kept.observe("n", touch("n", 1))
+    assert kept.predict(touch("n", 1)).material == "n"
+
+
+def test_a_prediction_meets_a_memory_that_is_embedded_again(kept, monkeypatch):
+    before = copy.deepcopy(kept)
+    done = once(monkeypatch, FeatureExtractor, "encode", lambda: beside(lambda: kept.reembed(OTHER)))
+    prediction = kept.predict(touch("b", 9))
+    assert done
+    monkeypatch.undo()
+    assert prediction in (before.predict(touch("b", 9)), kept.predict(touch("b", 9)))

@@ -11,6 +11,7 @@ from scroll_tactile.cli.bulk import AsJson, CutBy, Label, LabelBy, Labels, Label
 from scroll_tactile.cli.everyday import Clock, Field, MemoryFolder, Preset, Sources, Topic
 from scroll_tactile.cli.terminal import progress_bar, say, say_json, say_refused
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.fleet import FleetReport
@@ -80,10 +81,8 @@ def fleet(
 
 
 def _connected(scheduler: str) -> Any:
-    try:
+    with optional("dask[distributed]", "fleet", "--scheduler"):
         import distributed
-    except ImportError as error:
-        raise InputError("a scheduler takes Dask: pip install 'scroll-tactile[fleet]'") from error
     connect: Any = distributed.Client
     try:
         return connect(scheduler, timeout=SECONDS)

@@ -169,7 +169,7 @@ def test_diagnostics_say_what_was_met(spinning, learner):
 
 def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, learner):
     node = spinning.node("scroll_tactile")
-    with pytest.raises(errors.RecordingError, match="sr-robot-msgs"):
+    with pytest.raises(errors.MissingLibraryError, match="sr-robot-msgs"):
         TactileNode(node, learner, TOPIC, "position", kind="sr_robot_msgs/msg/BiotacAll")
     TactileNode(node, learner, "/other", "position")
     other = spinning.node("other")

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
+from scroll_tactile.cli.wording import has_option, in_options, typed
 from scroll_tactile.errors import InputError, ScrollTactileError, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
@@ -74,7 +75,7 @@ def say_refused(refused: Sequence[Refused]) -> None:
     """Print on the standard error what could not be taken, and why; at most 20, and one list of what a file has."""
     listed = False
     for each in refused[:MOST_REFUSED]:
-        first, *others = each.why.splitlines() or [""]
+        first, *others = in_options(each.why).splitlines() or [""]
         _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(first)}")
         for line in [] if listed else others:
             _warn(f"  {shown(line)}")
@@ -94,13 +95,21 @@ class Commands(TyperGroup):
     Errors of the system are expected: files that cannot be read, a device that is full.
     """
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that was typed, whose options errors name."""
+        found = super().resolve_command(ctx, args)
+        if found[1] is not None:
+            typed(found[1].params)
+        return found
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
         try:
             return super().invoke(ctx)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
-                text = " ".join([*(str(error) or "no memory is left").split(), *getattr(error, "__notes__", [])])
+                said = in_options(str(error)) or "no memory is left"
+                text = " ".join([*said.split(), *getattr(error, "__notes__", [])])
                 _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
             raise typer.Exit(1) from error
         except KeyboardInterrupt:
@@ -122,8 +131,9 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     except (InputError, NotAStoreError) as error:
         if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
             raise
-        what = f"there is no memory in {path}; to make one, say which sensor it is for: scroll-tactile observe --sensor"
-        raise InputError(what) from error
+        options = [f"{name}=" for name in ("sensor", "preset") if has_option(name)]
+        how = f"say which sensor it is for: {' or '.join(options)}" if options else "scroll-tactile observe --sensor"
+        raise InputError(f"there is no memory in {path}; to make one, {how}") from error
 
 
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:

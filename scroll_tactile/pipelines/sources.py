@@ -116,7 +116,7 @@ def contact_spans(learner: TactileLearner, recording: Recording) -> list[tuple[i
     if not spans:
         raise InputError(
             f"no contact was found in {recording.source}: it has to begin at rest, for two seconds or more, from which "
-            "the sensor's noise is learned. For a file of one touch take no cut"
+            "the sensor's noise is learned. For a file of one touch take cut='none'"
         )
     return spans
 
@@ -199,7 +199,7 @@ def source_touches(
         try:
             material = options.material if options.material is not None else touch.material
             if named and material is None:
-                raise InputError("nothing names it: say what was touched")
+                raise InputError("nothing names it: give material= for all, by='folder', by='file' or intervals=")
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
             yield SourceTouch(source, material if material is None else require_name(material), stream)

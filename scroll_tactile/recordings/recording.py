@@ -103,7 +103,7 @@ class Recording:
     @property
     def place(self) -> str:
         """What is read, as errors name it."""
-        return f"field {self.field!r} of {self.source}" if self.field else self.source
+        return f"field {self.field!r:.80} of {self.source}" if self.field else self.source
 
     def cure(self, sensor: Sensor) -> str:
         """What to do where these are not the sensor's readings."""

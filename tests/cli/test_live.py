@@ -63,7 +63,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
         expected = learner.predict(SCENE.touch("silk", 9))
     lines = []
     monkeypatch.setattr(replay.typer, "echo", lines.append)
-    replay.live(memory / "memory", replay.Path("-"), 0.05, False, True, True)
+    replay.live(memory / "memory", replay.Path("-"), None, 0.05, False, True, True)
     answer = json.loads(lines[-2])
     assert (answer["event"], answer["material"]) == ("ended", expected.material)
     assert answer["probability"] == expected.probability
@@ -72,7 +72,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
 def test_on_a_terminal_the_answer_grows(memory, monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=80)
     monkeypatch.setattr(replay, "console", lambda: screen)
-    replay.live(memory / "memory", memory / "silk.npy", 0.05, False, True, False)
+    replay.live(memory / "memory", memory / "silk.npy", None, 0.05, False, True, False)
     shown = screen.file.getvalue()
     assert "touched for 0.30 s" in shown and "touched for 1.50 s" in shown and "█" in shown
 

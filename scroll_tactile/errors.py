@@ -28,6 +28,8 @@
     ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
+    RangeWarning (UserWarning)               what is learned lies outside a sensor's range, or in a corner of it
+
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
 """
 
@@ -152,3 +154,10 @@ class FineTuneError(ScrollTactileError):
 
 class CapacityError(ScrollTactileError, OverflowError):
     """An exact sum would not fit its integers any more."""
+
+
+class RangeWarning(UserWarning):
+    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it; said once a learner."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), keep="\n")

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
 from scroll_tactile.cli.wording import has_option, in_options, typed
-from scroll_tactile.errors import InputError, ScrollTactileError, printable
+from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
 
@@ -105,7 +106,8 @@ class Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
         try:
-            return super().invoke(ctx)
+            with _warnings_as_lines():
+                return super().invoke(ctx)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
                 said = in_options(str(error)) or "no memory is left"
@@ -115,6 +117,23 @@ class Commands(TyperGroup):
         except KeyboardInterrupt:
             _warn("[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on.")
             raise typer.Exit(INTERRUPTED) from None
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show the warnings of this library as lines, and not where they came from."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RangeWarning)
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, RangeWarning):
+                _warn(f"[yellow]Warning:[/] {shown(in_options(str(message)))}")
+            else:
+                others(message, category, *where, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def _warn(text: str) -> None:

@@ -148,11 +148,17 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     try:
         return TactileLearner.open(path, sensor=sensor, mode=mode)
     except (InputError, NotAStoreError) as error:
-        if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
+        if path.is_file() or sensor is not None or (mode == "read" and path.exists()):
             raise
-        options = [f"{name}=" for name in ("sensor", "preset") if has_option(name)]
-        how = f"say which sensor it is for: {' or '.join(options)}" if options else "scroll-tactile observe --sensor"
-        raise InputError(f"there is no memory in {path}; to make one, {how}") from error
+        raise _no_memory(path) from error
+
+
+def _no_memory(path: Path) -> InputError:
+    """The error of a command whose memory is not there, with how this or another command makes one."""
+    how = "scroll-tactile learn or observe makes one"
+    if has_option("sensor"):
+        how = "to make one, say which sensor it is for: sensor=" + " or preset=" * has_option("preset")
+    return InputError(f"there is no memory in {path}; {how}")
 
 
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
@@ -160,6 +166,8 @@ def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 
+    if not path.exists():
+        raise _no_memory(path)
     with Store.open(path, mode="read") as store:
         identity = Identity.read(store)
     return TactileLearner.open(path, embedding=AbsentEmbedding(identity, path), mode=mode)

@@ -86,6 +86,7 @@ class SourceOptions:
             clock=self.clock,
             columns=self.columns,
             preset=self.preset,
+            rate=learner.sensor.rate,  # where it has no clock
             labels=self.labels,
         )
         if self.intervals is not None:

@@ -155,7 +155,7 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
 
 def _no_memory(path: Path) -> InputError:
     """The error of a command whose memory is not there, with how this or another command makes one."""
-    how = "scroll-tactile learn or observe makes one"
+    how = "scroll-tactile observe or learn makes one"
     if has_option("sensor"):
         how = "to make one, say which sensor it is for: sensor=" + " or preset=" * has_option("preset")
     return InputError(f"there is no memory in {path}; {how}")

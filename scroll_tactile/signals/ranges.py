@@ -29,7 +29,7 @@ new memory with a Sensor whose low and high are the least and the most that it s
     cure = "make a new memory with a Sensor whose low and high are the least and the most that it sends, in its unit"
     share = stream.clipped / stream.readings.size
     if share > CLIPPED:
-        return f"{100 * share:.2g} % of the values lie outside {where} and were clipped to its ends: {cure}"
+        return f"{100 * share:.0f} % of the values lie outside {where} and were clipped to its ends: {cure}"
     least, most = stream.readings.min(axis=0), stream.readings.max(axis=0)
     span = float(np.max((most - low) / (high - low)) - np.min((least - low) / (high - low)))
     if not 0 < span <= NARROW:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ class Demo:
         first = middle * self.held_out
         return Outcome(Half(**notes.notes["half"]), answers, first, short, observed, learner.digest())
 
-    def _half(self, learner: TactileLearner, learned: list[str], others: list[str]) -> Half:
+    def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
         right = evaluate(learner, self._held_out(learned)).accuracy
         asked = evaluate(learner, self._held_out(others))
         unknown = sum(not answer.known for answer in asked.predictions)
@@ -126,7 +126,7 @@ class Demo:
         nearest = str(first.material)
         return Half(right, unknown, len(asked.truth), asked.truth[0], nearest, first.novelty, first.known)
 
-    def _held_out(self, names: list[str]) -> list[Labelled]:
+    def _held_out(self, names: Sequence[str]) -> list[Labelled]:
         return [touch for name in names for touch in self._touches(name, self.touches, self.held_out)]
 
     def _touches(self, name: str, first: int, count: int) -> list[Labelled]:

@@ -47,7 +47,7 @@ BIOTAC = ("--preset", "biotac", "--columns", "25:44")
         (("inspect", "new"), "scroll-tactile observe or learn makes one"),
         (
             ("observe", "new", "oak", "touch.npy", "--topic", "/x", "--sensor", "biotac"),
-            "came --topic /x: give --field",
+            "came --topic /x: give",
         ),
         (("observe", "new", "oak", "rec/oak/0.npy", "--sensor", "biotac"), "taken by --columns 0:19"),
     ],

@@ -15,8 +15,9 @@
     │   ├── DescriptionError                 what a material is said to be made of cannot be
     │   ├── UnknownMaterialError (KeyError)  a material that was never observed is asked for
     │   ├── ObservationError (KeyError)      an observation that is not there, or can no longer be retracted
-    │   └── RecordingError                   a file of readings is damaged, empty or of no known format
-    │       └── FieldError                   it has no such topic or field: choose one that it has
+    │   ├── RecordingError                   a file of readings is damaged, empty or of no known format
+    │   │   └── FieldError                   it has no such topic or field: choose one that it has
+    │   └── MissingLibraryError (ImportError)    an optional library is not installed: the message has the line
     ├── MismatchError                        two things that do not belong together: open the right one
     │   ├── SensorMismatchError              another sensor's stream or memory
     │   └── EmbeddingMismatchError           a memory made with another embedding
@@ -26,6 +27,8 @@
     ├── DatasetError                         a data set's folder is not laid out as its publisher does
     ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
+
+    RangeWarning (UserWarning)               what is learned lies outside a sensor's range, or in a corner of it
 
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
 """
@@ -106,11 +109,15 @@ class ObservationError(InputError, KeyError):
 
 
 class RecordingError(InputError):
-    """A file of readings is not there, damaged, empty, ragged, of no known format, or lacks the library to read it."""
+    """A file of readings is not there, damaged, empty, ragged, or of no known format."""
 
 
 class FieldError(RecordingError):
     """A recording has no such topic, field or column, or it holds no numbers; the message lists what there is."""
+
+
+class MissingLibraryError(InputError, ImportError):
+    """A library that comes with an extra is not installed; the message has the line that installs it."""
 
 
 class MismatchError(ScrollTactileError):
@@ -147,3 +154,10 @@ class FineTuneError(ScrollTactileError):
 
 class CapacityError(ScrollTactileError, OverflowError):
     """An exact sum would not fit its integers any more."""
+
+
+class RangeWarning(UserWarning):
+    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it; said once a learner."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), keep="\n")

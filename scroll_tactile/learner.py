@@ -6,6 +6,7 @@ import copy
 import logging
 import math
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
-from scroll_tactile.errors import DescriptionError, InputError
+from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import open_store
@@ -41,6 +42,7 @@ from scroll_tactile.results import Compacted, Composition, Constituent, Merged, 
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_source, require_text
 from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
 
@@ -112,6 +114,7 @@ class TactileLearner:
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
         self._snapshot_of: str | None = None
+        self._range_said = False
         self._current = CurrentModel(self._settings)
         self._tuned_reader: TunedReader | None = None
 
@@ -266,7 +269,8 @@ class TactileLearner:
         source: where it comes from, such as a file's name: kept in the journal for `observations`, and nothing else.
 
         Raises StreamError (NoContactError where the gel was not pressed), MaterialError or InputError for a name or a
-        source that is none (nothing was kept), CapacityError, or StoreError.
+        source that is none (nothing was kept), CapacityError, or StoreError. Warns once, by a RangeWarning, where a
+        touch does not fit the sensor's range; it is learned all the same.
         """
         material, source = require_name(material), None if source is None else require_source(source)
         ledger = self._ledger  # first: `reembed` exchanges it last, and the one before is closed then
@@ -277,6 +281,9 @@ class TactileLearner:
         receipt = ledger.observe(material, touch, image.shape[1], codes, source)
         with self._locked() as ledger:
             self._current.prepare(ledger)
+        if not self._range_said and (problem := range_problem(touch)) is not None:
+            self._range_said = True
+            warnings.warn(problem, RangeWarning, stacklevel=2)
         return receipt
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:

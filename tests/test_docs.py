@@ -1,6 +1,5 @@
 """The documentation runs: README's session, the examples, and the commands that it names."""
 
-import doctest
 import os
 import re
 import runpy
@@ -9,18 +8,17 @@ import sys
 from pathlib import Path
 
 import pytest
+from buckets import BUCKETS, served
+from commands import run
+from readme import TEXT as README
+from readme import command_lines, lay_out, promised, run_session, set_up_lines
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
 
 
 def test_the_session_gives_what_it_shows(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    examples = doctest.DocTestParser().get_doctest(README, {}, "README.md", "README.md", 0)
-    assert len(examples.examples) > 10
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
-    runner.run(examples)
-    assert runner.summarize(verbose=False).failed == 0
+    assert run_session() == 0
 
 
 def test_every_python_block_is_run():
@@ -29,9 +27,25 @@ def test_every_python_block_is_run():
         assert block.startswith(">>> ")
 
 
-def test_the_test_command_is_the_one_that_ci_runs():
-    command = next(line.strip() for line in README.splitlines() if line.strip().endswith("-m pytest"))
-    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+def test_the_lines_that_set_up_are_those_that_ci_runs():
+    demo, tests = set_up_lines()
+    script = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert tests.endswith("-m pytest") and tests in script
+    assert demo.endswith("scroll-tactile demo") and demo.replace(".venv", ".venv-plain") in script
+
+
+@BUCKETS
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_every_command_line_runs_as_it_stands(tmp_path, monkeypatch):
+    lay_out(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    lines = [words for words in command_lines() if words[1] != "ros2"]  # which tests/ros2 runs
+    assert len(lines) >= 6
+    with served("robots") as bucket:
+        bucket.put("recordings", "robots/today", recursive=True)
+        for words in lines:
+            done = run(*words[1:])
+            assert done.exit_code == 0 and promised(words, tmp_path, done.stdout), (words, done.output)
 
 
 SHOWN = {

@@ -25,7 +25,7 @@ from examples.benchmarks.vision_speed import run_vision
 from examples.paper.commands.sets import Dataset, parse_folds, read, require_folders, write_result
 from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
-from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import missing
 
 __all__ = ["app"]
 
@@ -256,7 +256,7 @@ def numerics(
     """
     require_folders(json, plot)
     if find_spec("flint") is None:
-        raise InputError('exact sums need python-flint: pip install "scroll-tactile[bench]"')
+        raise missing("python-flint", "bench", "the comparison with exact sums")
     from examples.benchmarks.numerics.comparison import find_nist, run_numerics
     from examples.benchmarks.numerics.plots_numerics import draw_numerics
     from examples.benchmarks.numerics.show_numerics import show_numerics

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import missing
 
 __all__ = ["available", "draw", "picture"]
 
@@ -27,7 +28,7 @@ def picture(path: Path, width: float, height: float, dots: int = 120) -> Iterato
     Raises InputError where matplotlib is missing or the file cannot be written.
     """
     if not available():
-        raise InputError('pictures need matplotlib: pip install "scroll-tactile[plots]"')
+        raise missing("matplotlib", "plots", "a picture")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

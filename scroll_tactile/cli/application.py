@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
+from scroll_tactile import __version__
 from scroll_tactile.cli.bulk import evaluate, learn
 from scroll_tactile.cli.demonstration import demo
 from scroll_tactile.cli.everyday import inspect, observe, predict
@@ -25,6 +28,23 @@ app = typer.Typer(
     help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
     "it has never felt something. Start with: scroll-tactile demo",
 )
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"scroll-tactile {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version, and exit.")
+    ] = False,
+) -> None:
+    """Take the options that belong to no command."""
+
+
 for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report):
     app.command()(command)
 app.command(context_settings=PASSED_ON)(ros2)

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from scroll_tactile.cli.everyday import ANSWER, Clock, Field, MemoryFolder, Preset, Sources, Topic, answer_row
+from scroll_tactile.cli.everyday import (
+    ANSWER,
+    Clock,
+    Columns,
+    Field,
+    MemoryFolder,
+    Preset,
+    Sources,
+    Topic,
+    answer_row,
+    sensor_for,
+)
 from scroll_tactile.cli.terminal import (
     confusion_text,
     opened,
@@ -88,6 +99,7 @@ def learn(
     topic: Topic = None,
     field: Field = None,
     clock: Clock = None,
+    columns: Columns = None,
     label: Label = None,
     label_by: LabelBy = None,
     labels: Labels = None,
@@ -102,14 +114,10 @@ def learn(
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.pipelines.learning import learn as learn_sources
     from scroll_tactile.pipelines.sources import find_sources, has_touches
-    from scroll_tactile.recordings import presets
-    from scroll_tactile.sensors import read_sensor
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
-    chosen = None if sensor is None else read_sensor(sensor)
-    if chosen is None and preset is not None and not memory.exists():
-        chosen = presets.find(preset).sensor
+    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    chosen = sensor_for(memory, sensor, preset)
     with progress_bar() as progress:
         # What is refused makes no memory.
         if chosen is None or memory.exists() or has_touches(chosen, found, options):
@@ -131,6 +139,7 @@ def source_options(
     topic: str | None,
     field: str | None,
     clock: str | None,
+    columns: str | None,
     label: str | None,
     label_by: Place | None,
     labels: Path | None,
@@ -142,7 +151,7 @@ def source_options(
     from scroll_tactile.recordings import read_intervals
 
     if labels is not None and label_topic is not None:
-        raise InputError("give --labels or --label-topic: both say where touches begin")
+        raise InputError("give intervals= or labels=: both say where touches begin")
     intervals = None if labels is None else tuple(read_intervals(labels, found))
     if intervals == ():
         raise InputError(f"expected touches in {labels}, one row each; there are none")
@@ -150,6 +159,7 @@ def source_options(
         topic=topic,
         field=field,
         clock=clock,
+        columns=columns,
         preset=preset,
         labels=label_topic,
         cut=None if cut is None else cut.value,
@@ -188,6 +198,7 @@ def evaluate(
     topic: Topic = None,
     field: Field = None,
     clock: Clock = None,
+    columns: Columns = None,
     label: Label = None,
     label_by: LabelBy = None,
     labels: Labels = None,
@@ -204,7 +215,7 @@ def evaluate(
     from scroll_tactile.pipelines.sources import find_sources
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
+    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
         done = evaluate_sources(learner, found, options, progress)
     refused = [*missing, *done.refused]

@@ -27,8 +27,9 @@ from scroll_tactile.settings import LONGEST_SOURCE, require_name
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.learning import Answered
     from scroll_tactile.pipelines.sources import Refused
+    from scroll_tactile.sensors import Sensor
 
-__all__ = ["ANSWER", "answer_row", "inspect", "observe", "predict"]
+__all__ = ["ANSWER", "answer_row", "inspect", "observe", "predict", "sensor_for"]
 
 MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
 StreamFile = Annotated[
@@ -46,6 +47,7 @@ Sources = Annotated[
 Topic = Annotated[str | None, typer.Option(help="The topic that has the readings, in a recording of several.")]
 Field = Annotated[str | None, typer.Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")]
 Clock = Annotated[str | None, typer.Option(help="device, header, publish or log; or a field, column or array.")]
+Columns = Annotated[str | None, typer.Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
 Preset = Annotated[
     str | None,
     typer.Option(
@@ -65,18 +67,22 @@ def observe(
         str | None,
         typer.Option(
             help="Whose readings they are: biotac, biotac-all, roboskin, contactile, gelsight, or a JSON file with "
-            "name, channels, rate, low, high, unit and duration. Needed only to make a new memory."
+            "name, channels, rate, low, high, unit and duration; or give --preset. Needed only to make a new memory."
         ),
     ] = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    columns: Columns = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.recordings import read
-    from scroll_tactile.sensors import read_sensor
 
     require_name(material)
-    recording = read(file)
-    chosen = None if sensor is None else read_sensor(sensor)
+    recording = read(file, topic=topic, field=field, clock=clock, columns=columns, preset=preset)
+    chosen = sensor_for(memory, sensor, preset)
     if chosen is not None and not memory.exists():
         TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
@@ -86,6 +92,16 @@ def observe(
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
+
+
+def sensor_for(memory: Path, sensor: str | None, preset: str | None) -> Sensor | None:
+    """The sensor that was asked for; for a new memory also that of a preset."""
+    from scroll_tactile.recordings import presets
+    from scroll_tactile.sensors import read_sensor
+
+    if sensor is None and preset is not None and not memory.exists():
+        return presets.find(preset).sensor
+    return None if sensor is None else read_sensor(sensor)
 
 
 def predict(
@@ -98,6 +114,7 @@ def predict(
     topic: Topic = None,
     field: Field = None,
     clock: Clock = None,
+    columns: Columns = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
     ] = False,
@@ -112,7 +129,7 @@ def predict(
 
     candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
     found, refused = find_sources(sources)
-    options = SourceOptions(topic=topic, field=field, clock=clock, preset=preset)
+    options = SourceOptions(topic=topic, field=field, clock=clock, columns=columns, preset=preset)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
         answered = answers(learner, found, options, scene=candidates)

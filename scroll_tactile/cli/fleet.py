@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from scroll_tactile.cli.bulk import AsJson, CutBy, Label, LabelBy, Labels, LabelTopic, source_options
-from scroll_tactile.cli.everyday import Clock, Field, MemoryFolder, Preset, Sources, Topic
+from scroll_tactile.cli.everyday import Clock, Columns, Field, MemoryFolder, Preset, Sources, Topic, sensor_for
 from scroll_tactile.cli.terminal import progress_bar, say, say_json, say_refused
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.fleet import FleetReport
@@ -38,6 +39,7 @@ def fleet(
     topic: Topic = None,
     field: Field = None,
     clock: Clock = None,
+    columns: Columns = None,
     label: Label = None,
     label_by: LabelBy = None,
     labels: Labels = None,
@@ -51,15 +53,11 @@ def fleet(
     goes on. The exit code is 1 where something was refused.
     """
     from scroll_tactile.pipelines.fleet import learn
-    from scroll_tactile.recordings import presets
-    from scroll_tactile.sensors import read_sensor
 
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    options = source_options(sources, preset, topic, field, clock, label, label_by, labels, label_topic, cut)
-    chosen = None if sensor is None else read_sensor(sensor)
-    if chosen is None and preset is not None and not destination.exists():
-        chosen = presets.find(preset).sensor
+    options = source_options(sources, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    chosen = sensor_for(destination, sensor, preset)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
         progress = stack.enter_context(progress_bar())
@@ -80,10 +78,8 @@ def fleet(
 
 
 def _connected(scheduler: str) -> Any:
-    try:
+    with optional("dask[distributed]", "fleet", "--scheduler"):
         import distributed
-    except ImportError as error:
-        raise InputError("a scheduler takes Dask: pip install 'scroll-tactile[fleet]'") from error
     connect: Any = distributed.Client
     try:
         return connect(scheduler, timeout=SECONDS)

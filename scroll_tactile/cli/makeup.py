@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from scroll_tactile.cli.everyday import MemoryFolder, StreamFile
+from scroll_tactile.cli.everyday import Columns, MemoryFolder, StreamFile
 from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown
 from scroll_tactile.errors import DescriptionError
 
@@ -55,12 +55,13 @@ def _constituent(text: str) -> tuple[str, float | bool | None]:
 def compose(
     memory: MemoryFolder,
     file: StreamFile,
+    columns: Columns = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
     from scroll_tactile.recordings import read
 
-    recording = read(file)
+    recording = read(file, columns=columns)
     with opened(memory, mode="read") as learner:
         made_of = learner.compose(recording.stream(learner.sensor))
     if as_json:

@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.everyday import MemoryFolder
+from scroll_tactile.cli.everyday import Columns, MemoryFolder
 from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from scroll_tactile.live.answers import LiveReport, LiveState
+    from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
 
 __all__ = ["live"]
 
@@ -39,6 +39,7 @@ def live(
             show_default=False,
         ),
     ],
+    columns: Columns = None,
     risk: Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")] = 0.05,
     timed: Annotated[bool, typer.Option("--timed", help="The first column is each reading's time in seconds.")] = False,
     touch: Annotated[
@@ -47,6 +48,8 @@ def live(
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
+    from scroll_tactile.recordings.columns import places
+
     screen = console()
     with opened(memory, mode="read") as learner:
         shape = learner.sensor.shape
@@ -60,6 +63,7 @@ def live(
             for row in _rows(file, timed):
                 count += 1
                 reading, time = (row[1:], float(row[0])) if timed else (row, None)
+                reading = reading if columns is None else reading[places(columns, reading.size)]
                 now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
                 before = _shown(before, now, count / learner.sensor.rate, as_json, growing)
             if touch:
@@ -99,12 +103,12 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
                 ended.at,
                 seconds=ended.stream.seconds,
                 decided=ended.decided,
+                revised=ended.revised is not None,
                 end=ended.end,
                 **ended.prediction.as_json(),
             )
         else:
-            safe = "decided" if ended.decided else "[yellow]undecided[/]"
-            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {verdict(ended.prediction)}, {safe}")
+            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {_judged(ended)}")
             growing.update("", refresh=growing.is_started)
     old = before if before is not None and before.contact else None
     if not now.contact:
@@ -120,6 +124,13 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
     elif now.decided and (old is None or not old.decided) and now.prediction is not None:
         say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
     return now
+
+
+def _judged(ended: LiveTouch) -> str:
+    """The answer to a touch, and whether it was decided, or takes back what was."""
+    if ended.revised is not None:
+        return f"{verdict(ended.prediction)}, [yellow]revised[/]: it was decided as {verdict(ended.revised)}"
+    return f"{verdict(ended.prediction)}, {'decided' if ended.decided else '[yellow]undecided[/]'}"
 
 
 def _table(now: LiveState) -> Table:
@@ -146,7 +157,10 @@ def _summed_up(report: LiveReport, as_json: bool) -> None:
         return
     if report.learning:
         say("[yellow]all of it went into learning the sensor at rest[/]: for one touch from end to end take --touch")
-    say(f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided")
+    say(
+        f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
+        f"{report.revised} revised"
+    )
     strange = [
         name
         for name in ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
+from scroll_tactile.cli.everyday import sensor_for
 from scroll_tactile.cli.terminal import opened, say, shown
 from scroll_tactile.errors import InputError
 
@@ -24,7 +25,8 @@ def ros2(
         str | None, typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="A known sensor, which gives topic and field: biotac, xela-uskin, anyskin, …")
+        str | None,
+        typer.Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …"),
     ] = None,
     kind: Annotated[
         str | None, typer.Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
@@ -51,13 +53,12 @@ def ros2(
     from scroll_tactile.recordings.paths import FieldPath
     from scroll_tactile.ros2.interfaces import interface, require_rclpy
     from scroll_tactile.ros2.node import serve
-    from scroll_tactile.sensors import read_sensor
 
     FieldPath(field)
     require_rclpy()
     if kind is not None:
         interface(kind)
-    chosen = None if sensor is None else read_sensor(sensor)  # what is refused makes no memory
+    chosen = sensor_for(memory, sensor, preset)  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         way = cast(Literal["auto", "manual"], contact)
         met = serve(learner, topic, field, kind=kind, risk=risk, contact=way, arguments=context.args)

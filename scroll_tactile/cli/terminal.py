@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +20,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
-from scroll_tactile.errors import InputError, ScrollTactileError, printable
+from scroll_tactile.cli.wording import has_option, in_options, typed
+from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
 
@@ -74,7 +76,7 @@ def say_refused(refused: Sequence[Refused]) -> None:
     """Print on the standard error what could not be taken, and why; at most 20, and one list of what a file has."""
     listed = False
     for each in refused[:MOST_REFUSED]:
-        first, *others = each.why.splitlines() or [""]
+        first, *others = in_options(each.why).splitlines() or [""]
         _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(first)}")
         for line in [] if listed else others:
             _warn(f"  {shown(line)}")
@@ -94,18 +96,44 @@ class Commands(TyperGroup):
     Errors of the system are expected: files that cannot be read, a device that is full.
     """
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that was typed, whose options errors name."""
+        found = super().resolve_command(ctx, args)
+        if found[1] is not None:
+            typed(found[1].params)
+        return found
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
         try:
-            return super().invoke(ctx)
+            with _warnings_as_lines():
+                return super().invoke(ctx)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
-                text = " ".join([*(str(error) or "no memory is left").split(), *getattr(error, "__notes__", [])])
+                said = in_options(str(error)) or "no memory is left"
+                text = " ".join([*said.split(), *getattr(error, "__notes__", [])])
                 _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
             raise typer.Exit(1) from error
         except KeyboardInterrupt:
             _warn("[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on.")
             raise typer.Exit(INTERRUPTED) from None
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show the warnings of this library as lines, and not where they came from."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RangeWarning)
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, RangeWarning):
+                _warn(f"[yellow]Warning:[/] {shown(in_options(str(message)))}")
+            else:
+                others(message, category, *where, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def _warn(text: str) -> None:
@@ -120,10 +148,17 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     try:
         return TactileLearner.open(path, sensor=sensor, mode=mode)
     except (InputError, NotAStoreError) as error:
-        if (path.exists() and not path.is_dir()) or mode == "read" or sensor is not None:
+        if path.is_file() or sensor is not None or (mode == "read" and path.exists()):
             raise
-        what = f"there is no memory in {path}; to make one, say which sensor it is for: scroll-tactile observe --sensor"
-        raise InputError(what) from error
+        raise _no_memory(path) from error
+
+
+def _no_memory(path: Path) -> InputError:
+    """The error of a command whose memory is not there, with how this or another command makes one."""
+    how = "scroll-tactile observe or learn makes one"
+    if has_option("sensor"):
+        how = "to make one, say which sensor it is for: sensor=" + " or preset=" * has_option("preset")
+    return InputError(f"there is no memory in {path}; {how}")
 
 
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
@@ -131,6 +166,8 @@ def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 
+    if not path.exists():
+        raise _no_memory(path)
     with Store.open(path, mode="read") as store:
         identity = Identity.read(store)
     return TactileLearner.open(path, embedding=AbsentEmbedding(identity, path), mode=mode)

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError, StreamError
+from scroll_tactile.libraries import optional
 from scroll_tactile.sensors import BIOTAC, BIOTAC_ALL, ROBOSKIN, Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
@@ -126,7 +127,8 @@ def _load_biotac(folder: Path, sensor: Sensor, seed: int) -> Recordings:
 
 
 def _read_biotac(path: Path, sensor: Sensor) -> Stream:
-    import torch  # a second or more: not for those who read RoboSkin only
+    with optional("torch", "torch", "reading BioTac's files"):
+        import torch  # a second or more: not for those who read RoboSkin only
 
     wanted = f"a tensor of shape (≥ {BIOTAC.readings}, {_COLUMNS})"
     tensor = _read(path, lambda file: torch.load(file, weights_only=True), wanted)

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from scroll_tactile.datasets.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError, StreamError
+from scroll_tactile.libraries import optional
 from scroll_tactile.sensors import GELSIGHT, Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
@@ -156,12 +157,8 @@ def _videos(home: Path) -> Mapping[int, Sequence[Path]]:
 
 
 def _read(path: Path) -> Stream:
-    try:
+    with optional("Pillow", "gelsight", "reading GelSight's frames"):
         from PIL import Image
-    except ImportError as error:
-        raise InputError(
-            "GelSight frames are read by Pillow, which is not installed: pip install 'scroll-tactile[gelsight]'"
-        ) from error
     try:
         with Image.open(path) as picture:
             if picture.size != _SIZE or picture.mode != "RGB":

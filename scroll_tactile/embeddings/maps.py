@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter, shift
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.runtimes import one_torch_thread
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
     import torch
@@ -117,7 +118,8 @@ class Maps:
     @cached_property
     def _waves(self) -> list[tuple[torch.Tensor, FloatArray]]:
         """Weights, (cosines, maps' values), and phases, (cosines,), of each view."""
-        import torch
+        with optional("torch", "torch", "Maps with cosines"):
+            import torch
 
         rng = np.random.default_rng([self.seed, *self.layout, self.parts, self.cosines])
         each, more = divmod(self.cosines, self._read)
@@ -136,13 +138,13 @@ class Maps:
         plain = _means(values, self.parts).ravel() if len(self.layout) == 1 else self._grids(values)
         if not self.cosines:
             return plain
+        waves, views = self._waves, plain.reshape(self._read, self._seen)
         import torch
 
-        views = plain.reshape(self._read, self._seen)
         with one_torch_thread():  # in one order, whatever the threads
             turned = [
                 torch.mv(weights, torch.from_numpy(view)).numpy() + phases
-                for view, (weights, phases) in zip(views, self._waves, strict=True)
+                for view, (weights, phases) in zip(views, waves, strict=True)
             ]
         rounded: FloatArray = np.rint(np.cos(np.concatenate(turned)) * STEPS) / STEPS
         return rounded

@@ -10,13 +10,16 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
 
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.errors import EmbeddingError, InputError
+from scroll_tactile.libraries import optional
 from scroll_tactile.signals.augmentation import fit
+
+with optional("torch", "torch", "the embedding ModuleEmbedding"):
+    import torch
+    from torch import nn
 
 __all__ = ["ModuleEmbedding"]
 

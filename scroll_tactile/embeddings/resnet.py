@@ -11,11 +11,13 @@ import copy
 import math
 from typing import Literal, Self
 
-import torch
-from torch import nn
-from torch.nn import functional
-
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
+
+with optional("torch", "torch", "a residual network"):
+    import torch
+    from torch import nn
+    from torch.nn import functional
 
 __all__ = ["BLOCKS", "ResNet", "Stem", "folded"]
 

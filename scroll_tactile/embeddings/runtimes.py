@@ -8,6 +8,7 @@ planes, and other last bits than the other does.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -16,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
     from torch import nn
@@ -158,17 +160,8 @@ def _onnxruntime(net: ResNet, last: int, precision: Precision) -> Run:
 
 
 def _package(name: RuntimeName) -> Any:
-    try:
-        if name == "onnxruntime":
-            import onnxruntime as found
-        else:
-            import torch as found
-    except ImportError as error:
-        raise InputError(
-            f"runtime={name!r} needs the package {name}, which is not installed: "
-            "pip install 'scroll-tactile[onnx]', or use runtime='torch'"
-        ) from error
-    return found
+    with optional(name, "onnx" if name == "onnxruntime" else "torch", f"runtime={name!r}"):
+        return importlib.import_module(name)
 
 
 class Graph:
@@ -264,13 +257,8 @@ def network_model(net: ResNet, last: int) -> bytes:
 
 
 def _onnx() -> Any:
-    try:
+    with optional("onnx", "onnx", "an ONNX graph", "use runtime='torch'"):
         import onnx
         import onnx.helper
         import onnx.numpy_helper
-    except ImportError as error:
-        raise InputError(
-            "an ONNX graph needs the package onnx, which is not installed: pip install 'scroll-tactile[onnx]', or use "
-            "runtime='torch'"
-        ) from error
     return onnx

@@ -11,16 +11,19 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
-from torch.nn import functional
 
 from scroll_tactile.embeddings.protocol import TOGETHER, Capabilities, canary
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.embeddings.weights import digest_of, hash_tensors, load_network, source_name
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 from scroll_tactile.signals.augmentation import fit
+
+with optional("torch", "torch", "the embedding Vision"):
+    import torch
+    from torch import nn
+    from torch.nn import functional
 
 __all__ = ["TunableVision", "Vision", "pool_windows", "to_planes"]
 

@@ -16,10 +16,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 
 from scroll_tactile.embeddings.resnet import BLOCKS, BOTTLENECK, ResNet, Stem
 from scroll_tactile.errors import WeightsError
+from scroll_tactile.libraries import optional
+
+with optional("torch", "torch", "a network's weights"):
+    import torch
 
 __all__ = [
     "CACHE_VARIABLE",
@@ -195,24 +198,15 @@ def _fetch(url: str, path: Path) -> None:
 
 
 def _pooch() -> Any:
-    try:
+    with optional("pooch", "vision", "fetching published weights", "give the path of a file of weights"):
         import pooch
-    except ImportError as error:
-        raise WeightsError(
-            "published weights are fetched by pooch, which is not installed: pip install 'scroll-tactile[vision]', "
-            "or give the path of a file of weights"
-        ) from error
     return pooch
 
 
 def _read_safetensors(path: Path) -> Tensors:
-    try:
+    with optional("safetensors", "vision", str(path)):
         from safetensors import SafetensorError
         from safetensors.torch import load_file
-    except ImportError as error:
-        raise WeightsError(
-            f"{path} needs safetensors, which is not installed: pip install 'scroll-tactile[vision]'"
-        ) from error
     try:
         tensors: Tensors = load_file(path)
     except (SafetensorError, OSError, ValueError, KeyError) as error:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from scipy.special import logsumexp
 
 from scroll_tactile.embeddings.protocol import Embedding
@@ -32,11 +31,15 @@ from scroll_tactile.finetune.training import (
     repeatable,
     start_of,
 )
+from scroll_tactile.libraries import optional
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.statistics.statistics import Statistics
+
+with optional("torch", "torch", "a fine-tune"):
+    import torch
 
 __all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune"]
 

@@ -9,18 +9,21 @@ from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
-from torch.nn import functional
 
 from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, parts_of
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.libraries import optional
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.signals.windows import WindowPlan
+
+with optional("torch", "torch", "a fine-tune"):
+    import torch
+    from torch import nn
+    from torch.nn import functional
 
 __all__ = ["Backbone", "TouchFeatures", "TrainingSample", "TunedReader", "adapted"]
 

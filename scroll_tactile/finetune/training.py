@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
-from torch.nn import functional
 
 from scroll_tactile.embeddings.runtimes import full_float32, one_torch_thread
 from scroll_tactile.errors import FineTuneError
 from scroll_tactile.finetune.network import Backbone, TouchFeatures, TrainingSample, adapted
+from scroll_tactile.libraries import optional
 from scroll_tactile.memory.tuned import TuneMode
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.readout import Readout, Task
@@ -23,6 +21,11 @@ from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import Statistics
+
+with optional("torch", "torch", "a fine-tune"):
+    import torch
+    from torch import nn
+    from torch.nn import functional
 
 __all__ = ["FOLDS", "Progress", "Start", "Trained", "Trainer", "named_out_of_memory", "repeatable", "start_of"]
 

@@ -23,7 +23,8 @@ class LiveTouch:
     without any, in seconds since the session began. end: why it ended: "released", by `end()`, by a "gap" in time,
     as "time went back", as nothing moved for long ("still"), or because the session was "closed". earlier: the touches
     of the same thing before it that the prediction weighs with it, as `learner.predict(*earlier, stream)`; none unless
-    `LiveSession.again` said so.
+    `LiveSession.again` said so. revised: the prediction that was decided on before the touch ended, where the whole
+    touch says otherwise; None where it does not.
     """
 
     stream: Stream
@@ -32,6 +33,7 @@ class LiveTouch:
     at: float
     end: End
     earlier: tuple[Stream, ...] = ()
+    revised: Prediction | None = None
 
 
 class LiveState(NamedTuple):
@@ -63,7 +65,8 @@ class LiveReport:
     the line between their neighbours. repeated: readings that came twice, left out. late: that came behind a later one,
     left out. surplus: more than the sensor's rate has room for, left out. untimed: whose stamp stood still, taken as
     they came. gaps, steps_back: in time; each ends a touch. missing: values that were NaN or infinite.
-    touches: that ended. undecided: of them. truncated: that went on beyond what is kept of a touch. brief: contacts too
+    touches: that ended. undecided: of them. revised: of them, decided on before they ended, and whose end says
+    otherwise. truncated: that went on beyond what is kept of a touch. brief: contacts too
     short for a touch. relearned: how often the sensor turned out to be much quieter than what was learned as its rest:
     it was touched from the first reading on, and that touch was not found. learning: whether rest is still being
     learned; nothing is found until then.
@@ -81,6 +84,7 @@ class LiveReport:
     missing: int = 0
     touches: int = 0
     undecided: int = 0
+    revised: int = 0
     truncated: int = 0
     brief: int = 0
     relearned: int = 0

@@ -371,12 +371,15 @@ class LiveSession:
             self.report.brief += 1
             self._leave(touch)
             return
+        before = touch.prediction if touch.decided else None
         prediction = self._predict(touch, stream)
+        revised = before if before is not None and _says(before) != _says(prediction) else None
         self.touch, self._thing = stream, (*touch.earlier, stream)[-EARLIER:]
         self.report.touches += 1
         self.report.undecided += not touch.decided
+        self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
-        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end, touch.earlier))
+        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end, touch.earlier, revised))
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""
@@ -395,6 +398,11 @@ class LiveSession:
             return _AT_REST
         last = ended[-1]
         return LiveState(False, last.stream.seconds, last.prediction, last.decided, True, ended)
+
+
+def _says(prediction: Prediction) -> str | None:
+    """What is acted on: the material, or that it is none that was felt."""
+    return prediction.material if prediction.known else None
 
 
 _AT_REST = LiveState()

@@ -1,9 +1,9 @@
-"""The demonstration: twenty simulated materials learned one by one. Nothing in it is a result."""
+"""The demonstration: simulated materials, unknown first and then learned. Nothing in it is a result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +12,48 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.pipelines.runfile import RunFile
-from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["Demo", "Outcome", "Step"]
+__all__ = ["Demo", "Half", "Outcome"]
 
 
 @dataclass(frozen=True)
-class Step:
-    """After one more material: its name; accuracy over its own held-out touches, and over those of all met so far."""
+class Half:
+    """What was said when half of the materials were learned.
 
+    right: share of right answers to touches of these, held out. unknown, asked: how many touches of the other half were
+    called unknown, of how many. material, nearest, novelty, known: the answer to the first of those.
+    """
+
+    right: float
+    unknown: int
+    asked: int
     material: str
-    own: float
-    all: float
+    nearest: str
+    novelty: float
+    known: bool
 
 
 @dataclass(frozen=True)
 class Outcome:
     """How a demonstration ended.
 
-    answers: to the held-out touches of all materials. steps: accuracy after each material.
-    novel: material of another scene → the answer to a touch of it. short: the same for 0.3 s of known ones.
-    observed: how many touches this run observed; a resumed one fewer. digest: of the memory.
+    half: what was said half-way. answers: to the held-out touches of all materials. first: of which as many are of the
+    first half. short: answers to 0.3 s of one touch of each. observed: how many touches this run observed; a resumed
+    one fewer. digest: of the memory.
     """
 
+    half: Half
     answers: Answers
-    steps: list[Step]
-    novel: dict[str, Prediction]
+    first: int
     short: Answers
     observed: int
     digest: str
 
-    def forgotten(self) -> list[tuple[str, float, float]]:
-        """(material, accuracy right after it was learned, accuracy at the end) of those that lost any."""
-        pairs = [(step.material, step.own, self.answers.of(step.material).accuracy) for step in self.steps]
-        return [pair for pair in pairs if pair[2] < pair[1]]
+    @property
+    def still_right(self) -> float:
+        """The share of right answers to the touches of the first half, now that all materials are learned."""
+        return Answers(self.answers.truth[: self.first], self.answers.predictions[: self.first]).accuracy
 
 
 @dataclass(frozen=True)
@@ -54,13 +61,13 @@ class Demo:
     """A demonstration: a sensor, a seed, and how many materials and touches.
 
     sensor: any but a camera. seed: of the scene. materials: how many, at most twenty. touches: learned of each.
-    held_out: touches of each that are only tested. features: of the embedding; the usual 1008 take three times
-    as long to fit a readout to, and here twenty are fitted. folder: where the memory is kept, None for nowhere.
+    held_out: touches of each that are only tested. features: of the embedding. folder: where the memory is kept, None
+    for nowhere.
     """
 
     sensor: Sensor
     seed: int = 0
-    materials: int = 20
+    materials: int = 12
     touches: int = 6
     held_out: int = 4
     features: int = 504
@@ -70,7 +77,7 @@ class Demo:
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", Scene(self.sensor, self.seed))
 
-    def run(self, report: Callable[[Step], object] = lambda step: None) -> Outcome:
+    def run(self, report: Callable[[str], object] = lambda name: None) -> Outcome:
         """Learn and test; `report` receives every material when it is learned, those of an interrupted run first.
 
         A run with a folder that was interrupted, in whatever way, resumes where it was.
@@ -94,36 +101,36 @@ class Demo:
             return TactileLearner(sensor=self.sensor, embedding=embedding)
         return TactileLearner.open(self.folder / "memory", sensor=self.sensor, embedding=embedding)
 
-    def _learn(self, learner: TactileLearner, notes: RunFile, report: Callable[[Step], object]) -> Outcome:
-        steps: list[Step] = []
-        train: list[Labelled] = []
-        test: list[Labelled] = []
-        observed = 0
-        answers = Answers([], [])
-        for name in self.scene.materials[: self.materials]:
+    def _learn(self, learner: TactileLearner, notes: RunFile, report: Callable[[str], object]) -> Outcome:
+        names = self.scene.materials[: self.materials]
+        middle = max(1, len(names) // 2)
+        observed, train = 0, list[Labelled]()
+        for place, name in enumerate(names):
+            if place == middle and "half" not in notes.notes:
+                notes.note("half", asdict(self._half(learner, names[:middle], names[middle:])))
             train += self._touches(name, 0, self.touches)
-            test += self._touches(name, self.touches, self.held_out)
-            kept = notes.notes.get(name)
-            if kept is None:
+            if name not in notes.notes:
                 observed += observe_all(learner, train)
-                answers = evaluate(learner, test)
-                kept = {"own": answers.of(name).accuracy, "all": answers.accuracy}
-                notes.note(name, kept)
-            steps.append(Step(name, kept["own"], kept["all"]))
-            report(steps[-1])
-        if len(answers.truth) < len(test):  # a finished run was started again
-            observed += observe_all(learner, train)
-            answers = evaluate(learner, test)
-        return Outcome(answers, steps, self._novel(learner), self._short(learner), observed, learner.digest())
+                notes.note(name, self.touches)
+            report(name)
+        answers = evaluate(learner, self._held_out(names))
+        short = evaluate(learner, [(name, self._extra(name)) for name in names], seconds=0.3)
+        first = middle * self.held_out
+        return Outcome(Half(**notes.notes["half"]), answers, first, short, observed, learner.digest())
+
+    def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
+        right = evaluate(learner, self._held_out(learned)).accuracy
+        asked = evaluate(learner, self._held_out(others))
+        unknown = sum(not answer.known for answer in asked.predictions)
+        first = asked.predictions[0]
+        nearest = str(first.material)
+        return Half(right, unknown, len(asked.truth), asked.truth[0], nearest, first.novelty, first.known)
+
+    def _held_out(self, names: Sequence[str]) -> list[Labelled]:
+        return [touch for name in names for touch in self._touches(name, self.touches, self.held_out)]
 
     def _touches(self, name: str, first: int, count: int) -> list[Labelled]:
         return [(name, self.scene.touch(name, i)) for i in range(first, first + count)]
 
-    def _novel(self, learner: TactileLearner) -> dict[str, Prediction]:
-        other = Scene(self.sensor, self.seed + 1)
-        return {name: learner.predict(other.touch(name, 0)) for name in other.materials}
-
-    def _short(self, learner: TactileLearner) -> Answers:
-        repetition = self.touches + self.held_out
-        touches = [(name, self.scene.touch(name, repetition)) for name in self.scene.materials[: self.materials]]
-        return evaluate(learner, touches, seconds=0.3)
+    def _extra(self, name: str) -> Any:
+        return self.scene.touch(name, self.touches + self.held_out)

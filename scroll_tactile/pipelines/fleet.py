@@ -132,8 +132,8 @@ def learn(
         folder = place.with_name(place.name + ".fleet")
         if held is not None and held.observations() and not (folder / NOTES).exists() and not add:
             raise InputError(
-                f"{place} is there already, and not by a run of this kind: take another folder, or say that it is to "
-                "be added to"
+                f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
+                "add to it"
             )
         run = _Run(folder, making, report, fan, progress)
         run.begin(found)
@@ -169,7 +169,7 @@ def _making(
         kept = held.settings
         return Making(held.sensor, held.embedding, held.augmentation, kept.exemplars, kept.recall, options, patience)
     if sensor is None:
-        raise InputError("a new memory takes a sensor: say whose readings the sources are")
+        raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
     chosen = usual_embedding(sensor) if embedding is None else embedding
     return Making(sensor, chosen, **settings, options=options, patience=patience)
 

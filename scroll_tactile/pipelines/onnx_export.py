@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from scroll_tactile.embeddings.protocol import TOGETHER
 from scroll_tactile.embeddings.resnet import ResNet, folded
@@ -15,12 +14,16 @@ from scroll_tactile.embeddings.runtimes import Graph
 from scroll_tactile.embeddings.vision import DEVIATION, MEAN, MOST_COLUMNS, Vision
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.libraries import optional
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
+
+with optional("torch", "torch", "an export to ONNX"):
+    import torch
 
 __all__ = ["export_onnx"]
 

@@ -28,7 +28,7 @@ from scroll_tactile.memory.rows import OBSERVE, SOURCE, pack_codes, pack_reading
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.recordings.locations import is_remote, local
+from scroll_tactile.recordings.locations import file_system, is_remote, local
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
@@ -283,18 +283,11 @@ def _is_local_memory(path: Path) -> bool:
 def _is_remote_memory(address: str) -> bool:
     if address.lower().endswith(RECORDINGS):
         return False
-    files, path = _file_system(address)
+    files, path = file_system(address)
     if files.isdir(path):
         return bool(files.exists(f"{path.rstrip('/')}/{JOURNAL}"))
     with files.open(path, "rb", cache_type="none") as file:
         return bool(file.read(len(BEGIN)) == BEGIN)
-
-
-def _file_system(address: str) -> tuple[Any, str]:
-    import fsspec
-
-    found: tuple[Any, str] = fsspec.core.url_to_fs(address)
-    return found
 
 
 def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[str], list[Refused]]:
@@ -345,7 +338,7 @@ def _answered(ask: Callable[[], list[str]], patience: float | None) -> list[str]
 
 def _listed(address: str) -> list[str]:
     """What a remote folder holds; the address itself where it is a file, or a folder that is one recording."""
-    files, path = _file_system(address)
+    files, path = file_system(address)
     files.invalidate_cache()
     if not files.isdir(path):
         return [address]

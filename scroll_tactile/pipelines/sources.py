@@ -18,6 +18,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
 from scroll_tactile.live.pressing import FOLLOWED, PressDetector
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
+from scroll_tactile.recordings.columns import require_columns
 from scroll_tactile.recordings.locations import is_remote
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
@@ -43,8 +44,8 @@ Cut = Literal["episodes", "intervals", "none", "contact"]
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, preset, labels: as of `recordings.read`. cut: None cuts by the intervals where there are some,
-    by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, preset, labels: as of `recordings.read`. cut: None cuts by the intervals where there
+    are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
     At most one of the three names them; without any, episodes name themselves.
 
@@ -54,6 +55,7 @@ class SourceOptions:
     topic: str | None = None
     field: str | None = None
     clock: str | None = None
+    columns: str | None = None
     preset: str | None = None
     labels: str | None = None
     cut: Cut | None = None
@@ -63,20 +65,29 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
-            raise InputError("touches can be named in one way: by one material, by a place, or by a table of intervals")
+            raise InputError("touches can be named in one way: by one of material=, by= and intervals=")
         if self.material is not None:
             require_name(self.material)
         if self.preset is not None:
             presets.find(self.preset)
+        if self.columns is not None:
+            require_columns(self.columns)
         if self.cut == "intervals" and self.intervals is None:
-            raise InputError("to cut by intervals takes a table of them, with columns file, begin, end and material")
+            raise InputError("cut='intervals' takes intervals=, a table with columns file, begin, end and material")
         if self.intervals is not None and self.cut not in (None, "intervals"):
-            raise InputError(f"a table of intervals cuts by them; came cut {self.cut!r} beside it")
+            raise InputError(f"intervals= cuts by itself; came cut={self.cut!r} beside it")
 
     def touches_in(self, address: str, learner: TactileLearner) -> tuple[Recording, tuple[Touch, ...]]:
         """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
         recording = read(
-            address, topic=self.topic, field=self.field, clock=self.clock, preset=self.preset, labels=self.labels
+            address,
+            topic=self.topic,
+            field=self.field,
+            clock=self.clock,
+            columns=self.columns,
+            preset=self.preset,
+            rate=learner.sensor.rate,  # where it has no clock
+            labels=self.labels,
         )
         if self.intervals is not None:
             return recording, touches(recording, self.intervals)
@@ -106,7 +117,7 @@ def contact_spans(learner: TactileLearner, recording: Recording) -> list[tuple[i
     if not spans:
         raise InputError(
             f"no contact was found in {recording.source}: it has to begin at rest, for two seconds or more, from which "
-            "the sensor's noise is learned. For a file of one touch take no cut"
+            "the sensor's noise is learned. For a file of one touch take cut='none'"
         )
     return spans
 
@@ -189,7 +200,7 @@ def source_touches(
         try:
             material = options.material if options.material is not None else touch.material
             if named and material is None:
-                raise InputError("nothing names it: say what was touched")
+                raise InputError("nothing names it: give material= for all, by='folder', by='file' or intervals=")
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
             yield SourceTouch(source, material if material is None else require_name(material), stream)
@@ -198,11 +209,11 @@ def source_touches(
 
 
 def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
-    """The path as it was given, the readings where they are not all, topic and field where there are several."""
+    """The path as it was given, the readings where they are not all, topic and field where several, and columns."""
     whole = (touch.begin, touch.end) == (0, len(recording))
     where = recording.source + ("" if whole else f"[{touch.begin}:{touch.end}]")
     within = [recording.topic, recording.field] if recording.topic is not None else [options.field]
-    text = printable(" ".join([where, *(part for part in within if part)]))
+    text = printable(" ".join([where, *(part for part in (*within, options.columns) if part)]))
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"
 
 

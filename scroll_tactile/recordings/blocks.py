@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
+from scroll_tactile.libraries import missing
 
 __all__ = ["LARGEST", "Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
 
@@ -149,11 +150,6 @@ def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     exact = np.can_cast(array.dtype, np.float32, "safe")
     kind = np.float32 if exact else np.float64
     return array.reshape(len(array), -1).astype(kind, copy=False) if array.ndim != 2 else array.astype(kind, copy=False)
-
-
-def missing(module: str, extra: str, what: str) -> RecordingError:
-    """The error of a library that is not installed, with the line that installs it."""
-    return RecordingError(f"{what} needs {module}, which is not installed: pip install 'scroll-tactile[{extra}]'")
 
 
 @contextmanager

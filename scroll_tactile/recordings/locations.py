@@ -6,11 +6,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.blocks import missing
 
-__all__ = ["is_remote", "local"]
+__all__ = ["file_system", "is_remote", "local"]
 
 
 def is_remote(address: str) -> bool:
@@ -23,7 +24,7 @@ def is_remote(address: str) -> bool:
 def local(address: str) -> Iterator[Path]:
     """The path of a file or folder; what is elsewhere is copied into a temporary folder while it is used.
 
-    Raises RecordingError for an address where nothing is, that cannot be reached, or whose library is not installed.
+    Raises RecordingError for an address where nothing is or that cannot be reached, and what `file_system` raises.
     """
     if not is_remote(address):
         path = Path(address)
@@ -35,18 +36,25 @@ def local(address: str) -> Iterator[Path]:
         yield _copied(address, Path(folder))
 
 
-def _copied(address: str, folder: Path) -> Path:
-    scheme = address.partition("://")[0]
+def file_system(address: str) -> tuple[Any, str]:
+    """The file system of an address, as fsspec has it, and the path there.
+
+    Raises MissingLibraryError where the library for it is not installed, RecordingError for an address that is none.
+    """
     try:
         import fsspec
 
-        files, path = fsspec.core.url_to_fs(address)
-    except ImportError as error:
-        if scheme in ("s3", "s3a"):
-            raise missing("s3fs", "s3", address) from error
+        found: tuple[Any, str] = fsspec.core.url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        s3 = address.partition("://")[0] in ("s3", "s3a")
+        if isinstance(error, ImportError) and (s3 or error.name == "fsspec"):
+            raise missing("s3fs" if s3 else "fsspec", "s3", address) from error
         raise RecordingError(f"{address} cannot be reached: {error}") from error
-    except ValueError as error:
-        raise RecordingError(f"{address} cannot be reached: {error}") from error
+    return found
+
+
+def _copied(address: str, folder: Path) -> Path:
+    files, path = file_system(address)
     target = folder / (Path(path.rstrip("/")).name or "recording")
     try:
         if files.isdir(path):

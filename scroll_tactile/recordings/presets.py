@@ -1,5 +1,7 @@
 """Where known tactile sensors keep their numbers: the topic, the field, and the sensor with its range.
 
+Topic and field are those of its messages; of a file without topics, such as `.npy`, a preset is only its sensor.
+
 Ranges are what a driver's type and data sheet allow, in its own units. Where a preset's range is wider than what a
 sensor sends in use, a `Sensor` of one's own with the range seen resolves more.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -14,6 +14,7 @@ from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.clocks import choose
+from scroll_tactile.recordings.columns import only_columns
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Recording, assemble, resampled
 
@@ -28,6 +29,7 @@ def read(
     topic: str | None = None,
     field: str | None = None,
     clock: str | None = None,
+    columns: str | None = None,
     preset: str | None = None,
     rate: float | None = None,
     labels: str | None = None,
@@ -46,7 +48,8 @@ def read(
         tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
         that runs; see `Report`.
-    preset: a known sensor, in place of topic and field: see `presets`.
+    columns: those of the readings that are taken, by their places from 0, such as "25:44" or "0,3,5:9".
+    preset: a known sensor, in place of topic and field, see `presets`; of a file without topics it is only the sensor.
     rate: in Hz, counts times where a file has no clock.
     labels: a topic with texts, or a column: what they say become episodes.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
@@ -54,16 +57,15 @@ def read(
     definitions: of messages that a bag does not define, the text of the .msg by the type's name.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
-    file is not there, damaged, ragged, empty, of no known format, or needs a library that is not installed;
-    ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
+    file is not there, damaged, ragged, empty, or of no known format; MissingLibraryError where it needs a library that
+    is not installed; ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
     """
     request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
-    request = _with_preset(request, preset)
     address = fspath(path)
     with local(address) as place, guarded(address):
-        source = _open(place, address, request)
+        source = _open(place, address, request, preset)
         whole = _joined(_timed(source, request), address)
-        recording = _recording(whole, source, _clock(whole, request.clock))
+        recording = _recording(whole, source, _clock(whole, request.clock), columns)
     _require(recording, preset)
     return recording if resample is None else resampled(recording, resample)
 
@@ -74,6 +76,7 @@ def iterate(
     topic: str | None = None,
     field: str | None = None,
     clock: str | None = None,
+    columns: str | None = None,
     preset: str | None = None,
     rate: float | None = None,
     labels: str | None = None,
@@ -88,11 +91,10 @@ def iterate(
     readings; the clock is chosen from the first.
     """
     request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
-    request = _with_preset(request, preset)
     address = fspath(path)
     with local(address) as place:
         with guarded(address):
-            source = _open(place, address, request)
+            source = _open(place, address, request, preset)
             blocks = _timed(source, request)
             name = request.clock
         first = True
@@ -102,7 +104,7 @@ def iterate(
                 if block is None:
                     return
                 name = _clock(block, name) if first else name
-                recording = _recording(block, source, name)
+                recording = _recording(block, source, name, columns)
             if first:
                 _require(recording, preset)
             first = False
@@ -146,8 +148,12 @@ def find(path: _Address) -> list[Path]:
     return found
 
 
-def _open(path: Path, address: str, request: Request) -> Source:
-    """The reader that knows this file's format, by its name or by what a folder holds."""
+def _open(path: Path, address: str, request: Request, preset: str | None = None) -> Source:
+    """The reader that knows this file's format, by its name or by what a folder holds.
+
+    A preset says where messages have the numbers; of a file without topics it is only the sensor.
+    """
+    known = None if preset is None else presets.find(preset)
     kind = _kind(path)
     if kind is None:
         what = "a folder that is none of these" if path.is_dir() else repr(path.name)
@@ -155,6 +161,8 @@ def _open(path: Path, address: str, request: Request) -> Source:
             "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
             f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
+    if known is not None and kind.topics:
+        request = replace(request, field=request.field or known.field, likely=known.topic)
     source = kind(path, address, request)
     for name, value, takes in (("topic", request.topic, source.topics), ("labels", request.labels, source.labels)):
         if value is not None and not takes:
@@ -162,7 +170,7 @@ def _open(path: Path, address: str, request: Request) -> Source:
     return source
 
 
-def _kind(path: Path) -> Callable[[Path, str, Request], Source] | None:
+def _kind(path: Path) -> type[Source] | None:
     from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag
 
     if rosbag.is_rosbag(path):
@@ -217,10 +225,11 @@ def _joined(blocks: Iterator[Block], address: str) -> Block:
     return Block(np.concatenate([part.readings for part in parts]), whole("clocks"), whole("counters"), episodes)
 
 
-def _recording(block: Block, source: Source, clock: str | None) -> Recording:
+def _recording(block: Block, source: Source, clock: str | None, columns: str | None) -> Recording:
     readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
-    return Recording(source.address, source.topic, source.field(), readings, times, episodes, report)
+    recording = Recording(source.address, source.topic, source.field(), readings, times, episodes, report)
+    return recording if columns is None else only_columns(recording, columns)
 
 
 def _clock(block: Block, asked: str | None) -> str | None:
@@ -228,13 +237,6 @@ def _clock(block: Block, asked: str | None) -> str | None:
     if asked is not None and asked not in block.clocks and len(block.clocks) == 1 and "log" not in block.clocks:
         return next(iter(block.clocks))
     return choose(block.clocks, asked)
-
-
-def _with_preset(request: Request, name: str | None) -> Request:
-    if name is None:
-        return request
-    preset = presets.find(name)
-    return replace(request, field=request.field or preset.field, likely=preset.topic)
 
 
 def _require(recording: Recording, name: str | None) -> None:
@@ -245,8 +247,7 @@ def _require(recording: Recording, name: str | None) -> None:
     if sensor.camera != (len(shape) == 3) or (not sensor.camera and shape != sensor.shape):
         alike = [other for other, preset in presets.PRESETS.items() if preset.sensor.shape == shape]
         raise ChannelCountError(
-            f"expected readings of {name!r}, shape {sensor.shape}; field {recording.field!r} of {recording.source} has "
-            f"{shape}"
+            f"expected readings of {name!r}, shape {sensor.shape}; {recording.place} has {shape}"
             + (f", as of {' or '.join(alike)}" if alike else "")
-            + ". For another size give topic= and field="
+            + f". {recording.cure(sensor)}"
         )

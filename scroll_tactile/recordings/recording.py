@@ -100,6 +100,17 @@ class Recording:
     def __len__(self) -> int:
         return len(self.readings)
 
+    @property
+    def place(self) -> str:
+        """What is read, as errors name it."""
+        return f"field {self.field!r:.80} of {self.source}" if self.field else self.source
+
+    def cure(self, sensor: Sensor) -> str:
+        """What to do where these are not the sensor's readings."""
+        wider = self.readings.ndim == 2 and self.readings.shape[1] > sensor.channels
+        some = f" Some of its columns are taken by columns='0:{sensor.channels}'" if wider else ""
+        return f"Is it another sensor's recording, or another field?{some}"
+
     def stream(self, sensor: Sensor) -> Stream:
         """All readings as one stream of `sensor`.
 
@@ -108,8 +119,8 @@ class Recording:
         shape = self.readings.shape[1:]
         if shape != sensor.shape and int(np.prod(shape)) != sensor.channels:
             raise ChannelCountError(
-                f"expected readings of sensor {sensor.name!r}, {sensor.channels} channels; field {self.field!r} of "
-                f"{self.source} has {shape}: is it another sensor's recording, or another field?"
+                f"expected readings of sensor {sensor.name!r}, {sensor.channels} channels; {self.place} has {shape}. "
+                f"{self.cure(sensor)}"
             )
         return validate(self.readings.reshape(len(self), *sensor.shape), sensor)
 

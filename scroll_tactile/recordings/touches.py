@@ -75,7 +75,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
         if cut not in ("whole", "episodes"):
             raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
         if cut == "episodes" and not recording.episodes:
-            raise InputError(f"{recording.source} has no episodes: cut it by intervals, or not")
+            raise InputError(f"{recording.source} has no episodes: cut it by intervals=, or not")
         spans = recording.episodes if cut == "episodes" else (Episode(0, len(recording), _only(recording)),)
     elif callable(cut):
         spans = tuple(Episode(begin, end, _during(recording, begin, end)) for begin, end in cut(recording))

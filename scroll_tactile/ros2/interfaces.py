@@ -8,7 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
+from scroll_tactile.libraries import install_line
 from scroll_tactile.recordings.paths import nearest
 
 __all__ = ["interface", "kind_of", "require_rclpy"]
@@ -17,21 +18,22 @@ _NAME = re.compile(r"([A-Za-z]\w*)/(msg|srv)/([A-Za-z]\w*)")
 
 
 def require_rclpy() -> Any:
-    """Python's client of ROS 2. Raises RecordingError, with how to get it, where it cannot be imported."""
+    """Python's client of ROS 2. Raises MissingLibraryError, with how to get it, where it cannot be imported."""
     try:
         return importlib.import_module("rclpy")
     except ImportError as error:
-        raise RecordingError(
+        raise MissingLibraryError(
             f"a ROS 2 node needs rclpy, which cannot be imported here ({error}): source the robot's own ROS 2 "
-            "(source /opt/ros/DISTRIBUTION/setup.bash) in the shell that starts this, with a Python of the same version"
+            "(source /opt/ros/DISTRIBUTION/setup.bash) in the shell that starts this, with a Python of the same "
+            f"version; where there is no ROS: {install_line('ros-rclpy', 'ros2')}"
         ) from error
 
 
 def interface(name: str) -> Any:
     """The class of a message or service, such as std_msgs/msg/String.
 
-    Raises InputError for a name that is none, RecordingError where its package is not installed, with the line that
-    installs it, and FieldError, with those nearest, where the package has none of this name.
+    Raises InputError for a name that is none, MissingLibraryError where its package is not installed, with the line
+    that installs it, and FieldError, with those nearest, where the package has none of this name.
     """
     match = _NAME.fullmatch(name)
     if match is None:
@@ -41,7 +43,7 @@ def interface(name: str) -> Any:
         module = importlib.import_module(f"{package}.{group}")
     except ImportError as error:
         distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
-        raise RecordingError(
+        raise MissingLibraryError(
             f"type {name} needs the Python package {package!r}, which cannot be imported ({error}): "
             f"sudo apt install ros-{distribution}-{package.replace('_', '-')}, or source the workspace it is built in"
         ) from error

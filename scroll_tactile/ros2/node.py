@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from scroll_tactile.errors import FieldError, InputError, RecordingError, ScrollTactileError
+from scroll_tactile.errors import FieldError, InputError, MissingLibraryError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.ros2.bridge import Answer, Bridge
@@ -51,7 +51,7 @@ class TactileNode:
 
     A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not tell.
 
-    Raises RecordingError where a package of ROS is missing, InputError for a type that is none, and what `Bridge`
+    Raises MissingLibraryError where a package of ROS is missing, InputError for a type that is none, and what `Bridge`
     raises. A field that the first message does not have raises FieldError from the node's executor.
     """
 
@@ -186,7 +186,7 @@ class _Diagnostics:
         self._node, self._before = node, 0
         try:
             self._array: Any = interface("diagnostic_msgs/msg/DiagnosticArray")
-        except RecordingError:
+        except MissingLibraryError:
             self._array, self._text = None, interface("std_msgs/msg/String")
         name = "~/diagnostics" if self._array is None else "/diagnostics"
         self._publisher = node.create_publisher(self._array or self._text, name, 10)

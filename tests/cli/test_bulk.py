@@ -118,7 +118,7 @@ class TestLearn:
     def test_options_that_do_not_fit_are_one_line(self, memory: Path, data: Path) -> None:
         assert "in one way" in refused("learn", memory, data, "--label", "a", "--label-by", "file")
         assert "1 to 200" in refused("learn", memory, data, "--label", "")
-        assert "takes a table" in refused("learn", memory, data, "--cut", "intervals")
+        assert "--cut intervals takes --labels, a table" in refused("learn", memory, data, "--cut", "intervals")
         assert "expected a preset" in refused("learn", memory, data, "--preset", "nose", "--label", "a")
         assert "biotac" in refused("learn", memory, data, "--sensor", "biotac", "--label", "a")
         assert run("learn", memory, data, "--cut", "thin").exit_code == 2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Kernels, TactileLearner, sensors
+from scroll_tactile import Kernels, TactileLearner, __version__, sensors
 from scroll_tactile.datasets.simulator import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -137,13 +137,13 @@ class TestDemo:
         assert result.exit_code == 0, result.output
         for words in (
             "Simulated",
-            "not",
-            "result",
-            "worst confusions:",
-            "forgot:",
-            "never touched",
-            "0.3 s",
-            "digest:",
+            "nothing here is a result",
+            "unknown is called unknown: ",
+            "forgets nothing: ",
+            "answers from 0.3 s on: ",
+            "survives the power plug: ",
+            "the very bits of a memory that nothing interrupted",
+            "digest: ",
         ):
             assert words in result.stdout
 
@@ -182,6 +182,10 @@ class TestDemo:
 def _finished(kept: Path) -> list[str]:
     file = kept / "demo.json"
     return list(json.loads(file.read_text())["notes"]) if file.exists() else []
+
+
+def test_the_version_is_told() -> None:
+    assert run("--version").stdout == f"scroll-tactile {__version__}\n"
 
 
 def test_schedules_give_one_memory() -> None:

@@ -7,7 +7,9 @@ import sys
 import numpy as np
 import pytest
 from commands import refused, run
+from live_touches import slide
 from rich.console import Console
+from touches import PAD, SMALL
 
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.cli import replay
@@ -63,7 +65,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
         expected = learner.predict(SCENE.touch("silk", 9))
     lines = []
     monkeypatch.setattr(replay.typer, "echo", lines.append)
-    replay.live(memory / "memory", replay.Path("-"), 0.05, False, True, True)
+    replay.live(memory / "memory", replay.Path("-"), None, 0.05, False, True, True)
     answer = json.loads(lines[-2])
     assert (answer["event"], answer["material"]) == ("ended", expected.material)
     assert answer["probability"] == expected.probability
@@ -72,7 +74,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
 def test_on_a_terminal_the_answer_grows(memory, monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=80)
     monkeypatch.setattr(replay, "console", lambda: screen)
-    replay.live(memory / "memory", memory / "silk.npy", 0.05, False, True, False)
+    replay.live(memory / "memory", memory / "silk.npy", None, 0.05, False, True, False)
     shown = screen.file.getvalue()
     assert "touched for 0.30 s" in shown and "touched for 1.50 s" in shown and "█" in shown
 
@@ -84,3 +86,22 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
     with pytest.raises(replay.InputError, match="line 2"):
         list(replay._rows(replay.Path("-")))
+
+
+def test_a_revised_decision_is_called_one(tmp_path):
+    random = np.random.default_rng(3)
+    _kept(tmp_path / "m")
+    np.save(tmp_path / "t.npy", np.concatenate([slide("a", 20, random), slide("b", 30, random)]))
+    words = ("live", tmp_path / "m", tmp_path / "t.npy", "--touch", "--risk", "0.3")
+    shown = run(*words).stdout
+    assert "revised: it was decided as a with" in shown and "1 revised" in shown
+    ended = json.loads(run(*words, "--json").stdout.splitlines()[-2])
+    assert (ended["event"], ended["material"], ended["revised"]) == ("ended", "b", True)
+
+
+def _kept(folder):
+    random = np.random.default_rng(1)
+    with TactileLearner.open(folder, sensor=PAD, embedding=SMALL) as made:
+        for _ in range(6):
+            for material in "abc":
+                made.observe(material, slide(material, 50, random))

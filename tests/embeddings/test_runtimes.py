@@ -1,6 +1,6 @@
 """What runs the network: the same features in each, the same bytes from one."""
 
-import builtins
+import sys
 
 import numpy as np
 import pytest
@@ -65,15 +65,8 @@ def test_what_no_runtime_has_is_refused():
 def test_a_missing_package_is_named_with_its_extra(monkeypatch, package):
     if package == "onnx":
         pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name.split(".")[0] == package:
-            raise ImportError(f"No module named {name!r}")
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=rf"(?s)needs the package {package}.*scroll-tactile\[onnx\]"):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"(?s)needs {package}, which is not installed.*\[onnx\]"):
         Vision(STATE, runtime="onnxruntime")
 
 

@@ -376,3 +376,17 @@ def test_a_gap_before_the_first_reading_of_a_touch_does_not_end_it():
     [touch] = session.end().touches
     assert touch.end == "end" and len(touch.stream) == end - begin
     assert session.report.gaps == 1
+
+
+def test_a_decision_that_the_whole_touch_takes_back_is_called_revised():
+    made, random = learner(), np.random.default_rng(3)
+    with made.live(contact="manual", risk=0.3) as live:
+        for rest_of_it, revised in (("a", None), ("b", "a")):
+            live.begin()
+            now = live.push(slide("a", 20, random))
+            assert now.decided and now.prediction.material == "a"
+            live.push(slide(rest_of_it, 30, random))
+            (touch,) = live.end().touches
+            assert touch.prediction.material == rest_of_it
+            assert (touch.revised and touch.revised.material) == revised
+        assert (live.report.touches, live.report.revised) == (2, 1)

@@ -7,6 +7,7 @@ import socket
 
 import numpy as np
 import pytest
+from buckets import BUCKETS, served
 from commands import refused
 from commands import run as command
 from test_fleet import BY_FOLDER, TOUCHES, expected, run, touch_files
@@ -16,36 +17,14 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.fleet import learn
 
-BUCKETS = pytest.mark.skipif(
-    not all(map(importlib.util.find_spec, ("moto", "flask", "s3fs"))), reason="moto[server] and s3fs are not installed"
-)
 CLUSTER = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask[distributed] is missing")
 
 
 @pytest.fixture(scope="module")
 def bucket():
-    """An empty bucket of a real S3 interface: its address begins here."""
-    import s3fs
-    from moto.server import ThreadedMotoServer
-
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server = ThreadedMotoServer(port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    before = dict(os.environ)
-    os.environ |= {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    files = s3fs.S3FileSystem()
-    files.mkdir("touches")
-    yield files
-    server.stop()
-    os.environ.clear()
-    os.environ.update(before)
-    s3fs.S3FileSystem.clear_instance_cache()
+    """An empty bucket: its address begins here."""
+    with served("touches") as files:
+        yield files
 
 
 @BUCKETS

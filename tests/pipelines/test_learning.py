@@ -13,7 +13,7 @@ from touches import PAD, SETTINGS, fed, filled, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets import biotac_slide
-from scroll_tactile.errors import InputError, MaterialError
+from scroll_tactile.errors import FieldError, InputError, MaterialError
 from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.learning import evaluate_sources, learn
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
@@ -80,8 +80,9 @@ class TestSources:
             ({"material": "a", "by": "file"}, InputError, "in one way"),
             ({"material": ""}, MaterialError, "1 to 200"),
             ({"preset": "biotacc"}, InputError, "expected a preset"),
-            ({"cut": "intervals"}, InputError, "takes a table"),
-            ({"cut": "none", "intervals": (Interval("a", 0, 1, "x"),)}, InputError, "came cut 'none'"),
+            ({"columns": "25-44"}, FieldError, "such as 25:44 or 0,3,5:9, counted from 0; came '25-44'"),
+            ({"cut": "intervals"}, InputError, "takes intervals=, a table"),
+            ({"cut": "none", "intervals": (Interval("a", 0, 1, "x"),)}, InputError, "came cut='none'"),
         ],
     )
     def test_options_that_do_not_fit_together_are_refused(self, options, error, match):

@@ -12,6 +12,7 @@ from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
+from scroll_tactile.pipelines.unplugged import pull_the_plug
 
 
 class TestMetrics:
@@ -97,16 +98,18 @@ class TestDemo:
         with pytest.raises(KeyboardInterrupt):
             task.run(stop)
         resumed = task.run()
-        assert (resumed.observed, resumed.digest, resumed.steps) == (6, whole.digest, whole.steps)
+        assert (resumed.observed, resumed.digest, resumed.half) == (6, whole.digest, whole.half)
         assert resumed.answers == whole.answers
         again = task.run()
-        assert (again.observed, again.digest, again.answers) == (0, whole.digest, whole.answers)
+        assert (again.observed, again.digest, again.answers, again.half) == (0, whole.digest, whole.answers, whole.half)
 
-    def test_forgetting_would_be_reported(self) -> None:
-        outcome = Demo(sensors.BIOTAC, **SMALL).run()
-        assert len(outcome.novel) == 20
-        first = outcome.steps[0]
-        wrong = [outcome.answers.predictions[-1]] * 2  # what was said to the last material, to the first
-        outcome.answers.predictions[:2] = wrong
-        assert outcome.forgotten() == [(first.material, 1.0, 0.0)]
-        assert outcome.answers.confusions() == [(first.material, outcome.answers.truth[-1], 2)]
+    def test_what_is_new_is_shown(self) -> None:
+        outcome = Demo(sensors.BIOTAC, materials=8, touches=5, held_out=2, features=64).run()
+        assert (outcome.half.asked, outcome.first) == (8, 8)
+        assert outcome.half.unknown >= 6 and outcome.half.right == 1.0 and outcome.still_right == 1.0
+        outcome.answers.predictions[:2] = outcome.answers.predictions[-2:]  # what was said to the last, to the first
+        assert outcome.still_right == 0.75  # forgetting would be seen
+
+    def test_a_process_that_is_killed_loses_nothing_that_it_acknowledged(self) -> None:
+        found = pull_the_plug(sensors.ROBOSKIN, 3)
+        assert found.acknowledged == 5 <= found.found and found.same

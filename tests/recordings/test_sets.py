@@ -267,11 +267,11 @@ def test_a_library_that_is_not_installed_is_named_with_its_line(tmp_path, librar
 import sys
 sys.modules[{library!r}] = None
 from scroll_tactile.recordings import read
-from scroll_tactile.errors import RecordingError
+from scroll_tactile.errors import MissingLibraryError
 try:
     read({str(tmp_path / name)!r}, field='data')
-except RecordingError as error:
-    assert "pip install 'scroll-tactile[{extra}]'" in str(error), error
+except MissingLibraryError as error:
+    assert "[{extra}]" in str(error) and " -m pip install " in str(error), error
 else:
     raise AssertionError('read without it')
 """

@@ -11,7 +11,7 @@ from scroll_tactile.ros2.interfaces import interface, kind_of, require_rclpy
 
 def test_a_package_that_is_missing_is_named_with_what_installs_it(monkeypatch):
     monkeypatch.setenv("ROS_DISTRO", "jazzy")
-    with pytest.raises(errors.RecordingError, match="apt install ros-jazzy-sr-robot-msgs"):
+    with pytest.raises(errors.MissingLibraryError, match="apt install ros-jazzy-sr-robot-msgs"):
         interface("sr_robot_msgs/msg/BiotacAll")
 
 
@@ -31,7 +31,7 @@ def test_a_topic_of_two_types():
 
 def test_without_rclpy(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    with pytest.raises(errors.RecordingError, match=r"setup\.bash"):
+    with pytest.raises(errors.MissingLibraryError, match=r"setup\.bash"):
         require_rclpy()
     assert "rclpy" in refused("ros2", "--memory", tmp_path / "none", "--topic", "/t", "--field", "data")
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from commands import refused
 from live_touches import shift
+from readme import command_lines
 from robot import TOPIC, taught
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner, errors
-from scroll_tactile.recordings import read
+from scroll_tactile.recordings import PRESETS, read
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -169,7 +170,7 @@ def test_diagnostics_say_what_was_met(spinning, learner):
 
 def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, learner):
     node = spinning.node("scroll_tactile")
-    with pytest.raises(errors.RecordingError, match="sr-robot-msgs"):
+    with pytest.raises(errors.MissingLibraryError, match="sr-robot-msgs"):
         TactileNode(node, learner, TOPIC, "position", kind="sr_robot_msgs/msg/BiotacAll")
     TactileNode(node, learner, "/other", "position")
     other = spinning.node("other")
@@ -227,6 +228,22 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
     assert "4 materials" in output and "readings: 500" in output
     with TactileLearner.open(tmp_path / "own", mode="read") as kept:
         assert kept.materials["felt"] == 1
+
+
+def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
+    TactileLearner.open(tmp_path / "memory", sensor=PRESETS["biotac"].sensor).close()
+    words = next(words for words in command_lines() if words[1] == "ros2")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    line = [sys.executable, "-m", "scroll_tactile.cli", *words[1:]]
+    with subprocess.Popen(line, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            client = spinning.node("arm").create_client(Trigger, "/scroll_tactile/learn")
+            spinning.until(client.service_is_ready, 60)
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0 and "memory: 0 materials" in output
 
 
 def test_the_example_acts_on_what_it_feels(memory, tmp_path):

@@ -15,12 +15,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+from rich.markup import escape
+
 from examples.paper import drawing
 from scroll_tactile import __version__
 from scroll_tactile.cli.terminal import percent, say
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import missing
 
 __all__ = [
     "Dataset",
@@ -120,7 +123,7 @@ def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:
     if plot is None:
         return True
     if not drawing.available():
-        say('[yellow]No picture: it needs matplotlib[/] (pip install "scroll-tactile\\[plots]")')
+        say(f"[yellow]No picture:[/] {escape(str(missing('matplotlib', 'plots', 'it')))}")
         return False
     draw(plot)
     say(f"plot: {plot}")

@@ -25,6 +25,7 @@ from scroll_tactile import Embedding, Kernels
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.libraries import optional
 from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
@@ -151,12 +152,8 @@ def _simple(readings: npt.NDArray[np.float32]) -> FloatArray:
 
 def _forest(rows: FloatArray, grades: Sequence[int], asked: FloatArray, seed: int) -> npt.NDArray[np.int64]:
     """The grades that extremely randomised trees (Geurts et al. 2006) predict."""
-    try:
+    with optional("scikit-learn", "bench", "the comparison with trees"):
         from sklearn.ensemble import ExtraTreesClassifier
-    except ImportError as error:
-        raise InputError(
-            "trees to compare with need scikit-learn, which is not installed: pip install 'scroll-tactile[bench]'"
-        ) from error
     forest = ExtraTreesClassifier(TREES, random_state=seed)
     given: npt.NDArray[np.int64] = forest.fit(rows, np.asarray(grades)).predict(asked)
     return given

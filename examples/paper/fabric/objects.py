@@ -28,6 +28,7 @@ from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.libraries import optional
 from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
@@ -215,13 +216,8 @@ class Objects:
 
     def _grown(self, trained: Mask, tested: Mask, targets: npt.NDArray[Any]) -> tuple[FloatArray, npt.NDArray[Any]]:
         """Probabilities of each frame of the tested videos, (videos, frames, classes), and the classes."""
-        try:
+        with optional("scikit-learn", "bench", "the baseline of trees", "leave it out with --trees 0"):
             from sklearn.ensemble import ExtraTreesClassifier
-        except ImportError as error:
-            raise InputError(
-                "the baseline's trees are scikit-learn's, which is not installed: pip install 'scroll-tactile[bench]', "
-                "or leave it out with --trees 0"
-            ) from error
         rows, frames = self._counts, self._counts.shape[1]
         forest = ExtraTreesClassifier(self.trees, random_state=self.seed)
         forest.fit(rows[trained].reshape(-1, rows.shape[2]), np.repeat(targets[trained], frames))

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import to_planes
-from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 __all__ = ["ConvLSTM", "ResNetClassifier", "SpikingNet"]
 
@@ -93,12 +93,8 @@ class SpikingNet(nn.Module):
 
 
 def _leaky() -> Any:
-    try:
+    with optional("snntorch", "spiking", "the spiking network"):
         from snntorch import Leaky
-    except ImportError as error:
-        raise InputError(
-            "the spiking network needs snntorch, which is not installed: pip install 'scroll-tactile[spiking]'"
-        ) from error
     return Leaky
 
 

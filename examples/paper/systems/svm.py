@@ -11,6 +11,7 @@ from examples.paper.systems.inputs import Image, one_width, picture, usual_colum
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
+from scroll_tactile.libraries import optional
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.signals.stream import Stream
 
@@ -80,10 +81,6 @@ class Svm:
 
 
 def _machine(kernel: str, c: float) -> Any:
-    try:
+    with optional("scikit-learn", "bench", "a support vector machine"):
         from sklearn.svm import SVC
-    except ImportError as error:
-        raise InputError(
-            "support vector machines need scikit-learn, which is not installed: pip install 'scroll-tactile[bench]'"
-        ) from error
     return SVC(kernel=kernel, C=c)

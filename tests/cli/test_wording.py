@@ -1,0 +1,116 @@
+"""Errors speak of the options of the command that was typed, and not of Python's arguments."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import refused, run
+
+from scroll_tactile import sensors
+from scroll_tactile.cli.application import app
+from scroll_tactile.cli.wording import in_options, typed
+from scroll_tactile.datasets.simulator import Scene
+
+SCENE = Scene(sensors.BIOTAC)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Touches of 44 columns in folders by material, those of the sensor behind 25 others; one of 19."""
+    folder = tmp_path_factory.mktemp("wording")
+    for name in ("oak", "felt"):
+        (folder / "rec" / name).mkdir(parents=True)
+        readings = SCENE.touch(name, 0).readings
+        np.save(folder / "rec" / name / "0.npy", np.column_stack([np.zeros((len(readings), 25)), readings]))
+    np.save(folder / "touch.npy", readings)
+    np.savetxt(folder / "comma.csv", readings[:3], delimiter=";", fmt="%.1f")
+    text = (folder / "comma.csv").read_text().replace(".", ",")
+    (folder / "comma.csv").write_text(text)
+    (folder / "table.csv").write_text("file,begin,end,material\noak/0,0,2,oak\nfelt/0,1,3,felt\n")
+    return folder
+
+
+BIOTAC = ("--preset", "biotac", "--columns", "25:44")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("observe", "new", "oak", "touch.npy"), "say which sensor it is for: --sensor or --preset"),
+        (("learn", "new", "rec"), "say which sensor it is for: --sensor or --preset"),
+        (("learn", "new", "rec", *BIOTAC, "--label-by", "file", "--label", "a"), "one of --label, --label-by and"),
+        (("learn", "new", "rec", *BIOTAC, "--cut", "intervals"), "--cut intervals takes --labels, a table"),
+        (("learn", "new", "rec", *BIOTAC, "--labels", "t.csv", "--label-topic", "x"), "give --labels or --label-topic"),
+        (("fleet", "new", "rec", "--label-by", "folder"), "a new memory takes a sensor, --sensor:"),
+        (("predict", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
+        (("live", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
+        (("inspect", "new"), "scroll-tactile observe or learn makes one"),
+        (
+            ("observe", "new", "oak", "touch.npy", "--topic", "/x", "--sensor", "biotac"),
+            "came --topic /x: give",
+        ),
+        (("observe", "new", "oak", "rec/oak/0.npy", "--sensor", "biotac"), "taken by --columns 0:19"),
+    ],
+    ids=lambda each: each[0] if isinstance(each, tuple) else "",
+)
+def test_an_error_names_this_commands_options(folder, monkeypatch, words, said):
+    monkeypatch.chdir(folder)
+    assert said in refused(*words)
+    assert not (folder / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "taken by --columns 0:19"),
+        (("--columns", "25:44"), "give --label for all, --label-by folder, --label-by file or --labels"),
+        (("--columns", "25:50"), "columns 25:50 are not there: expected places from 0 to 43"),
+        (("--columns", "25:44", "--label-by", "folder", "--cut", "contact"), "For a file of one touch take --cut none"),
+        (("--columns", "25:44", "--label-by", "folder", "--cut", "episodes"), "cut it by --labels, or not"),
+    ],
+)
+def test_so_does_what_is_refused(folder, monkeypatch, options, said):
+    monkeypatch.chdir(folder)
+    result = run("learn", "new", "rec", "--preset", "biotac", *options)
+    assert result.exit_code == 1 and said in result.stderr and result.stderr.count("refused:") == 2
+    assert not (folder / "new").exists()
+
+
+def test_readmes_line_learns_wide_arrays_with_columns(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder)
+    learned = run("learn", tmp_path / "m", "rec", *BIOTAC, "--label-by", "folder", "--json")
+    assert json.loads(learned.stdout)["learned"] == {"felt": 1, "oak": 1}
+    again = run("learn", tmp_path / "m", "rec/oak/0.npy", *BIOTAC, "--label", "oak", "--json")
+    assert json.loads(again.stdout)["skipped"] == 1
+    assert "oak" in run("predict", tmp_path / "m", "rec/oak/0.npy", "--columns", "25:44").stdout
+    assert run("live", tmp_path / "m", "rec/oak/0.npy", "--columns", "25:44", "--touch").exit_code == 0
+
+
+def test_a_table_cuts_what_has_no_clock_at_the_sensors_rate(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder)
+    learned = run("learn", tmp_path / "m", "rec", *BIOTAC, "--labels", "table.csv")
+    assert learned.exit_code == 0, learned.output
+    listed = [json.loads(line) for line in run("memory", "list", tmp_path / "m", "--json").stdout.splitlines()]
+    assert [each["source"] for each in listed] == ["rec/felt/0.npy[100:300] 25:44", "rec/oak/0.npy[0:200] 25:44"]
+
+
+def test_what_no_option_can_do_is_said_to_be_pythons(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    result = run("learn", "new", "comma.csv", "--sensor", "biotac", "--label", "oak")
+    assert "pass decimal=',' (decimal=: from Python alone)" in result.stderr
+
+
+def test_a_line_of_python_becomes_options_to_copy():
+    typed(_parameters("learn"))
+    line = "read('a b.mcap', topic='/rh/tactile', field='tactiles[0].electrodes')"
+    assert in_options(f"x has:\n{line}") == "x has:\nsuch as --topic /rh/tactile --field 'tactiles[0].electrodes'"
+    assert in_options("by='folder', and s3://a/topic=x/field='y'") == "--label-by folder, and s3://a/topic=x/field='y'"
+    typed(_parameters("inspect"))
+    assert in_options(line) == f"{line} (topic=, field=: from Python alone)"
+    assert in_options("read(__import__('os').getcwd(), topic=1)").startswith("read(__import__")
+
+
+def _parameters(name):
+    from typer.main import get_command
+
+    return get_command(app).commands[name].params

@@ -181,9 +181,9 @@ class Ledger:
         attributes: dict[str, Any] = {"columns": columns}
         attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
         arrays = packed if self._bare else packed | pack_codes(codes)
-        sequence = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays).sequence
-        memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None, stream.readings)
-        return sequence
+        head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
+        memory.replay(Record(**vars(head), arrays=arrays), self.store, codes)
+        return head.sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
         """As `TactileLearner.describe`, of what was checked."""

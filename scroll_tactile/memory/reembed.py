@@ -89,22 +89,19 @@ class Reembedding:
             progress("embedding", draft.last, self._source.last)
 
     def _carry(self, record: Record) -> None:
-        memory, attributes, arrays = self._memory, dict(record.attributes), dict(record.arrays)
-        codes: Codes = {}
+        attributes, arrays = dict(record.attributes), dict(record.arrays)
+        codes: Codes | None = None
         if record.kind == OBSERVE:
             readings = unpack_readings(record.arrays)
             assert readings is not None
             columns, codes = self._encode(readings)
             attributes |= {"columns": columns, "nbytes": readings.nbytes}
             arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
-        sequence = self._draft.append(
+        head = self._draft.append(
             record.kind, record.label, record.key, attributes=attributes, arrays=arrays, time=record.time
-        ).sequence
-        assert sequence == record.sequence
-        if record.kind == OBSERVE:
-            memory.add(record.label, record.key, columns, codes, sequence, sequence)
-        else:
-            memory.replay(self._draft.record(sequence), self._draft)
+        )
+        assert head.sequence == record.sequence
+        self._memory.replay(Record(**vars(head), arrays=arrays), self._draft, codes)
 
     def _snapshot(self) -> None:
         arrays, attributes = self._memory.to_arrays()

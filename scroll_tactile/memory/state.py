@@ -109,13 +109,13 @@ class Memory:
         columns: int,
         codes: Codes,
         sequence: int,
-        source: Source | None = None,
-        readings: Readings | None = None,
+        source: Source | None,
+        readings: Readings | None,
     ) -> None:
-        """Add an observation: a touch of so many columns, its rows of codes by scale, and the row that it is.
+        """Add an observation without a journal: a touch of so many columns, its rows of codes by scale, and its number.
 
-        source: of its readings, for the exemplars; None where they are not kept. Raises CapacityError before anything
-        is added.
+        source: of its readings, for the exemplars. readings: for the kept touches. None: they are not kept. What a
+        journal has is added by `replay`. Raises CapacityError before anything is added.
         """
         self.statistics.add(material, codes, columns)
         if self.sample.wants(material, key):
@@ -140,14 +140,17 @@ class Memory:
 
         return undo
 
-    def replay(self, record: Record, store: Store) -> list[Added] | None:
+    def replay(self, record: Record, store: Store, codes: Codes | None = None) -> list[Added] | None:
         """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
 
-        Call `refill` after the last row. Raises MismatchError for a row of a kind that this version does not know.
+        Every row becomes a part of the memory here, whether it was just written, read again or embedded anew.
+        codes: of an observation, where they are known; None to make them. Call `refill` after the last row. Raises
+        MismatchError for a row of a kind that this version does not know, CapacityError before anything is added.
         """
         changed: list[Added] | None = []
         if record.kind == OBSERVE:
-            columns, codes = self.codes(record)
+            columns = cast(int, record.attributes["columns"])
+            codes = self.codes(record)[1] if codes is None else codes
             source = record.sequence if only_readings(record.arrays) else None
             self.add(record.label, record.key, columns, codes, record.sequence, source, self._to_keep(record))
             changed = [(record.label, codes, 1)]

@@ -11,14 +11,13 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import MismatchError, UnknownMaterialError
+from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import (
     DESCRIBE,
-    KINDS,
     MEMBER,
     MERGE,
     OBSERVE,
@@ -145,7 +144,7 @@ class Memory:
 
         Every row becomes a part of the memory here, whether it was just written, read again or embedded anew.
         codes: of an observation, where they are known; None to make them. Call `refill` after the last row. Raises
-        MismatchError for a row of a kind that this version does not know, CapacityError before anything is added.
+        CapacityError before anything is added.
         """
         changed: list[Added] | None = []
         if record.kind == OBSERVE:
@@ -168,11 +167,8 @@ class Memory:
         elif record.kind == MERGE:
             self._join(record)
             changed = None
-        elif record.kind not in (MEMBER, DESCRIBE):
-            raise MismatchError(
-                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
-                f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
-            )
+        else:
+            assert record.kind in (MEMBER, DESCRIBE), "the gate lets no other row through"
         apply_description(self.descriptions, record)
         self.sequence = record.sequence
         return changed

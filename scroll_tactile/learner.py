@@ -43,6 +43,7 @@ from scroll_tactile.settings import Settings, candidates_of, names_of, require_n
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from store.files import is_there
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
@@ -144,7 +145,7 @@ class TactileLearner:
         require_arguments({"path": path, "mode": mode}, made_with)
         chosen = Settings(**settings)
         finish_interrupted(Path(path))
-        if sensor is None and not Path(path).exists():
+        if sensor is None and not is_there(Path(path)):
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
         store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.recall, mode)
         try:

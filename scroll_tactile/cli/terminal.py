@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
-from scroll_tactile.errors import InputError, ScrollTactileError, printable
+from scroll_tactile.errors import InputError, ScrollTactileError, plain_cell, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
 
@@ -66,7 +66,8 @@ def say_json(found: Mapping[str, Any]) -> None:
 def say_csv(*cells: object) -> None:
     """Print a line of CSV; what is None has an empty cell."""
     line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(["" if cell is None else cell for cell in cells])
+    told = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
+    csv.writer(line, lineterminator="").writerow(told)
     typer.echo(line.getvalue())
 
 

@@ -45,6 +45,7 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
 from store import CompactedError, ReadOnlyError, Record, Store, StoreClosedError, StoreError
+from store.files import is_there
 
 __all__ = ["Ledger"]
 
@@ -423,4 +424,5 @@ def _opened(other: str | os.PathLike[str] | Joint) -> AbstractContextManager[Mem
     """A memory to be merged: in a folder, in a file, or partials that are open already."""
     if isinstance(other, Joint):
         return nullcontext(other)
-    return Partial(Path(other)) if Path(other).is_file() else MemoryStore.open(other, mode="read")
+    path = Path(other)
+    return Partial(path) if is_there(path) and path.is_file() else MemoryStore.open(path, mode="read")

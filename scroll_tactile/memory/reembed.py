@@ -32,7 +32,7 @@ from scroll_tactile.memory.rows import (
 from scroll_tactile.memory.state import Memory
 from store import Record, Store, StoreError
 from store.exceptions import reported
-from store.files import sync_folder
+from store.files import is_there, sync_folder
 from store.lock import WriterLock
 
 __all__ = ["Reembedding", "finish_interrupted"]
@@ -63,7 +63,7 @@ class Reembedding:
         _require_readings(source)
         self._source, self._encode, self._bare = source, encode, bare
         folder = _named(source.path, "reembedding")
-        if (whole := _named(source.path, "reembedded")).exists():  # as far as it goes: rows may have come since
+        if is_there(whole := _named(source.path, "reembedded")):  # as far as it goes: rows may have come since
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())
@@ -143,7 +143,7 @@ class Reembedding:
 def finish_interrupted(path: Path) -> None:
     """Put the memory embedded anew in place, where the exchange was cut short just before that."""
     folder, whole = path.resolve(), _named(path, "reembedded")
-    if not folder.exists() and whole.exists():
+    if not is_there(folder) and is_there(whole):
         with reported(folder, "putting a memory embedded anew in place"):
             whole.rename(folder)
             sync_folder(folder.parent)

@@ -415,7 +415,8 @@ class TactileLearner:
         The memory is whole and can be used until the new one takes its place; returns the folder in which it lies from
         then on, to be removed once nobody needs it. A call that was cut short is resumed by the next. Observations
         keep their receipts, retractions and descriptions stay; an f* is gone. Other calls that wait meanwhile raise
-        StoreClosedError. `reembed_memory` does this with a memory that does not open.
+        StoreClosedError. `reembed_memory` does this with a memory that does not open. A memory that a version up to 0.6
+        embedded again has lost its kept touches: embedding it again brings them back.
 
         Raises MismatchError where readings are missing, as in a compacted memory; InputError in a memory without a
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.

@@ -2,7 +2,8 @@
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
 gate takes every row and generation for what it must be (see `row_checks`, `generation_checks`), and raises DamageError
-with its place for anything else. What it lets through may be false, as a touch under another name is, and it fits.
+with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
+under another name is, and it fits.
 """
 
 from __future__ import annotations

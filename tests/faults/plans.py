@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 from touches import stream
@@ -49,26 +50,27 @@ def prepare(home: Path) -> dict[str, Other]:
 
 def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) -> Operation:
     """A random operation of a kind; now and then one that is refused."""
-    if kind == "observe":
-        return kind, rng.choice(MATERIALS), touch(rng)
-    if kind == "batch":
-        return kind, _together(rng, state, others)
-    if kind == "describe":
-        return kind, rng.choice(MATERIALS), rng.choice(SAID)
-    if kind in ("retract", "forget", "relabel"):
-        name = (rng.choice(MATERIALS),) if kind == "relabel" else ()
-        return kind, _to_retract(rng, state, kind), *name
-    if kind == "merge":
-        name = rng.choice([*sorted(others), *dict(state.packed)])
-        shared = rng.choice(("twice", "once")) if name in others or len(state.observed) <= MOST_TWICE else "once"
-        return kind, name, shared, rng.choice(("same", "ours", "theirs"))
-    if kind == "pack":
-        return kind, f"packed-{len(state.packed)}", rng.random() < 0.7
-    if kind == "reembed":
-        return kind, rng.choice(sorted(EMBEDDINGS))
-    if kind == "fleet":
-        return kind, _of_one_name(rng, state)
-    return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)
+    drawn: dict[str, Callable[[], Operation]] = {
+        "observe": lambda: (rng.choice(MATERIALS), touch(rng)),
+        "batch": lambda: (_together(rng, state, others),),
+        "describe": lambda: (rng.choice(MATERIALS), rng.choice(SAID)),
+        "retract": lambda: (_to_retract(rng, state, kind),),
+        "forget": lambda: (_to_retract(rng, state, kind),),
+        "relabel": lambda: (_to_retract(rng, state, kind), rng.choice(MATERIALS)),
+        "merge": lambda: _to_merge(rng, state, others),
+        "compact": lambda: (rng.choice((0, 1, 2, 4)),),
+        "pack": lambda: (f"packed-{len(state.packed)}", rng.random() < 0.7),
+        "reembed": lambda: (rng.choice(sorted(EMBEDDINGS)),),
+        "fleet": lambda: (_of_one_name(rng, state),),
+    }
+    return kind, *drawn.get(kind, tuple)()
+
+
+def _to_merge(rng: random.Random, state: State, others: dict[str, Other]) -> Operation:
+    """One of the others, or what this memory was packed as."""
+    name = rng.choice([*sorted(others), *dict(state.packed)])
+    shared = rng.choice(("twice", "once")) if name in others or len(state.observed) <= MOST_TWICE else "once"
+    return name, shared, rng.choice(("same", "ours", "theirs"))
 
 
 def _to_retract(rng: random.Random, state: State, kind: str) -> int | str:

@@ -33,6 +33,11 @@
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
 """
 
+import re
+
+# The wide forms count as well where Chinese or Japanese is written.
+COMPUTED = re.compile(r"(^|;)(?=\s*'*[=+\-@\t\r＝＋－＠])")
+
 
 def printable(text: str, keep: str = "") -> str:
     """Text with what does not print as Python's escapes: control characters, line ends, marks of direction, surrogates.
@@ -45,6 +50,14 @@ def printable(text: str, keep: str = "") -> str:
         character if character.isprintable() or character in keep else character.encode("unicode_escape").decode()
         for character in text
     )
+
+
+def plain_cell(text: str) -> str:
+    """Text as a cell that no spreadsheet computes: an apostrophe before = + - @ where a cell may begin with it.
+
+    It may behind a semicolon, too: there many countries' spreadsheets cut. One apostrophe less is the text again.
+    """
+    return COMPUTED.sub(r"\1'", text)
 
 
 class ScrollTactileError(Exception):

@@ -45,6 +45,7 @@ from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from store.files import is_there
 
 if TYPE_CHECKING:
     from scroll_tactile.finetune.network import TunedReader
@@ -147,7 +148,7 @@ class TactileLearner:
         require_arguments({"path": path, "mode": mode}, made_with)
         chosen = Settings(**settings)
         finish_interrupted(Path(path))
-        if sensor is None and not Path(path).exists():
+        if sensor is None and not is_there(Path(path)):
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
         store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.recall, mode)
         try:
@@ -433,7 +434,8 @@ class TactileLearner:
         The memory is whole and can be used until the new one takes its place; returns the folder in which it lies from
         then on, to be removed once nobody needs it. A call that was cut short is resumed by the next. Observations
         keep their receipts, retractions and descriptions stay; an f* is gone. Other calls that wait meanwhile raise
-        StoreClosedError. `reembed_memory` does this with a memory that does not open.
+        StoreClosedError. `reembed_memory` does this with a memory that does not open. A memory that a version up to 0.6
+        embedded again has lost its kept touches: embedding it again brings them back.
 
         Raises MismatchError where readings are missing, as in a compacted memory; InputError in a memory without a
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.

@@ -24,6 +24,7 @@ __all__ = [
     "copy_regular",
     "file_size",
     "is_real_folder",
+    "is_there",
     "read_regular",
     "remove_tree",
     "require_room",
@@ -93,6 +94,14 @@ def remove_tree(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+
+
+def is_there(path: Path) -> bool:
+    """Return whether anything is there; not where nothing can be, as under a name that is too long."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def is_real_folder(path: Path) -> bool:

@@ -6,7 +6,7 @@ import logging
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -214,10 +214,13 @@ class Journal:
                 raise self.given_up(head.sequence)
             raise self._damage(f"the arrays of row {head.sequence} are missing from", head.sequence)
         # A flipped bit can also change a value's type.
-        with suppress(TypeError, ValueError):
-            if isinstance(payload, bytes) and payload_digest(payload) == digest:
-                return Record(**vars(head), arrays=decode_payload(payload))
-        raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)
+        if not isinstance(payload, bytes) or payload_digest(payload) != digest:
+            raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)
+        try:
+            return Record(**vars(head), arrays=decode_payload(payload))
+        except (TypeError, ValueError) as error:  # anybody can make the checksum
+            what = f"the arrays of row {head.sequence} were never written so ({error}) in"
+            raise self._damage(what, head.sequence) from error
 
     def given_up(self, sequence: int) -> CompactedError:
         """Return the error for a row whose arrays a base stands for."""

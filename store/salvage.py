@@ -35,6 +35,7 @@ class Fault(enum.Enum):
     UNREADABLE = ("cannot be read", "cannot be read")
     NO_ARRAYS = ("has lost its arrays", "have lost their arrays")
     DAMAGED_ARRAYS = ("has arrays that fail their checksum", "have arrays that fail their checksums")
+    FOREIGN_ARRAYS = ("has arrays that were never written so", "have arrays that were never written so")
     UNREADABLE_ARRAYS = ("has arrays that cannot be read", "have arrays that cannot be read")
 
     @property

@@ -176,7 +176,9 @@ class Survey:
         payload, readable = self.salvage.payload(row[0])
         if payload is None:
             return Fault.NO_ARRAYS if readable else Fault.UNREADABLE_ARRAYS
-        return None if payload_digest(payload) == head[1] and _is_readable(payload) else Fault.DAMAGED_ARRAYS
+        if payload_digest(payload) != head[1]:
+            return Fault.DAMAGED_ARRAYS
+        return None if _is_readable(payload) else Fault.FOREIGN_ARRAYS
 
     def _note(self, first: int, last: int, fault: Fault) -> None:
         if self.faults and self.faults[-1][1] == first - 1 and self.faults[-1][2] is fault:

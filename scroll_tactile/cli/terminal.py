@@ -21,7 +21,7 @@ from typer.core import TyperGroup
 
 from scroll_tactile.cli import INTERRUPTED
 from scroll_tactile.cli.wording import has_option, in_options, typed
-from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, printable
+from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
 from scroll_tactile.results import Prediction
 from store import NotAStoreError, Store, StoreError
 
@@ -68,7 +68,8 @@ def say_json(found: Mapping[str, Any]) -> None:
 def say_csv(*cells: object) -> None:
     """Print a line of CSV; what is None has an empty cell."""
     line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(["" if cell is None else cell for cell in cells])
+    told = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
+    csv.writer(line, lineterminator="").writerow(told)
     typer.echo(line.getvalue())
 
 

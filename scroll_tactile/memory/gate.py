@@ -2,7 +2,8 @@
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
 gate takes every row and generation for what it must be (see `row_checks`, `generation_checks`), and raises DamageError
-with its place for anything else. What it lets through may be false, as a touch under another name is, and it fits.
+with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
+under another name is, and it fits.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Literal, cast
@@ -21,13 +23,13 @@ from scroll_tactile.memory.expected import Unexpected
 from scroll_tactile.memory.generation_checks import GenerationChecks
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
 from scroll_tactile.memory.row_checks import RowChecks
-from scroll_tactile.memory.rows import KINDS, MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import WindowPlan
 from store import DamageError, Generation, Head, NotAStoreError, Record, Store
 
-__all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted"]
+__all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
 
 JOURNAL = ("journal.sqlite", "journal.sqlite-wal")
 SMALLEST_ROW = 32  # bytes of the journal: two digests
@@ -49,33 +51,38 @@ class Gate:
         self._generations = GenerationChecks(*made_with)
 
     def head(self, head: Head) -> Head:
-        """This row, which is what its kind must be but for its arrays. Raises DamageError."""
-        try:
+        """This row, which is what its kind must be but for its arrays. Raises as `record`."""
+        with self._refusing(f"row {head.sequence}", head.sequence):
             self._rows.check_head(head, self._most_rows)
-        except WRONG as error:
-            raise self._damage(f"row {head.sequence}", error, head.sequence) from error
         return head
 
     def record(self, record: Record) -> Record:
         """This row with its arrays. Raises DamageError; MismatchError for what this version does not know."""
         self.head(record)
-        try:
+        with self._refusing(f"row {record.sequence}", record.sequence):
             if record.kind == OBSERVE:
                 self._rows.check_observed(record)
             elif record.kind == MERGE:
                 self._generations.check(record.arrays, record.attributes, None, thorough=self._thorough)
-        except WRONG as error:
-            raise self._damage(f"row {record.sequence}", error, record.sequence) from error
         return record
 
     def generation(self, generation: Generation) -> Generation:
         """This generation. Raises DamageError."""
-        try:
+        with self._refusing(f"generation {generation.number}"):
             arrays, attributes, upto = generation.arrays, generation.attributes, generation.upto
             self._generations.check(arrays, attributes, upto, thorough=self._thorough)
-        except WRONG as error:
-            raise self._damage(f"generation {generation.number}", error) from error
         return generation
+
+    @contextmanager
+    def _refusing(self, what: str, sequence: int | None = None) -> Iterator[None]:
+        """Name the place of what a check refuses."""
+        try:
+            yield
+        except MismatchError as error:
+            advice = "Open the memory with the version that wrote it, or a newer one"
+            raise MismatchError(f"{what} of {self._path} {error}. {advice}") from None
+        except WRONG as error:
+            raise self._damage(what, error, sequence) from error
 
     def _damage(self, what: str, error: Exception, sequence: int | None = None) -> DamageError:
         """The error for what is Unexpected and, as a last net, for what a check itself did not expect."""
@@ -195,7 +202,9 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         except (DamageError, EmbeddingError, MismatchError) as error:
             return [str(error)]
         heads, wrong = _in_rows(store)
-        return [*_in_generations(store, heads), *wrong]
+        passed = [head for head in heads if head.sequence not in wrong]
+        retractions = map(str, wrong_retractions(store.path, passed))
+        return [*_in_generations(store, heads), *wrong.values(), *retractions]
 
 
 def _in_generations(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
@@ -207,40 +216,33 @@ def _in_generations(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
             yield str(damage)
 
 
-def _in_rows(store: MemoryStore) -> tuple[list[Head], list[str]]:
-    """The heads of the rows that verify, and what is wrong with them."""
+def _in_rows(store: MemoryStore) -> tuple[list[Head], dict[int, str]]:
+    """The heads of the rows that verify, and by their sequence what is wrong with them."""
     heads: list[Head] = []
-    wrong: list[str] = []
-    kinds: dict[int, str] = {}
+    wrong: dict[int, str] = {}
     for row in _rows(store):
-        heads.append(Head(**{field.name: getattr(row, field.name) for field in fields(Head)}))  # without arrays
         try:
             store.gate.record(row) if isinstance(row, Record) else store.gate.head(row)
-            require_observed(store.path, row, kinds)
         except (DamageError, MismatchError) as error:
-            wrong.append(str(error))
-        kinds[row.sequence] = row.kind
+            wrong[row.sequence] = str(error)
+        heads.append(Head(**{field.name: getattr(row, field.name) for field in fields(Head)}))  # without arrays
     return heads, wrong
 
 
-def require_observed(path: Path, row: Head, kinds: dict[int, str]) -> None:
-    """Raise DamageError where a row retracts what is no observation, or was retracted before; MismatchError for a kind
-    that this version does not know.
-
-    kinds: of the rows before it, those retracted among them.
-    """
-    if row.kind not in KINDS:
-        raise MismatchError(f"row {row.sequence} of {path} is of kind {row.kind!r}, which this version does not know")
-    if row.kind != RETRACT:
-        return
-    gone = unspanned(row.attributes["sequences"])
-    if strange := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
-        raise DamageError(
-            f"row {row.sequence} of {path} retracts {strange[:5]}, which are no observations, or retracted before",
-            path=path,
-            sequence=row.sequence,
-        )
-    kinds.update((sequence, RETRACT) for sequence in gone)
+def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError]:
+    """What is wrong with the rows, in order, that retract what is no observation, or was retracted before."""
+    kinds = {head.sequence: head.kind for head in heads}
+    for head in heads:
+        if head.kind != RETRACT:
+            continue
+        gone = unspanned(head.attributes["sequences"])
+        if strange := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
+            yield DamageError(
+                f"row {head.sequence} of {path} retracts {strange[:5]}, which are no observations, or retracted before",
+                path=path,
+                sequence=head.sequence,
+            )
+        kinds.update((sequence, RETRACT) for sequence in gone)
 
 
 def _rows(store: MemoryStore) -> Iterator[Head]:

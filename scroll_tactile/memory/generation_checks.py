@@ -21,7 +21,7 @@ from scroll_tactile.memory.expected import (
 from scroll_tactile.memory.row_checks import check_description, check_readings
 from scroll_tactile.memory.rows import Arrays
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.stream import fewest_readings
+from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import VIEWS, Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, one_thread, within_scatter
@@ -179,6 +179,9 @@ class GenerationChecks:
         readings = array(arrays, "exemplar-readings", ("float32",), shape)
         if count:
             check_readings("exemplar-readings", readings, self._sensor)
+            streams = (Stream(self._sensor, own) for own in np.split(readings, np.cumsum(lengths)[:-1]))
+            same = [stream.key for stream in streams] == [key.tobytes() for key in arrays["exemplar-keys"]]
+            expect(same, "exemplar-keys", "the content hashes of their readings", "others")
 
     def _check_tuned(self, arrays: Arrays, about: Any) -> None:
         """An f*: whether a network takes its tensors is known when one is made."""

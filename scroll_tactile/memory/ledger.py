@@ -45,6 +45,7 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
 from store import CompactedError, ReadOnlyError, Record, Store, StoreClosedError, StoreError
+from store.files import is_there
 
 __all__ = ["Ledger"]
 
@@ -181,9 +182,9 @@ class Ledger:
         attributes: dict[str, Any] = {"columns": columns}
         attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
         arrays = packed if self._bare else packed | pack_codes(codes)
-        sequence = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays).sequence
-        memory.add(material, stream.key, columns, codes, sequence, sequence if kept else None, stream.readings)
-        return sequence
+        head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
+        memory.replay(Record(**vars(head), arrays=arrays), self.store, codes)
+        return head.sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
         """As `TactileLearner.describe`, of what was checked."""
@@ -423,4 +424,5 @@ def _opened(other: str | os.PathLike[str] | Joint) -> AbstractContextManager[Mem
     """A memory to be merged: in a folder, in a file, or partials that are open already."""
     if isinstance(other, Joint):
         return nullcontext(other)
-    return Partial(Path(other)) if Path(other).is_file() else MemoryStore.open(other, mode="read")
+    path = Path(other)
+    return Partial(path) if is_there(path) and path.is_file() else MemoryStore.open(path, mode="read")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.gate import require_counted
+from scroll_tactile.memory.gate import require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.partial import Joint, Partial, sums_without
 from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, SOURCE, unspanned
@@ -166,14 +166,15 @@ class Incoming:
 
         once: leave out streams that both observed, of one material with one content hash. Raises MismatchError where
         theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
-        shared stream cannot be left out, DamageError.
+        shared stream cannot be left out, DamageError for what opening theirs refuses, and for a shared stream that is
+        not what its key says, here or there.
         """
         _require_mergeable(ours, memory, theirs)
         base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
         incoming = standing(heads)
-        known = {(head.label, head.key) for head in standing(ours.heads()) if head.kind != MERGE}
+        known = {(head.label, head.key): head for head in standing(ours.heads()) if head.kind != MERGE}
         both = [head for head in incoming if head.kind != MERGE and (head.label, head.key) in known]
         fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
         if once and fixed:
@@ -190,6 +191,11 @@ class Incoming:
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
         described = _descriptions(ours, memory, theirs, found, descriptions)
+        _require_sound(theirs, heads, coming={head.sequence for head in rows})
+        if once:
+            for head in (known[head.label, head.key] for head in both):
+                if head.kind == OBSERVE and head.sequence > ours.compacted:
+                    ours.record(head.sequence)
         return cls(theirs, found, rows, len(both), both if once else [], described)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
@@ -301,6 +307,17 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Journal) -> None:
             f"{theirs.path} was compacted and keeps {other.recall or 0} touches for recall; {ours.path} keeps "
             f"{memory.kept.capacity}, and the readings for the others are gone"
         )
+
+
+def _require_sound(theirs: Journal, heads: Sequence[Head], coming: Set[int]) -> None:
+    """Raise DamageError where what does not come in would not pass the gate when theirs is opened."""
+    for wrong in wrong_retractions(theirs.path, heads):
+        raise wrong
+    if isinstance(theirs, Store):
+        theirs.latest()
+    for head in heads:
+        if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
+            theirs.record(head.sequence)
 
 
 def _without_configuration(part: Any) -> Any:

@@ -32,7 +32,7 @@ from scroll_tactile.memory.rows import (
 from scroll_tactile.memory.state import Memory
 from store import Record, Store, StoreError
 from store.exceptions import reported
-from store.files import sync_folder
+from store.files import is_there, sync_folder
 from store.lock import WriterLock
 
 __all__ = ["Reembedding", "finish_interrupted"]
@@ -63,7 +63,7 @@ class Reembedding:
         _require_readings(source)
         self._source, self._encode, self._bare = source, encode, bare
         folder = _named(source.path, "reembedding")
-        if (whole := _named(source.path, "reembedded")).exists():  # as far as it goes: rows may have come since
+        if is_there(whole := _named(source.path, "reembedded")):  # as far as it goes: rows may have come since
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())
@@ -89,22 +89,19 @@ class Reembedding:
             progress("embedding", draft.last, self._source.last)
 
     def _carry(self, record: Record) -> None:
-        memory, attributes, arrays = self._memory, dict(record.attributes), dict(record.arrays)
-        codes: Codes = {}
+        attributes, arrays = dict(record.attributes), dict(record.arrays)
+        codes: Codes | None = None
         if record.kind == OBSERVE:
             readings = unpack_readings(record.arrays)
             assert readings is not None
             columns, codes = self._encode(readings)
             attributes |= {"columns": columns, "nbytes": readings.nbytes}
             arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
-        sequence = self._draft.append(
+        head = self._draft.append(
             record.kind, record.label, record.key, attributes=attributes, arrays=arrays, time=record.time
-        ).sequence
-        assert sequence == record.sequence
-        if record.kind == OBSERVE:
-            memory.add(record.label, record.key, columns, codes, sequence, sequence)
-        else:
-            memory.replay(self._draft.record(sequence), self._draft)
+        )
+        assert head.sequence == record.sequence
+        self._memory.replay(Record(**vars(head), arrays=arrays), self._draft, codes)
 
     def _snapshot(self) -> None:
         arrays, attributes = self._memory.to_arrays()
@@ -146,7 +143,7 @@ class Reembedding:
 def finish_interrupted(path: Path) -> None:
     """Put the memory embedded anew in place, where the exchange was cut short just before that."""
     folder, whole = path.resolve(), _named(path, "reembedded")
-    if not folder.exists() and whole.exists():
+    if not is_there(folder) and is_there(whole):
         with reported(folder, "putting a memory embedded anew in place"):
             whole.rename(folder)
             sync_folder(folder.parent)

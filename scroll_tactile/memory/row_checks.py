@@ -25,6 +25,7 @@ from scroll_tactile.memory.expected import (
 )
 from scroll_tactile.memory.rows import (
     DESCRIBE,
+    KINDS,
     LARGEST,
     MEMBER,
     MOST_BYTES,
@@ -40,7 +41,7 @@ from scroll_tactile.memory.rows import (
     unpack_readings,
 )
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.stream import fewest_readings
+from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import EARLIER, MOST_WINDOWS, WindowPlan
 from store import Head, Record
 
@@ -57,7 +58,7 @@ class RowChecks:
 
     copies: of each touch, whose rows lie behind its own; None where nobody knows how many.
 
-    Each raises Unexpected; MismatchError for arrays that this version does not know.
+    Each raises Unexpected; MismatchError for kinds and arrays that this version does not know.
     """
 
     def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, copies: int | None) -> None:
@@ -66,6 +67,8 @@ class RowChecks:
 
     def check_head(self, head: Head, most_rows: Callable[[], int]) -> None:
         """Check a row without its arrays; most_rows: gives how many the journal can hold."""
+        if head.kind not in KINDS:
+            raise MismatchError(f"is of kind {head.kind!r}, which this version does not know")
         expect(isinstance(head.time, float), "time", "a number", head.time)
         if head.kind in (OBSERVE, MEMBER):
             name("label", head.label)
@@ -98,16 +101,17 @@ class RowChecks:
         """Check the arrays of an observation, whose head was checked."""
         arrays, columns = record.arrays, cast(int, record.attributes["columns"])
         if unknown := [own for own in arrays if not _is_known(own)]:
-            raise MismatchError(
-                f"row {record.sequence} has arrays {unknown[:5]}, which this version does not know: open the memory "
-                "with the version that wrote it, or a newer one"
-            )
+            raise MismatchError(f"has arrays {unknown[:5]}, which this version does not know")
         packed = only_readings(arrays)
         size = cast("int | None", record.attributes.get("nbytes"))
         expect((size is None) == (not packed), "nbytes", "the size of the row's readings", size)
-        if size is not None:
-            check_readings("readings", _unpacked(packed, size, self._sensor), self._sensor)
+        readings = None if size is None else _unpacked(packed, size, self._sensor)
+        if readings is not None:
+            check_readings("readings", readings, self._sensor)
         self._check_codes(arrays, columns)
+        if readings is not None:
+            same = Stream(self._sensor, readings).key == record.key
+            expect(same, "key", "the content hash of its readings", record.key)
 
     def _check_codes(self, arrays: Arrays, columns: int) -> None:
         found: dict[str, dict[int, int]] = {"stages": {}, "codes": {}}

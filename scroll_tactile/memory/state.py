@@ -11,14 +11,13 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import MismatchError, UnknownMaterialError
+from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import (
     DESCRIBE,
-    KINDS,
     MEMBER,
     MERGE,
     OBSERVE,
@@ -109,13 +108,13 @@ class Memory:
         columns: int,
         codes: Codes,
         sequence: int,
-        source: Source | None = None,
-        readings: Readings | None = None,
+        source: Source | None,
+        readings: Readings | None,
     ) -> None:
-        """Add an observation: a touch of so many columns, its rows of codes by scale, and the row that it is.
+        """Add an observation without a journal: a touch of so many columns, its rows of codes by scale, and its number.
 
-        source: of its readings, for the exemplars; None where they are not kept. Raises CapacityError before anything
-        is added.
+        source: of its readings, for the exemplars. readings: for the kept touches. None: they are not kept. What a
+        journal has is added by `replay`. Raises CapacityError before anything is added.
         """
         self.statistics.add(material, codes, columns)
         if self.sample.wants(material, key):
@@ -140,14 +139,17 @@ class Memory:
 
         return undo
 
-    def replay(self, record: Record, store: Store) -> list[Added] | None:
+    def replay(self, record: Record, store: Store, codes: Codes | None = None) -> list[Added] | None:
         """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
 
-        Call `refill` after the last row. Raises MismatchError for a row of a kind that this version does not know.
+        Every row becomes a part of the memory here, whether it was just written, read again or embedded anew.
+        codes: of an observation, where they are known; None to make them. Call `refill` after the last row. Raises
+        CapacityError before anything is added.
         """
         changed: list[Added] | None = []
         if record.kind == OBSERVE:
-            columns, codes = self.codes(record)
+            columns = cast(int, record.attributes["columns"])
+            codes = self.codes(record)[1] if codes is None else codes
             source = record.sequence if only_readings(record.arrays) else None
             self.add(record.label, record.key, columns, codes, record.sequence, source, self._to_keep(record))
             changed = [(record.label, codes, 1)]
@@ -165,11 +167,8 @@ class Memory:
         elif record.kind == MERGE:
             self._join(record)
             changed = None
-        elif record.kind not in (MEMBER, DESCRIBE):
-            raise MismatchError(
-                f"row {record.sequence} of the journal is of kind {record.kind!r}; this version knows only "
-                f"{KINDS}. Open the memory with the version that wrote it, or a newer one"
-            )
+        else:
+            assert record.kind in (MEMBER, DESCRIBE), "the gate lets no other row through"
         apply_description(self.descriptions, record)
         self.sequence = record.sequence
         return changed

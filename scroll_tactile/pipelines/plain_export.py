@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import InputError, plain_cell
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.results import Observation
@@ -43,6 +43,8 @@ def export_plain(
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
     - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given. Only
       where anything was described.
+    - In the tables a name or source that a spreadsheet would compute, for it begins with = + - @, has an apostrophe in
+      front, also behind a semicolon within (see `errors.plain_cell`).
     - `memory.json`: format 2, sensor, embedding, digest, date, and the number of touches. It is written last.
 
     The classifier of a scale follows with NumPy alone. With means m_y = sums / counts, N rows and n touches,
@@ -112,12 +114,12 @@ def _one_state(learner: TactileLearner) -> tuple[TactileLearner, list[Observatio
             return held, journal
 
 
-def date_of(seconds: float) -> str:
+def date_of(seconds: float) -> str | float:
     """A moment in seconds since 1970 as ISO 8601, UTC; the number where no calendar has it."""
     try:
         return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
     except (OSError, OverflowError, ValueError):
-        return repr(seconds)
+        return seconds
 
 
 def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:
@@ -153,4 +155,4 @@ def _rows(path: Path, header: list[str], rows: list[list[Any]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
-        writer.writerows(rows)
+        writer.writerows([plain_cell(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)

@@ -51,9 +51,9 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
     """What carries the memory in a store over to another embedding."""
     made = Identity.read(store)
     exemplars = made.exemplar_count(store, None)
-    usual = usual_kept(made.sensor) if made.views else None
-    # As many as were asked for, or as many as are usual with the embedding that it gets.
-    recall = usual_recall(made.sensor, embedding) if made.recall in (None, usual) else made.recall
+    kept, usual = made.recall or 0, usual_kept(made.sensor) if made.views else 0
+    # As many as were asked for, none too; where nobody asked, as many as are usual with the embedding that it gets.
+    recall = usual_recall(made.sensor, embedding) if kept == usual else kept
     identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation, recall)
     keeping = Keeping(made.sensor, recall)
     plan = window_plan(made.sensor, embedding)

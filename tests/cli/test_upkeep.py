@@ -1,8 +1,10 @@
 """`scroll-tactile memory …`, as its user sees it."""
 
 import csv
+import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +14,12 @@ import pytest
 from commands import refused, run
 from touches import PAD, SETTINGS, fed, require_same, stream
 
-from scroll_tactile import ModuleEmbedding, TactileLearner
+from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
 from scroll_tactile.cli.terminal import opened_for_upkeep
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
-from store import Store
+from scroll_tactile.prediction.reembedding import reembed_memory
+from store import Store, StoreError
 
 OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
 
@@ -238,6 +241,57 @@ class TestExport:
         scores = counts.sum() / (1 - share) * (row @ solved - (means.T * solved).sum(axis=0) / 2)
         expected = readout.scores(row.astype(float), range(len(readout.names)), "lda")
         assert np.allclose(np.diff(scores), np.diff(expected), rtol=1e-4)
+
+    def test_no_cell_is_computed_by_a_spreadsheet_and_every_name_comes_back(self, tmp_path):
+        names = [
+            "=cmd|'/c calc'!A1",
+            "@SUM(A1)",
+            "+1+1",
+            "-2",
+            "'=1",
+            "＝1",
+            "a;=1",
+            "a;'=1;;-2",
+            'b,"=1',
+            "'u'",
+            "ü - c",
+        ]
+        with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": len(names)}) as learner:
+            for i, name in enumerate(names):
+                learner.observe(name, stream((i, 60)), source=name)
+                learner.describe(name, {name: 1.0})
+            export_plain(learner, tmp_path / "out")
+        for table, column in (("observations", "source"), ("exemplars", "material"), ("descriptions", "constituent")):
+            text = (tmp_path / "out" / f"{table}.csv").read_text(encoding="utf-8")
+            for separator in ",;\t":  # a spreadsheet takes that of its country
+                rows = csv.reader(io.StringIO(text), delimiter=separator)
+                assert [cell for row in rows for cell in row if cell.startswith(tuple("=+-@＝\t\r"))] == []
+            for read in ("material", column):
+                found = [row[read] for row in csv.DictReader(io.StringIO(text))]
+                assert {re.sub(r"(^|;)'(?='*[=+@＝-])", r"\1", cell) for cell in found} == set(names)
+
+    def test_a_path_that_no_system_takes_is_an_error_with_a_type(self, path, tmp_path):
+        long = tmp_path / ("m" * 300)
+        assert "too long" in refused("memory", "export", path, long)
+        assert "too long" in refused("memory", "export", long, tmp_path / "out")
+        with TactileLearner.open(path) as learner:
+            for call in (
+                lambda: export_plain(learner, long),
+                lambda: learner.merge(long, shared="once"),
+                lambda: TactileLearner.open(long),
+                lambda: TactileLearner.open(long, **SETTINGS),
+                lambda: reembed_memory(long),
+            ):
+                with pytest.raises((InputError, StoreError)):
+                    call()
+
+    def test_a_memory_of_as_long_a_name_as_there_can_be_is_opened(self, tmp_path):
+        longest = tmp_path / ("m" * 250)  # of which reembedding would make a longer one
+        with TactileLearner.open(longest, **SETTINGS) as learner:
+            learner.observe("a", stream((0, 60)))
+            with pytest.raises(StoreError, match="too long"):
+                learner.reembed(Kernels(seed=1, dimension=64))
+            assert learner.materials == {"a": 1}
 
     def test_nothing_is_written_over(self, path, tmp_path):
         (tmp_path / "out").mkdir()

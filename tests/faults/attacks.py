@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import random
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,9 @@ from forging import (
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
 from faults.places import Attack, Scene, hot_journal, other_schema, strange_file
-from scroll_tactile.memory.rows import pack_codes
+from scroll_tactile.memory.rows import pack_codes, unpack_readings
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import Stream
 from store.encoding import decode_payload, encode_payload
 
 KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "felt", "x", "", "OBSERVE")
@@ -129,7 +132,18 @@ def _fill(rng: random.Random, row: dict[str, Any], path: Path, scene: Scene) -> 
     else:
         row["attributes"] = attributes
     row["payload"] = payload
+    if row["kind"] == "observe" and rng.random() < 0.9:  # another is refused whatever else there is
+        row["key"] = _right_key(path, arrays) or row["key"]
     return told
+
+
+def _right_key(path: Path, arrays: dict[str, np.ndarray]) -> bytes | None:
+    """The content hash of the readings in these arrays; None where there are none."""
+    with suppress(Exception):  # they may be anything
+        readings = unpack_readings(arrays)
+        assert readings is not None
+        return Stream(Sensor(**get_identity(path)["sensor"]), readings.astype(np.float32)).key
+    return None
 
 
 def forged_identity(rng: random.Random, path: Path, scene: Scene) -> str:

@@ -26,8 +26,9 @@ from hypothesis.stateful import (
 from touches import SMALL, SmallSample, contents, fed, stream
 
 from faults.common import parser, progress, run
-from faults.model import MATERIALS, State, after, expected, opened, perform, seen, unsound_copies
+from faults.model import EMBEDDINGS, MATERIALS, State, after, expected, opened, perform, seen, unsound_copies
 from faults.plans import KINDS, draw, prepare, touch
+from faults.recorded import learn_files
 from scroll_tactile.errors import StreamError
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -51,8 +52,10 @@ class History(RuleBasedStateMachine):
     @initialize()
     def create(self) -> None:
         self.path = self.home / f"memory-{next(self.names)}"
-        self.learner = opened(self.path)
-        self.reader = opened(self.path, "read")
+        self.learner, self.reader = self.open(), self.open("read")
+
+    def open(self, mode: str = "write", **settings_: Any) -> Any:
+        return opened(self.path, mode, embedding=EMBEDDINGS[self.state.embedding], **settings_)
 
     def do(self, operation: Any) -> None:
         self.state, result = after(self.state, operation, self.others)
@@ -64,6 +67,25 @@ class History(RuleBasedStateMachine):
             self.reopen("lda")
         self.do(draw(rng, self.state, self.others, kind))
         assert unsound_copies(self.path, [self.state]) == []
+
+    @rule(rng=randoms)
+    def reembed(self, rng: Any) -> None:
+        self.do(draw(rng, self.state, self.others, "reembed"))
+        assert seen(self.learner) == expected(self.state)
+        self.reader.close()  # it reads the memory that was replaced
+        self.reader = self.open("read")
+
+    @rule(rng=randoms)
+    def learn_as_a_fleet(self, rng: Any) -> None:
+        operation = draw(rng, self.state, self.others, "fleet")
+        readout = self.learner.settings.readout
+        self.learner.close()
+        self.reader.close()
+        came = learn_files(self.path, self.state, operation[1])
+        self.state, result = after(self.state, operation, self.others)
+        self.learner, self.reader = self.open(readout=readout), self.open("read")
+        assert came == result
+        assert seen(self.learner) == expected(self.state)
 
     @rule(rng=randoms)
     def fail_in_a_batch(self, rng: Any) -> None:
@@ -96,7 +118,7 @@ class History(RuleBasedStateMachine):
     @rule(readout=readouts)
     def reopen(self, readout: str) -> None:
         self.learner.close()
-        self.learner = opened(self.path, readout=readout)
+        self.learner = self.open(readout=readout)
         self.agrees(self.learner)
 
     @rule(readout=readouts)
@@ -106,7 +128,7 @@ class History(RuleBasedStateMachine):
         shutil.copytree(before, self.path, ignore=shutil.ignore_patterns("*-shm", "lock"))
         self.learner.close()
         self.reader.close()
-        self.learner, self.reader = opened(self.path, readout=readout), opened(self.path, "read")
+        self.learner, self.reader = self.open(readout=readout), self.open("read")
 
     @rule()
     def refresh(self) -> None:
@@ -120,7 +142,7 @@ class History(RuleBasedStateMachine):
         sides: tuple[list[Any], list[Any]] = ([], [])
         for observation in self.state.observed:
             sides[rng.randrange(2)].append(observation.pair)
-        ours, theirs = (fed(side).memory.statistics for side in sides)
+        ours, theirs = (fed(side, embedding=self.learner.embedding).memory.statistics for side in sides)
         whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
@@ -134,7 +156,8 @@ class History(RuleBasedStateMachine):
     def agrees(self, learner: Any) -> None:
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
         assert seen(learner) == expected(self.state)
-        whole = fed(self.state.pairs, learner.descriptions, readout=learner.settings.readout, recall=5)
+        made = {"embedding": EMBEDDINGS[self.state.embedding], "readout": learner.settings.readout, "recall": 5}
+        whole = fed(self.state.pairs, learner.descriptions, **made)
         if self.state.tuned is None:
             assert contents(learner) == contents(whole)
         assert repr(learner.descriptions) == repr({name: dict(parts) for name, parts in self.state.said})

@@ -2,9 +2,10 @@
 
 An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
 ("forget", material), ("relabel", sequence, material), ("describe", material, constituents or None),
-("merge", name, shared), ("compact", keep), ("fine_tune",), ("backup",). `after` says what it makes of a `State` and
-what the call returns, `perform` does it to a learner, and `expected` is what can be seen of a learner in that state:
-made anew, in memory, from the touches in another order.
+("merge", name, shared), ("compact", keep), ("fine_tune",), ("backup",), ("pack", name, rows), ("reembed", embedding),
+("fleet", pairs). `after` says what it makes of a `State` and what the call returns, `perform` does it to a learner (and
+`recorded.learn_files` a fleet's), and `expected` is what can be seen of a learner in that state: made anew, in memory,
+from the touches in another order.
 """
 
 from __future__ import annotations
@@ -20,15 +21,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from touches import PAD, SETTINGS, SmallSample, fed, stream
+from touches import PAD, SETTINGS, SMALL, SmallSample, fed, stream
 
 import scroll_tactile.memory.state
-from scroll_tactile import TactileLearner
+from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from store import check_store
 
 MATERIALS = ("a", "b", "c", "ü")
 LENGTHS = (2, 16, 25, 40, 60, 90, 120)  # the widest scale needs 37, a fine-tune some of two materials
+
+# By the names that a `State` has for them: that which memories are made with, and one to embed them again with.
+EMBEDDINGS = {"own": SMALL, "other": Kernels(seed=3, dimension=SMALL.dimension)}
 
 Touch = tuple[int, int]
 Constituents = tuple[tuple[str, float | bool | None], ...]
@@ -66,7 +70,7 @@ def one_scale() -> None:
 
 def opened(path: Path, mode: Any = "write", **more: Any) -> TactileLearner:
     """The memory in folder `path`."""
-    return TactileLearner.open(path, mode=mode, **settings(), **more)
+    return TactileLearner.open(path, mode=mode, **settings() | more)
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,25 @@ Pairs = tuple[tuple[str, Touch], ...]
 
 
 @dataclass(frozen=True)
+class Other:
+    """A memory to be merged. felt: what it holds, of which the first `fixed` were compacted. based: any row was.
+
+    said: what it says that materials are made of. embedding: the name of the one that made it.
+    """
+
+    observed: Pairs
+    fixed: int
+    based: bool
+    said: tuple[tuple[str, Constituents], ...] = ()
+    embedding: str = "own"
+
+
+@dataclass(frozen=True)
 class State:
     """All that a memory holds. last: its rows. base: the last that was compacted. tuned: what f* was made from.
 
-    said: materials with what they are made of, in alphabetical order.
+    said: materials with what they are made of, in alphabetical order. embedding: its name. brought: whether a memory
+    came in without its rows. packed: what it was packed as, by the name of the file.
     """
 
     observed: tuple[Observation, ...] = ()
@@ -100,6 +119,9 @@ class State:
     tuned: Pairs | None = None
     tuned_upto: int = 0
     said: tuple[tuple[str, Constituents], ...] = ()
+    embedding: str = "own"
+    brought: bool = False
+    packed: tuple[tuple[str, Other], ...] = ()
 
     @property
     def pairs(self) -> Pairs:
@@ -128,19 +150,6 @@ class State:
     def loose(self) -> list[Observation]:
         """What can still be retracted."""
         return [one for one in self.observed if not one.fixed]
-
-
-@dataclass(frozen=True)
-class Other:
-    """A memory to be merged. felt: what it holds, of which the first `fixed` were compacted. based: any row was.
-
-    said: what it says that materials are made of.
-    """
-
-    observed: Pairs
-    fixed: int
-    based: bool
-    said: tuple[tuple[str, Constituents], ...] = ()
 
 
 def after(state: State, operation: Operation, others: dict[str, Other]) -> tuple[State, Any]:
@@ -195,7 +204,9 @@ def _describe(state: State, _: Any, material: str, constituents: Constituents | 
 def _merge(
     state: State, others: dict[str, Other], name: str, shared: str, descriptions: str = "same"
 ) -> tuple[State, Any]:
-    other, said = others[name], dict(state.said)
+    other, said = (others | dict(state.packed))[name], dict(state.said)
+    if other.embedding != state.embedding:
+        return state, "MismatchError"
     ours = {one.pair for one in state.observed}
     both = [i for i, pair in enumerate(other.observed) if pair in ours]
     if shared == "once" and any(i < other.fixed for i in both):
@@ -208,7 +219,7 @@ def _merge(
     coming = [i for i in range(len(other.observed)) if shared == "twice" or i not in both]
     for material, parts in new.items():
         state = state.with_said(material, parts)
-    state = replace(state, last=state.last + len(new) + other.based)
+    state = replace(state, last=state.last + len(new) + other.based, brought=state.brought or other.based)
     for i in coming:
         state = state.with_one(*other.observed[i], fixed=i < other.fixed)
     return state, [len(coming), len(both), len(new)]
@@ -223,7 +234,7 @@ def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
 
 
 def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
-    digest = tuned_digest(state.pairs)
+    digest = tuned_digest(state.pairs, state.embedding)
     if digest is None:
         return state, "InputError"
     return replace(state, tuned=state.pairs, tuned_upto=state.last), digest
@@ -231,6 +242,29 @@ def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
 
 def _backup(state: State, _: Any) -> tuple[State, Any]:
     return state, None
+
+
+def _pack(state: State, _: Any, name: str, rows: bool) -> tuple[State, Any]:
+    """Rows stay behind where any are missing; a file of no touches has none."""
+    whole = rows and bool(state.observed) and not (state.base or state.brought)
+    pairs = tuple(one.pair for one in state.observed)
+    other = Other(pairs, 0 if whole else len(pairs), not whole, state.said, state.embedding)
+    return replace(state, packed=(*state.packed, (name, other))), None
+
+
+def _reembed(state: State, _: Any, embedding: str) -> tuple[State, Any]:
+    """Nothing is lost but f*."""
+    if state.base or state.brought:
+        return state, "MismatchError"
+    return replace(state, embedding=embedding, tuned=None, tuned_upto=0), None
+
+
+def _fleet(state: State, _: Any, touches: Pairs) -> tuple[State, Any]:
+    ours = {one.pair for one in state.observed}
+    coming = [pair for pair in dict.fromkeys(touches) if pair not in ours]
+    for pair in coming:
+        state = state.with_one(*pair)
+    return state, len(coming)
 
 
 _AFTER = {
@@ -244,6 +278,9 @@ _AFTER = {
     "compact": _compact,
     "fine_tune": _fine_tune,
     "backup": _backup,
+    "pack": _pack,
+    "reembed": _reembed,
+    "fleet": _fleet,
 }
 
 
@@ -275,6 +312,10 @@ def _do_backup(learner: TactileLearner, _: Path) -> None:
     store.backup(store.path.with_name(f"{store.path.name}-copy-{time.time_ns()}"))
 
 
+def _do_reembed(learner: TactileLearner, _: Path, embedding: str) -> None:
+    shutil.rmtree(learner.reembed(EMBEDDINGS[embedding]))
+
+
 _CALLS = {
     "observe": _do_observe,
     "batch": _do_batch,
@@ -286,6 +327,8 @@ _CALLS = {
     "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,
     "fine_tune": lambda learner, _: learner.fine_tune(epochs=1).digest,
     "backup": _do_backup,
+    "pack": lambda learner, home, name, rows: learner.pack(home / name, rows=rows),
+    "reembed": _do_reembed,
 }
 
 
@@ -298,7 +341,7 @@ def unsound_copies(path: Path, states: Sequence[State]) -> list[str]:
     for copy in sorted(path.parent.glob(f"{path.name}-copy-*")):
         if not copy.name.endswith(".partial"):
             wrong += [f"a backup: {problem.what}" for problem in check_store(copy) if problem.kind != "leftover"]
-            with opened(copy, "read") as learner:
+            with opened(copy, "read", embedding=EMBEDDINGS[states[-1].embedding]) as learner:
                 if settle(seen(learner), states)[0] is None:
                     wrong.append(f"{copy.name} is a backup of no state that there was")
         shutil.rmtree(copy)
@@ -340,10 +383,10 @@ def _kept(learner: TactileLearner) -> str:
 def expected(state: State) -> dict[str, Any]:
     """What must be seen of a learner in this state."""
     counted = dict(sorted(Counter(one.material for one in state.observed).items()))
-    tuned = None if state.tuned is None else tuned_digest(state.tuned)
+    tuned = None if state.tuned is None else tuned_digest(state.tuned, state.embedding)
     said = {material: dict(constituents) for material, constituents in state.said}
     told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
-    return _observed(state.pairs) | told
+    return _observed(state.pairs, state.embedding) | told
 
 
 def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None, list[list[str]]]:
@@ -353,14 +396,14 @@ def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None
 
 
 @functools.lru_cache(maxsize=4096)
-def _observed(pairs: Pairs) -> dict[str, Any]:
-    return seen(fed(pairs, **settings()))
+def _observed(pairs: Pairs, embedding: str) -> dict[str, Any]:
+    return seen(fed(pairs, **settings() | {"embedding": EMBEDDINGS[embedding]}))
 
 
 @functools.lru_cache(maxsize=4096)
-def tuned_digest(pairs: Pairs) -> str | None:
+def tuned_digest(pairs: Pairs, embedding: str = "own") -> str | None:
     """The digest of the f* that is made from touches; None where none can be."""
     try:
-        return fed(pairs, **settings()).fine_tune(epochs=1).digest
+        return fed(pairs, **settings() | {"embedding": EMBEDDINGS[embedding]}).fine_tune(epochs=1).digest
     except InputError:
         return None

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 from touches import stream
 
-from faults.model import LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
+from faults.model import EMBEDDINGS, LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
 
-KINDS = ("observe", "batch", "retract", "forget", "relabel", "describe", "merge", "compact", "fine_tune", "backup")
+KINDS = (
+    *("observe", "batch", "retract", "forget", "relabel", "describe", "merge", "compact", "fine_tune", "backup"),
+    "pack",
+)
+MOST_TWICE = 16  # observations: a memory that is merged into itself would soon be all that a history does
 
 # Few touches, so that the same stream is observed again, by this memory and by those merged into it.
 SEEDS = 6
@@ -45,18 +50,27 @@ def prepare(home: Path) -> dict[str, Other]:
 
 def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) -> Operation:
     """A random operation of a kind; now and then one that is refused."""
-    if kind == "observe":
-        return kind, rng.choice(MATERIALS), touch(rng)
-    if kind == "batch":
-        return kind, _together(rng, state, others)
-    if kind == "describe":
-        return kind, rng.choice(MATERIALS), rng.choice(SAID)
-    if kind in ("retract", "forget", "relabel"):
-        name = (rng.choice(MATERIALS),) if kind == "relabel" else ()
-        return kind, _to_retract(rng, state, kind), *name
-    if kind == "merge":
-        return kind, rng.choice(sorted(others)), rng.choice(("twice", "once")), rng.choice(("same", "ours", "theirs"))
-    return (kind, rng.choice((0, 1, 2, 4))) if kind == "compact" else (kind,)
+    drawn: dict[str, Callable[[], Operation]] = {
+        "observe": lambda: (rng.choice(MATERIALS), touch(rng)),
+        "batch": lambda: (_together(rng, state, others),),
+        "describe": lambda: (rng.choice(MATERIALS), rng.choice(SAID)),
+        "retract": lambda: (_to_retract(rng, state, kind),),
+        "forget": lambda: (_to_retract(rng, state, kind),),
+        "relabel": lambda: (_to_retract(rng, state, kind), rng.choice(MATERIALS)),
+        "merge": lambda: _to_merge(rng, state, others),
+        "compact": lambda: (rng.choice((0, 1, 2, 4)),),
+        "pack": lambda: (f"packed-{len(state.packed)}", rng.random() < 0.7),
+        "reembed": lambda: (rng.choice(sorted(EMBEDDINGS)),),
+        "fleet": lambda: (_of_one_name(rng, state),),
+    }
+    return kind, *drawn.get(kind, tuple)()
+
+
+def _to_merge(rng: random.Random, state: State, others: dict[str, Other]) -> Operation:
+    """One of the others, or what this memory was packed as."""
+    name = rng.choice([*sorted(others), *dict(state.packed)])
+    shared = rng.choice(("twice", "once")) if name in others or len(state.observed) <= MOST_TWICE else "once"
+    return name, shared, rng.choice(("same", "ours", "theirs"))
 
 
 def _to_retract(rng: random.Random, state: State, kind: str) -> int | str:
@@ -67,6 +81,15 @@ def _to_retract(rng: random.Random, state: State, kind: str) -> int | str:
     if loose and rng.random() < 0.95:
         return rng.choice(loose)
     return rng.choice(MATERIALS) if kind == "forget" else state.last + 3
+
+
+def _of_one_name(rng: random.Random, state: State) -> tuple[tuple[str, Touch], ...]:
+    """Touches, some of which are there, in this list or in the memory; each content under one name only."""
+    names = {one.touch: one.material for one in state.observed}
+    pairs = []
+    for one in (touch(rng) for _ in range(rng.randrange(1, 6))):
+        pairs.append((names.setdefault(one, rng.choice(MATERIALS)), one))
+    return tuple(pairs)
 
 
 def _together(rng: random.Random, state: State, others: dict[str, Other]) -> tuple[Operation, ...]:

@@ -13,9 +13,10 @@ from touches import PAD, SETTINGS, contents, filled, stream
 from scroll_tactile import Augmented, Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
+from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.signals.stream import validate
-from store import DamageError, StoreError
+from store import DamageError, Store, StoreError
 
 TYPED = (ScrollTactileError, StoreError)
 OTHER = [("d", (9, 60)), ("e", (10, 60)), ("d", (11, 60))]
@@ -83,10 +84,16 @@ def require_refused(path, match, expected=DamageError, others=None, **settings_)
 
 def readings_row(path, **changes):
     """A row of readings as they are, with some of its arrays changed; None leaves one out."""
-    readings = validate(stream((20, 60)), PAD).readings
-    arrays = {"readings": readings, **changes}
+    touch = validate(stream((20, 60)), PAD)
+    arrays = {"readings": touch.readings, **changes}
     arrays = {name: array for name, array in arrays.items() if array is not None}
-    return put_row(path, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
+    return put_row(path, key=touch.key, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
+
+
+def observed_in(path):
+    """The names and keys of what a memory observed."""
+    with Store.open(path, mode="read") as store:
+        return [(head.label, head.key) for head in store.heads(kind="observe")]
 
 
 def test_a_sound_memory_has_nothing_that_is_found(made):
@@ -140,6 +147,60 @@ def test_a_row_that_is_no_observation_is_damage(path, others, name):
     }
     put_row(path, **row | changes)
     require_refused(path, match, others=others)
+
+
+@pytest.mark.parametrize("packing", ["readings", "packed"])
+def test_a_row_under_the_key_of_another_touch_is_damage(made, path, others, packing):
+    """What would be left out of a merge as "shared" though it was never there."""
+    label, key = observed_in(made / "other")[0]
+    readings = validate(stream((20, 60)), PAD).readings
+    payload = {"readings": readings} if packing == "readings" else pack_readings(readings)
+    put_row(path, key=key, label=label, attributes={"columns": 60, "nbytes": 480}, payload=payload)
+    require_refused(path, r"row 14 .* key: expected the content hash of its readings", others=others)
+
+
+@pytest.mark.parametrize("where", ["here", "there"])
+def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
+    """Row 1 lies under a generation: opening does not read it, but a touch is left out for its key."""
+    theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
+    theirs.close()
+    attributes, arrays = row_of(path, 1)
+    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=arrays)
+    assert any("content hash" in found for found in check_memory(path))
+    ours, theirs = (path, tmp_path / "theirs") if where == "here" else (tmp_path / "theirs", path)
+    with opened(ours) as learner:
+        before = learner.digest(), len(learner.observations())
+        with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
+            learner.merge(theirs, shared="once")
+        assert (learner.digest(), len(learner.observations())) == before
+
+
+def test_what_merge_leaves_out_passes_the_gate_too(path, others):
+    """A row that was retracted, one that both observed: opening refuses either."""
+    readings = validate(stream(OTHER[0][1]), PAD).readings
+    put_row(path, label="d", key=bytes(32), attributes={"columns": 60, "nbytes": 480}, payload={"readings": readings})
+    put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[14, 14]]})
+    require_refused(path, r"row 14 .* content hash", others=others)
+
+
+@pytest.mark.parametrize("kind", ["exec", "", "OBSERVE"])
+def test_a_row_of_a_kind_that_nobody_knows_is_of_a_newer_version(path, others, kind):
+    put_row(path, kind=kind, label="", key=b"")
+    require_refused(path, f"row 14 .* of kind {kind!r}", MismatchError, others=others)
+
+
+def test_a_generation_that_opening_refuses_is_not_merged(path, others):
+    attributes, arrays = generation_of(path)
+    put_generation(path, attributes | {"pool": ["nobody"] * len(attributes["pool"])}, arrays)
+    require_refused(path, "pool: expected materials that were observed", others=others)
+
+
+def test_an_exemplar_under_the_key_of_another_touch_is_damage(made, tmp_path, others):
+    path = copied(made / "compacted", tmp_path / "m")
+    attributes, arrays = generation_of(path)
+    arrays["exemplar-keys"] = arrays["exemplar-keys"][::-1].copy()
+    put_generation(path, attributes, arrays, base=True)
+    require_refused(path, "exemplar-keys: expected the content hashes of their readings", others=others)
 
 
 def test_a_row_of_nothing_is_damage(path):
@@ -232,15 +293,15 @@ def test_a_retraction_is_of_rows_before_it(path, others, sequences):
     require_refused(path, "sequences: expected", others=others)
 
 
-def test_a_description_cannot_be_retracted_and_no_observation_twice(path):
+def test_a_description_cannot_be_retracted(path, others):
     put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[13, 13]]})
-    require_refused(path, "retracts")
+    require_refused(path, "retracts", others=others)
 
 
-def test_an_observation_cannot_be_retracted_twice(path):
+def test_an_observation_cannot_be_retracted_twice(path, others):
     for _ in range(2):
         put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[1, 1]]})
-    require_refused(path, "retracts")
+    require_refused(path, "retracts", others=others)
 
 
 @pytest.mark.parametrize(

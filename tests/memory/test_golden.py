@@ -220,7 +220,7 @@ def test_a_row_of_an_unknown_kind_is_refused_with_what_to_do(golden):
     path, _ = golden
     with Store.open(path) as store:
         store.append("dream", "", b"")
-    with pytest.raises(MismatchError, match=r"is of kind 'dream'; .* Open the memory with the version that wrote it"):
+    with pytest.raises(MismatchError, match=r"is of kind 'dream', .* Open the memory with the version that wrote it"):
         open_golden(path)
 
 

@@ -134,7 +134,7 @@ def touch(seed):
 def filled(seeds):
     memory = Memory(DIMENSION, READING)
     for i, seed in enumerate(seeds, start=1):
-        memory.add(*touch(seed), i)
+        memory.add(*touch(seed), i, None, None)
     return memory
 
 
@@ -182,7 +182,7 @@ def test_a_full_memory_refuses_and_stays_as_it_was():
     held, moment.rows = moment.rows, MOST_ROWS
     before = content(memory)
     with pytest.raises(CapacityError):
-        memory.add(*touch(9), 6)
+        memory.add(*touch(9), 6, None, None)
     assert content(memory) == before
     moment.rows = held
     assert content(memory) == content(filled(range(5)))

@@ -33,6 +33,16 @@ def test_a_crafted_frame_is_damage_and_nothing_else(plain, frame):
     assert (read.returncode, read.stdout) == (0, f"damage at {number}\n"), read.stderr
 
 
+def test_what_was_never_written_so_is_not_said_to_fail_a_checksum_that_is_right(plain):
+    number = put_row(plain, payload=b"no payload at all")
+    with Store.open(plain, mode="read") as opened, pytest.raises(DamageError) as caught:
+        list(opened.records())
+    (problem,) = (problem.what for problem in check_store(plain) if problem.kind == "lost")
+    assert f"the arrays of row {number} were never written so (the payload does not start with" in str(caught.value)
+    assert f"row {number} has arrays that were never written so" in problem
+    assert "checksum" not in str(caught.value) + problem
+
+
 def test_arrays_that_together_are_larger_than_any_that_are_written_are_damage(plain):
     large = 256 * 2**20
     frame = blosc.compress(np.zeros(large, np.uint8), b"zstd", 1, blosc.BITSHUFFLE)

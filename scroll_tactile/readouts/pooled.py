@@ -87,44 +87,45 @@ def pool(recall: Recall, apart: Mapping[bytes, Apart], power: float = 1.0) -> Po
     which its own are beside them; where nothing can be left out, those of the kept touches are as well.
     """
     keys = {row: key for key, row in sorted(recall.rows().items()) if key in apart}
-    rows = list(keys)
-    # Half of them are the least sure, where it matters which of the two is believed; each of the others, taken at
-    # random, stands for many: else the weights were too small for all but those that are taken for another material.
-    unsure = sorted(rows, key=lambda row: apart[keys[row]].margin)[: LEFT_OUT // 2]
-    others = [row for row in rows if row not in unsure]
-    chosen = [others[i] for i in spaced(others, LEFT_OUT // 2)]
-    stands_for = dict.fromkeys(unsure, 1.0) | dict.fromkeys(chosen, len(others) / max(len(chosen), 1))
-    rows = sorted(stands_for)
-    names = recall.materials
+    stands_for = _left_out({row: apart[key].margin for row, key in keys.items()})
+    rows, names = sorted(stands_for), recall.materials
     if len(rows) < FEWEST or len(names) < 2:
         recalled = recalled_of(power * UNSEEN, recall.measured.likelihood.table(CLEAN).certainty)
-        return Pooled(recall, float(PRIOR[0]), recalled, recalled, np.inf, 0.0, 1.0 / UNMEASURED, sure=0.0)
+        sure = SURE if apart else 0.0  # with one touch of each, any other looks as if noise had come over it
+        return Pooled(recall, float(PRIOR[0]), recalled, recalled, np.inf, 0.0, 1.0 / UNMEASURED, sure)
     told = [apart[keys[row]] for row in rows]
     found = [recall.recollect(recall.levels(row), left_out=row) for row in rows]
     common = [i for i, name in enumerate(names) if all(name in touch.logits for touch in told)]
     targets = [[names[i] for i in common].index(touch.material) for touch in told]
     familiar = float(np.quantile([touch.strange for touch in apart.values()], USUAL))
-    # As they are weighed where they are asked: see `prediction.recalling`.
     certainty = np.maximum([recollection.certainty for recollection in found], LEAST_CERTAINTY)
     usual = float(np.median(certainty))
-    scores = np.array(
-        [
-            [
-                familiarity_of(familiar, touch.strange, own_time=True)
-                * (1 - recollection.trust)
-                * np.array([touch.logits[names[i]] for i in common]),
-                usual / sure * recollection.scores[common],  # β is nearly r / c
-            ]
-            for touch, recollection, sure in zip(told, found, certainty, strict=True)
-        ]
-    )
+    # Both as they are weighed where they are asked, see `prediction.recalling`: β is nearly r / c.
+    parts = [
+        familiarity_of(familiar, touch.strange, own_time=True) * (1 - recollection.trust)
+        for touch, recollection in zip(told, found, strict=True)
+    ]
+    heard = np.array([[touch.logits[names[i]] for i in common] for touch in told]) * np.array(parts)[:, None]
+    kept = np.array([recollection.scores[common] for recollection in found]) * (usual / certainty)[:, None]
     counts = np.array([stands_for[row] for row in rows])
-    trusted, steepness = fit_weights(scores, targets, PRIOR, PRIOR_TOUCHES, counts).tolist()
-    alone = float(fit_weights(scores[:, 1:], targets, PRIOR[1:], PRIOR_TOUCHES, counts)[0])
+    trusted, steepness = fit_weights(np.stack([heard, kept], axis=1), targets, PRIOR, PRIOR_TOUCHES, counts).tolist()
+    by_itself = float(fit_weights(kept[:, None], targets, PRIOR[1:], PRIOR_TOUCHES, counts)[0])
+    recalled, alone = (recalled_of(value, usual) for value in (steepness, by_itself))
     surprise = np.array([recollection.surprise for recollection in found])
     spread = max(float(surprise.std()), MOST_SPREAD)
-    recalled, by_itself = (recalled_of(value, usual) for value in (steepness, alone))
-    return Pooled(recall, trusted, recalled, by_itself, familiar, float(surprise.mean()), spread)
+    return Pooled(recall, trusted, recalled, alone, familiar, float(surprise.mean()), spread)
+
+
+def _left_out(margins: Mapping[int, float]) -> dict[int, float]:
+    """The rows that are left out, of those with these margins, and how many touches each stands for.
+
+    Half of them are the least sure, where it matters which of the two is believed. Each of the others, taken at random,
+    stands for many: else the weights were too small for all but those that are taken for another material.
+    """
+    unsure = sorted(margins, key=lambda row: margins[row])[: LEFT_OUT // 2]
+    others = [row for row in margins if row not in unsure]
+    chosen = [others[i] for i in spaced(others, LEFT_OUT // 2)]
+    return dict.fromkeys(unsure, 1.0) | dict.fromkeys(chosen, len(others) / max(len(chosen), 1))
 
 
 def familiarity_of(familiar: float, strange: float, own_time: bool) -> float:

@@ -183,14 +183,15 @@ class TactileLearner:
             arrays, attributes = self._ledger.snapshot()
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
-            held = arrays, attributes, self._ledger.memory.sequence
-            return {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
+            held, contents = (arrays, attributes, self._ledger.memory.sequence), self._ledger.contents().copy()
+            state = {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
+            return state | {"contents": contents}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
         self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.recall)
         self._unverified, self._snapshot_of = state["unverified"], state["of"]
-        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]))
+        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]), contents=state["contents"])
         logger.info("a snapshot of %s, in memory only", state["of"])
 
     def __repr__(self) -> str:
@@ -247,8 +248,11 @@ class TactileLearner:
         """
         return self._extractor.stream(readings)
 
-    def observe(self, material: str, stream: Readings, *, source: str | None = None) -> Receipt:
+    def observe(self, material: str, stream: Readings, *, source: str | None = None, again: bool = False) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
+
+        One content is one touch: of readings that the memory has under this name nothing is learned a second time, and
+        the receipt is that of the first, `repeated`. again: they count once more all the same.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
         unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
@@ -260,12 +264,23 @@ class TactileLearner:
         """
         material, source = require_name(material), None if source is None else require_source(source)
         touch = self._verified().stream(stream)
+        if not again and (known := self._ledger.repeated(material, touch)) is not None:
+            return known
         image = self._extractor.image(touch)
         codes = self._extractor.codes(image, touch.key)
-        receipt = self._ledger.observe(material, touch, image.shape[1], codes, source)
+        receipt = self._ledger.observe(material, touch, image.shape[1], codes, source, again=again)
         with self._ledger.lock:
             self._current.prepare(self._ledger)
         return receipt
+
+    def names_of(self, stream: Readings) -> list[str]:
+        """The materials of which the memory has these very readings: none for a touch that it never learned.
+
+        stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream.
+        """
+        touch = self._extractor.stream(stream)
+        with self._ledger.lock:
+            return self._ledger.contents().names(touch.key)
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.

@@ -33,13 +33,13 @@ def stream(touch):
     return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
 
 
-def fed(observed, described=(), **settings):
-    """A memory without a path that observed these touches."""
+def fed(observed, described=(), *, again=False, **settings):
+    """A memory without a path that observed these touches; again: also those that come twice."""
     learner = TactileLearner(**SETTINGS | settings)
     for material, constituents in dict(described).items():
         learner.describe(material, constituents)
     for material, touch in observed:
-        learner.observe(material, stream(touch))
+        learner.observe(material, stream(touch), again=again)
     return learner
 
 

@@ -68,9 +68,13 @@ def observe(
             "name, channels, rate, low, high, unit and duration. Needed only to make a new memory."
         ),
     ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Learn it also where the memory has this very touch already.")
+    ] = False,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.memory.contents import refusal
     from scroll_tactile.recordings import read
     from scroll_tactile.sensors import read_sensor
 
@@ -81,10 +85,16 @@ def observe(
         TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         source = printable(str(file))[-LONGEST_SOURCE:]
-        receipt = learner.observe(material, recording.stream(learner.sensor), source=source)
+        stream = learner.stream(recording.stream(learner.sensor))
+        if not again and (why := refusal(learner.names_of(stream), material)) is not None:
+            raise InputError(why)
+        receipt = learner.observe(material, stream, source=source, again=again)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
-    say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    if receipt.repeated:
+        say(f"{shown(material)}: this touch is there already, as observation {receipt.sequence}; nothing was learned")
+    else:
+        say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 

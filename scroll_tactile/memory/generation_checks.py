@@ -141,6 +141,8 @@ class GenerationChecks:
         pairs = array(arrays, "pool-pairs", ("int64",), (int(sizes.sum()), 3))
         counts("pool-pairs", pairs[:, :2], 0, MOST_STAGES - 1)
         counts("pool-pairs", pairs[:, 2], 1, MOST_ROWS)
+        if "pool-copies" in arrays:
+            counts("pool-copies", array(arrays, "pool-copies", ("int64",), (len(materials),)), 1, MOST_ROWS)
         order = np.diff(pairs[:, 0] * MOST_STAGES + pairs[:, 1])
         order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
         expect(bool((order > 0).all()), "pool-pairs", "stages and scales in order", pairs)

@@ -62,7 +62,7 @@ def kept_of(learner):
 
 def contents(learner, *, exemplars=True):
     """Digest, exemplars, pool, kept touches and answers, to the byte."""
-    pool = [(name, key, touch.rows.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
+    pool = [(name, key, t.rows.tobytes(), t.pairs.tobytes(), t.copies) for name, key, t in learner.memory.sample]
     learner.settle()
     answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60), (9, 300))]
     return learner.digest(), learner.exemplars if exemplars else None, pool, kept_of(learner), answers

@@ -47,7 +47,7 @@ from scroll_tactile.pipelines.runfile import RunFile, alone_in
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
-from store import StoreError, StoreFullError
+from store import DamageError, StoreError, StoreFullError
 
 __all__ = ["FleetReport", "learn"]
 
@@ -439,7 +439,13 @@ class _Run:
                 described = _described([partial for _, partial in opened], descriptions)
                 rows = [(opened[number][1], out) for number, out in chosen.rows]
                 joint = Joint(rows, stack.enter_context(Partial(Path(sums))), described, chosen.not_taken)
-                done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
+                try:
+                    done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
+                except DamageError as error:
+                    if self.folder not in error.path.parents:
+                        raise
+                    why = f"{error.path} is not as it was written; call again: its sources are learned again"
+                    raise DamageError(why, path=error.path) from error
                 self.report.observations += done.observations
                 self.report.repeated += done.shared
         for whole in self._whole_sums(there):

@@ -120,7 +120,7 @@ class History(RuleBasedStateMachine):
         sides: tuple[list[Any], list[Any]] = ([], [])
         for observation in self.state.observed:
             sides[rng.randrange(2)].append(observation.pair)
-        ours, theirs = (fed(side).memory.statistics for side in sides)
+        ours, theirs = (fed(side, again=True).memory.statistics for side in sides)
         whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
@@ -134,7 +134,7 @@ class History(RuleBasedStateMachine):
     def agrees(self, learner: Any) -> None:
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
         assert seen(learner) == expected(self.state)
-        whole = fed(self.state.pairs, learner.descriptions, readout=learner.settings.readout, recall=5)
+        whole = fed(self.state.pairs, learner.descriptions, again=True, readout=learner.settings.readout, recall=5)
         if self.state.tuned is None:
             assert contents(learner) == contents(whole)
         assert repr(learner.descriptions) == repr({name: dict(parts) for name, parts in self.state.said})

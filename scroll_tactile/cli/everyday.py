@@ -92,7 +92,7 @@ def observe(
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     if receipt.repeated:
-        say(f"{shown(material)}: this touch is there already, as observation {receipt.sequence}; nothing was learned")
+        say(f"{shown(material)}: this touch was learned already, as observation {receipt.sequence}")
     else:
         say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")

@@ -113,7 +113,7 @@ class Bridge:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
         if receipt.repeated:
-            return f"{receipt.material}: this touch is there already, as observation {receipt.sequence}"
+            return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         count = self.learner.materials[receipt.material]
         return (
             f"{receipt.material}: {receipt.seconds:g} s learned as observation {receipt.sequence}; "

@@ -17,28 +17,24 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, ObservationError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.contents import Contents, refusal
-from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import usual_embedding
 from scroll_tactile.memory.merge import Choice
-from scroll_tactile.memory.partial import Joint, Partial
-from scroll_tactile.pipelines.choosing import Part, choose
+from scroll_tactile.pipelines.addresses import expand, is_memory
+from scroll_tactile.pipelines.choosing import Part
 from scroll_tactile.pipelines.engines import Engine, engine
+from scroll_tactile.pipelines.gathering import FleetReport, Gathering
 from scroll_tactile.pipelines.partials import (
     Contained,
     LearnJob,
     Made,
     Making,
     SumJob,
-    expand,
-    is_memory,
     learn_partial,
     packed_path,
     sum_partials,
@@ -47,7 +43,7 @@ from scroll_tactile.pipelines.runfile import RunFile, alone_in
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
-from store import DamageError, StoreError, StoreFullError
+from store import StoreError, StoreFullError
 
 __all__ = ["FleetReport", "learn"]
 
@@ -65,29 +61,6 @@ QUEUED = 2  # times its patience, and GRACE seconds: so long may a job be under 
 GRACE = 10.0  # a worker takes a moment to begin
 
 Progress = Callable[[str, int, int], object]
-
-
-@dataclass
-class FleetReport:
-    """What a run did.
-
-    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
-    those that had come before, by their names and contents. refused: what was not learned, and why; of touches that
-    came under two names the first counts, of the destination and then of the sources in their order. deaths: jobs whose
-    worker ended before them, or did not answer. seconds: of all, and of the merge at the end. processor: seconds of the
-    workers' and of this process, of learning, of sums and of the merge. held, digest: of the memory that came out.
-    """
-
-    sources: int = 0
-    observations: int = 0
-    repeated: int = 0
-    refused: list[Refused] = field(default_factory=list)
-    deaths: int = 0
-    seconds: float = 0.0
-    merging: float = 0.0
-    held: int = 0
-    digest: str = ""
-    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "sums": 0.0, "merge": 0.0})
 
 
 def learn(
@@ -417,73 +390,13 @@ class _Run:
 
     def merge(self, held: TactileLearner, sums: str | None, descriptions: Choice) -> None:
         """Put everything into the memory; what is there already is left out."""
-        begun, processor = time.perf_counter(), time.process_time()
 
         def progress(what: str, done: int, of: int) -> None:
             self._progress(f"{what} {done} of {of} touches", self._total, self._total)
 
-        there = Contents(
-            (row.material, row.key, row.sequence) for row in held.observations() if row.state != "retracted"
-        )
-        with ExitStack() as stack:
-            parts = sorted(
-                self._parts, key=lambda part: min(map(self._order.__getitem__, part.held.sources), default=0)
-            )
-            opened = [(part.held, stack.enter_context(Partial(Path(part.held.path)))) for part in parts]
-            chosen = choose(opened, self._order, there)
-            self.report.repeated += chosen.repeated
-            for address, said, why in chosen.refused:
-                self.report.refused.append(Refused(said, why))
-                self._learned.discard(address)
-            if sums is not None:
-                described = _described([partial for _, partial in opened], descriptions)
-                rows = [(opened[number][1], out) for number, out in chosen.rows]
-                joint = Joint(rows, stack.enter_context(Partial(Path(sums))), described, chosen.not_taken)
-                try:
-                    done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
-                except DamageError as error:
-                    if self.folder not in error.path.parents:
-                        raise
-                    why = f"{error.path} is not as it was written; call again: its sources are learned again"
-                    raise DamageError(why, path=error.path) from error
-                self.report.observations += done.observations
-                self.report.repeated += done.shared
-        for whole in self._whole_sums(there):
-            try:
-                done = held.merge(whole.path, shared="once", descriptions=descriptions, progress=progress)
-                self.report.observations += done.observations
-            except (MismatchError, ObservationError) as error:
-                self._refuse(whole.learned, str(error))
-        self.report.merging = time.perf_counter() - begun
-        self.report.processor["merge"] += time.process_time() - processor
-
-    def _refuse(self, sources: Sequence[str], why: str) -> None:
-        self.report.refused += [Refused(source, why) for source in sources]
-        self._learned.difference_update(sources)
-
-    def _whole_sums(self, there: Contents) -> list[Contained]:
-        """The partials without rows, as one where they add up and share no touch; each of the others by itself."""
-        together: list[Contained] = []
-        alone: list[Contained] = []
-        for held in sorted(self.whole, key=lambda held: self._order[held.sources[0]]):
-            other = [why for name, key in held.touches if (why := refusal(there.names(key), name)) is not None]
-            if other:
-                more = f" ({len(other)} of its touches)" if len(other) > 1 else ""
-                self._refuse(held.learned, f"{other[0]}{more}; it has no rows, of which one could be left out")
-                continue
-            adds_up = held.adds_up and not held.described
-            shares = any(there.names(key) for _, key in held.touches)
-            (together if adds_up and not shares else alone).append(held)
-            for name, key in held.touches:
-                if not there.names(key):
-                    there.add(name, key, 0)
-        if len(together) > 1:
-            target = self.folder / f"sum-{os.getpid()}-whole.part"
-            done = sum_partials(SumJob(self.making, tuple((held.path, ()) for held in together), str(target)))
-            self.report.processor["sums"] += done.processor
-            sources = tuple(source for held in together for source in held.learned)
-            together = [Contained(done.path, sources, (), (), has_rows=False)]
-        return [*together, *alone]
+        gathering = Gathering(self.folder, self.making, self.report, self._order, progress)
+        gathering.merge(held, [part.held for part in self._parts], sums, self.whole, descriptions)
+        self._learned -= gathering.refused
 
     def end(self) -> None:
         """Note what was learned, and remove the partials."""
@@ -506,22 +419,6 @@ def _sound(made: object, job: LearnJob | SumJob) -> Made:
     if not refused or not isinstance(made.processor, float) or (not made.path and not made.refused):
         raise MismatchError(f"expected what a job refused, and what it took; came {made!r:.200}")
     return made
-
-
-def _described(partials: Sequence[Partial], choice: Choice) -> dict[str, Description]:
-    """The descriptions of all; raises MismatchError where two differ and nobody chose."""
-    found: dict[str, tuple[Description, Path]] = {}
-    for partial in partials:
-        for material, description in partial.descriptions.items():
-            before = found.get(material)
-            if before is not None and repr(before[0]) != repr(description) and choice == "same":
-                raise MismatchError(
-                    f"{before[1]} and {partial.path} describe {material!r} differently: as {before[0]}, and as "
-                    f"{description}. Choose with descriptions='ours' (the first) or 'theirs' (the last)"
-                )
-            if before is None or choice == "theirs":
-                found[material] = description, partial.path
-    return {material: description for material, (description, _) in found.items()}
 
 
 def _bytes_of(source: str) -> int:

@@ -264,8 +264,6 @@ class TactileLearner:
         """
         material, source = require_name(material), None if source is None else require_source(source)
         touch = self._verified().stream(stream)
-        if not again and (known := self._ledger.repeated(material, touch)) is not None:
-            return known
         image = self._extractor.image(touch)
         codes = self._extractor.codes(image, touch.key)
         receipt = self._ledger.observe(material, touch, image.shape[1], codes, source, again=again)

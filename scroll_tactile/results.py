@@ -29,7 +29,7 @@ class Receipt:
     seconds: float
     clipped: int
     durable: bool
-    repeated: bool = False
+    repeated: bool = field(default=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,10 @@ def fed(observed, described=(), *, again=False, **settings):
     return learner
 
 
-def filled(path, observed=OBSERVED, **settings):
-    """A memory in a folder that observed these touches, and its receipts."""
+def filled(path, observed=OBSERVED, *, again=False, **settings):
+    """A memory in a folder that observed these touches, and its receipts; again: also those that come twice."""
     learner = TactileLearner.open(path, **SETTINGS | settings)
-    return learner, [learner.observe(name, stream(touch)) for name, touch in observed]
+    return learner, [learner.observe(name, stream(touch), again=again) for name, touch in observed]
 
 
 def without(*places):
@@ -85,7 +85,7 @@ def _expected(observed, described, exemplars, settings):
     """What a memory without a path says that observed these; one of the same touches and settings is made once."""
     key = repr((observed, described, exemplars, settings, scroll_tactile.memory.state.TouchSample))
     if "embedding" in settings or key not in _EXPECTED:
-        whole = fed(observed, described, **settings)
+        whole = fed(observed, described, again=True, **settings)
         found = contents(whole, exemplars=exemplars)
         composition = repr(whole.compose(stream((7, 25)))) if described else ""
         _EXPECTED[key] = found, repr(whole.descriptions), composition

@@ -74,7 +74,6 @@ def observe(
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.memory.contents import refusal
     from scroll_tactile.recordings import read
     from scroll_tactile.sensors import read_sensor
 
@@ -86,8 +85,7 @@ def observe(
     with opened(memory, sensor=chosen) as learner:
         source = printable(str(file))[-LONGEST_SOURCE:]
         stream = learner.stream(recording.stream(learner.sensor))
-        if not again and (why := refusal(learner.names_of(stream), material)) is not None:
-            raise InputError(why)
+        others = [name for name in learner.names_of(stream) if name != material]
         receipt = learner.observe(material, stream, source=source, again=again)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
@@ -95,6 +93,8 @@ def observe(
         say(f"{shown(material)}: this touch was learned already, as observation {receipt.sequence}")
     else:
         say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    if others:
+        say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 

@@ -116,15 +116,6 @@ class Ledger:
             self._contents = Contents((head.label, head.key, head.sequence) for head in stand)
         return self._contents
 
-    def repeated(self, material: str, stream: Stream) -> Receipt | None:
-        """The receipt of a touch that is there under this name already; None where nothing can be learned, too."""
-        with self.lock:
-            self.require_open()
-            if self.store is not None and self.store.mode == "read":
-                return None
-            sequence = self.contents().find(material, stream.key)
-            return None if sequence is None else self._receipt(sequence, material, stream, repeated=True)
-
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
         durable = self.store is not None and not self._batching
         return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable, repeated)
@@ -202,8 +193,11 @@ class Ledger:
         require_row(stream)
         with self.lock:
             self.require_open()
-            if not again and (known := self.repeated(material, stream)) is not None:
-                return known  # another thread was first
+            # In a memory opened to read the journal refuses all.
+            if not again and (self.store is None or self.store.mode == "write"):
+                known = self.contents().find(material, stream.key)
+                if known is not None:
+                    return self._receipt(known, material, stream, repeated=True)
             # Before the journal has it: every row there must fit at the next opening.
             self.memory.statistics.require_room(codes)
             undo = self._undo_of(material, stream.key, columns) if self.store is None else None

@@ -325,7 +325,7 @@ class Memory:
     def _take_from(self, generation: Generation, store: Store) -> None:
         """Take in a generation of a store; what an earlier version wrote does not say how often a touch is there."""
         self._take(generation.arrays, generation.attributes, 0)
-        if "pool-copies" in generation.arrays or not len(self.sample):
+        if "copies" in generation.attributes or not len(self.sample):
             return
         try:
             counted = self._counted(store, generation.upto)
@@ -386,6 +386,7 @@ class Memory:
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "pool": materials,
+            "copies": [touch.copies for *_, touch in self.sample],
             "capacity": [self.capacity, None],  # version 0.1 had a limit in bytes beside it
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
@@ -481,7 +482,7 @@ class Memory:
     def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        sample = TouchSample.from_arrays(arrays, attributes["pool"])
+        sample = TouchSample.from_arrays(arrays, attributes["pool"], attributes.get("copies"))
         self.sample = sample_of_windows(sample, attributes["scales"], self.plan)
         if self.kept is not None and "kept" in attributes:
             self.kept.fill(arrays, attributes["kept"])

@@ -89,15 +89,16 @@ class _Batch:
         with self._learner.batch():
             for touch in touches:
                 material = str(touch.material)
-                if (why := refusal(self._learner.names_of(touch.stream), material)) is not None:
+                names = self._learner.names_of(touch.stream)
+                if material in names:
+                    done.skipped += 1
+                    continue
+                if (why := refusal(names, material)) is not None:
                     done.refused.append(Refused(touch.source, why))
                     continue
                 try:
-                    receipt = self._learner.observe(material, touch.stream, source=touch.source)
-                    if receipt.repeated:
-                        done.skipped += 1
-                    else:
-                        done.learned[material] += 1
+                    self._learner.observe(material, touch.stream, source=touch.source)
+                    done.learned[material] += 1
                 except InputError as error:  # one that is too long
                     done.refused.append(Refused(touch.source, str(error)))
 

@@ -204,22 +204,22 @@ class TouchSample(Sample[SampledTouch]):
         return {
             "pool-keys": np.array([list(key) for _, key, _ in self] or [[]], np.uint8)[: len(self)],
             "pool-sizes": np.array([len(touch.pairs) for touch in touches], dtype=np.int64),
-            "pool-copies": np.array([touch.copies for touch in touches], dtype=np.int64),
             "pool-pairs": np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)]),
             "pool-rows": np.concatenate([t.rows for t in touches]) if touches else np.zeros((0, 0), np.int32),
         }, [material for material, *_ in self]
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> TouchSample:
-        """The sample that `to_arrays` described, of this version or an earlier one."""
+    def from_arrays(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str], copies: Sequence[int] | None = None
+    ) -> TouchSample:
+        """The sample that `to_arrays` described, of this version or an earlier one; copies: of each touch, else one."""
         sample = cls()
         edges = np.cumsum(arrays["pool-sizes"])[:-1]
         summed = "pool-sums" in arrays
         rows = np.split(arrays["pool-sums" if summed else "pool-rows"], edges)
         pairs = np.split(arrays["pool-pairs"], edges)
         made = SampledTouch.of_sums if summed else SampledTouch
-        copies = arrays["pool-copies"].tolist() if "pool-copies" in arrays else [1] * len(materials)
         for i, material in enumerate(materials):
-            touch = replace(made(rows[i], pairs[i]), copies=copies[i])
+            touch = replace(made(rows[i], pairs[i]), copies=1 if copies is None else copies[i])
             sample.add(material, arrays["pool-keys"][i].tobytes(), touch)
         return sample

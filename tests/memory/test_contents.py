@@ -11,6 +11,7 @@ import scroll_tactile.memory.state
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.memory.contents import Contents
+from scroll_tactile.memory.state import Memory
 from store import StoreError
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
@@ -191,13 +192,13 @@ class TestCopies:
         assert not learner.observe("a", stream((90, 60))).repeated
 
     def test_memories_of_versions_that_did_not_count_copies_are_counted_when_opened(self, tmp_path, monkeypatch):
-        to_arrays = scroll_tactile.memory.state.TouchSample.to_arrays
+        to_arrays = Memory.to_arrays
 
-        def before(self):
-            arrays, names = to_arrays(self)
-            return {name: array for name, array in arrays.items() if name != "pool-copies"}, names
+        def before(self, *words):
+            arrays, attributes = to_arrays(self, *words)
+            return arrays, {name: value for name, value in attributes.items() if name != "copies"}
 
-        monkeypatch.setattr(scroll_tactile.memory.state.TouchSample, "to_arrays", before)
+        monkeypatch.setattr(Memory, "to_arrays", before)
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
             for name, touch in MANY:
                 learner.observe(name, stream(touch), again=True)

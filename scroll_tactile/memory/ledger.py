@@ -297,8 +297,9 @@ class Ledger:
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
-            for record in records if contents is not None else ():
-                contents.remove(record.label, record.key, record.sequence)
+            if contents is not None:
+                for record in records:
+                    contents.remove(record.label, record.key, record.sequence)
             self._contents = contents
             self._changed(retracted)
         self._snapshot_if_due()

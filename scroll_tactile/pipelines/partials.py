@@ -198,8 +198,8 @@ class Contained:
             touches = tuple((head.label, head.key) for head in packed.named)
             described = bool(packed.descriptions)
             if address is not None:
-                rows, read = packed.has_rows and adds_up, ((address, len(touches)),)
-                return cls(str(path), (address,), read, touches, (), True, adds_up, rows, described)
+                rows, whole = packed.has_rows and adds_up, ((address, len(touches)),)
+                return cls(str(path), (address,), whole, touches, (), True, adds_up, rows, described)
             try:
                 learned, read, again = _noted(packed.note, len(touches))
             except (KeyError, TypeError, ValueError) as error:

@@ -198,13 +198,14 @@ class TactileLearner:
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
             held = arrays, attributes, ledger.memory.sequence
-            return {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
+            state = {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
+            return state | {"contents": ledger.contents().copy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
         self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.recall)
         self._unverified, self._snapshot_of = state["unverified"], state["of"]
-        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]))
+        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]), contents=state["contents"])
         logger.info("a snapshot of %s, in memory only", state["of"])
 
     def __repr__(self) -> str:
@@ -261,8 +262,11 @@ class TactileLearner:
         """
         return self._extractor.stream(readings)
 
-    def observe(self, material: str, stream: Readings, *, source: str | None = None) -> Receipt:
+    def observe(self, material: str, stream: Readings, *, source: str | None = None, again: bool = False) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
+
+        One content is one touch: of readings that the memory has under this name nothing is learned a second time, and
+        the receipt is that of the first, `repeated`. again: they count once more all the same.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
         unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
@@ -279,13 +283,22 @@ class TactileLearner:
         touch = extractor.stream(stream)
         image = extractor.image(touch)
         codes = extractor.codes(image, touch.key)
-        receipt = ledger.observe(material, touch, image.shape[1], codes, source)
+        receipt = ledger.observe(material, touch, image.shape[1], codes, source, again=again)
         with self._locked() as ledger:
             self._current.prepare(ledger)
         if not self._range_said and (problem := range_problem(touch)) is not None:
             self._range_said = True
             warnings.warn(problem, RangeWarning, stacklevel=2)
         return receipt
+
+    def names_of(self, stream: Readings) -> list[str]:
+        """The materials of which the memory has these very readings: none for a touch that it never learned.
+
+        stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream.
+        """
+        touch = self._extractor.stream(stream)
+        with self._locked() as ledger:
+            return ledger.contents().names(touch.key)
 
     def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.

@@ -19,7 +19,8 @@ class Receipt:
     material: its label. key: hash of the stream's content, 32 bytes.
     seconds: the stream's length; of a camera's, that of the frames in contact. clipped: values outside the sensor's
     range. durable: whether it is on disk; False in a memory without a path, and in a batch, which is durable at its
-    end.
+    end. repeated: whether the memory had this touch already: then nothing was learned, and the receipt is that of the
+    first time.
     """
 
     sequence: int
@@ -28,6 +29,7 @@ class Receipt:
     seconds: float
     clipped: int
     durable: bool
+    repeated: bool = field(default=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
             )
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
-            learner.observe(str(label), stream)
+            learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
         before = getattr(self, "classes_", labels[:0])
         self.learner_, self.n_features_in_ = learner, learner.sensor.channels
         self.classes_ = np.unique(np.concatenate([before, labels]))

@@ -19,7 +19,9 @@ import errno
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "SQLITE_ERRORS",
@@ -78,6 +80,10 @@ class DamageError(StoreError):
         super().__init__(message)
         self.path = path
         self.sequence = sequence
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A worker's error reaches whoever waits for it."""
+        return partial(type(self), path=self.path, sequence=self.sequence), self.args
 
 
 class CompactedError(StoreError):

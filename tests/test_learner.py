@@ -441,6 +441,8 @@ def test_a_receipt_says_what_was_kept(tmp_path):
     with opened(tmp_path / "m") as learner:
         learner.observe("silk", touch("silk", 1))
         receipt = learner.observe("wool", stream)
+        again = learner.observe("wool", stream)
+    assert again == receipt and again.repeated
     assert dataclasses.asdict(receipt) == {
         "sequence": 2,
         "material": "wool",
@@ -448,11 +450,12 @@ def test_a_receipt_says_what_was_kept(tmp_path):
         "seconds": 1.0,
         "clipped": 2,
         "durable": True,
+        "repeated": False,
     }
     assert len(receipt.key) == 32
     alone = TactileLearner(sensor=PAD, embedding=SMALL)
-    assert [alone.observe("wool", stream).sequence for _ in range(3)] == [1, 2, 3]
-    assert not alone.observe("wool", stream).durable
+    assert [alone.observe("wool", stream, again=True).sequence for _ in range(3)] == [1, 2, 3]
+    assert not alone.observe("wool", stream, again=True).durable
     assert alone.observe("wool", stream).key == receipt.key
 
 

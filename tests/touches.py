@@ -33,20 +33,20 @@ def stream(touch):
     return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
 
 
-def fed(observed, described=(), **settings):
-    """A memory without a path that observed these touches."""
+def fed(observed, described=(), *, again=False, **settings):
+    """A memory without a path that observed these touches; again: also those that come twice."""
     learner = TactileLearner(**SETTINGS | settings)
     for material, constituents in dict(described).items():
         learner.describe(material, constituents)
     for material, touch in observed:
-        learner.observe(material, stream(touch))
+        learner.observe(material, stream(touch), again=again)
     return learner
 
 
-def filled(path, observed=OBSERVED, **settings):
-    """A memory in a folder that observed these touches, and its receipts."""
+def filled(path, observed=OBSERVED, *, again=False, **settings):
+    """A memory in a folder that observed these touches, and its receipts; again: also those that come twice."""
     learner = TactileLearner.open(path, **SETTINGS | settings)
-    return learner, [learner.observe(name, stream(touch)) for name, touch in observed]
+    return learner, [learner.observe(name, stream(touch), again=again) for name, touch in observed]
 
 
 def without(*places):
@@ -62,7 +62,7 @@ def kept_of(learner):
 
 def contents(learner, *, exemplars=True):
     """Digest, exemplars, pool, kept touches and answers, to the byte."""
-    pool = [(name, key, touch.rows.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
+    pool = [(name, key, t.rows.tobytes(), t.pairs.tobytes(), t.copies) for name, key, t in learner.memory.sample]
     learner.settle()
     answers = [learner.predict(stream(touch)) for touch in ((7, 25), (8, 6), (9, 60), (9, 300))]
     return learner.digest(), learner.exemplars if exemplars else None, pool, kept_of(learner), answers
@@ -85,7 +85,7 @@ def _expected(observed, described, exemplars, settings):
     """What a memory without a path says that observed these; one of the same touches and settings is made once."""
     key = repr((observed, described, exemplars, settings, scroll_tactile.memory.state.TouchSample))
     if "embedding" in settings or key not in _EXPECTED:
-        whole = fed(observed, described, **settings)
+        whole = fed(observed, described, again=True, **settings)
         found = contents(whole, exemplars=exemplars)
         composition = repr(whole.compose(stream((7, 25)))) if described else ""
         _EXPECTED[key] = found, repr(whole.descriptions), composition

@@ -157,7 +157,8 @@ def _equal_runs(folder: Path, runs: int, note: Any) -> int:
     for seed in range(runs):
         note(f"run {seed}")
         draw, place = random.Random(seed), folder / f"random {seed}"
-        touches = [(draw.choice("abc"), draw.randrange(5)) for _ in range(draw.randrange(1, 16))]
+        own = [(name, 3 * number + i) for i, name in enumerate("abc") for number in range(5)]  # a content each
+        touches = [draw.choice(own) for _ in range(draw.randrange(1, 16))]
         for number, (material, touch) in enumerate(touches):
             path = place / "in" / material / f"{number}.npy"
             path.parent.mkdir(parents=True, exist_ok=True)

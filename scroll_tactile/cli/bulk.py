@@ -204,12 +204,15 @@ def evaluate(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    with_learned: Annotated[
+        bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
+    ] = False,
     as_json: AsJson = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
 ) -> None:
     """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
 
-    The memory stays as it is. The exit code is 1 where something was refused.
+    Touches that it has learned are left out. The memory stays as it is. The exit code is 1 where something was refused.
     """
     from scroll_tactile.pipelines.learning import evaluate_sources
     from scroll_tactile.pipelines.sources import find_sources
@@ -217,7 +220,7 @@ def evaluate(
     found, missing = find_sources(sources)
     options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
-        done = evaluate_sources(learner, found, options, progress)
+        done = evaluate_sources(learner, found, options, progress, with_learned=with_learned)
     refused = [*missing, *done.refused]
     if as_json:
         say_json(_figures(done) | {"refused": _refusals(refused)})
@@ -226,7 +229,7 @@ def evaluate(
         for each in done.answered:
             say_csv(*answer_row(each), each.touch.material, each.prediction.material == each.touch.material)
     else:
-        _report_evaluated(done)
+        _report_evaluated(done, with_learned)
     if not as_json:
         say_refused(refused)
     if refused:
@@ -244,6 +247,7 @@ def _figures(done: Evaluation) -> dict[str, Any]:
     ]
     return {
         "touches": len(familiar),
+        "learned_before": done.seen,
         "accuracy": done.answers.accuracy if familiar else None,
         "called_unknown": sum(not each.prediction.known for each in familiar),
         "calibration_error": done.calibration_error,
@@ -254,10 +258,13 @@ def _figures(done: Evaluation) -> dict[str, Any]:
     }
 
 
-def _report_evaluated(done: Evaluation) -> None:
+def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
     from scroll_tactile.pipelines.metrics import confusion_counts
 
     found, answers = _figures(done), done.answers
+    if done.seen:
+        what = "answered all the same" if with_learned else "left out; --with-learned answers them, too"
+        say(f"[bold]touches that it has learned:[/] {done.seen}, {what}")
     say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} materials that it learned")
     if found["touches"]:
         say(f"[bold]accuracy:[/] {percent(found['accuracy'])}")

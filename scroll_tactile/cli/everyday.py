@@ -75,6 +75,9 @@ def observe(
     field: Field = None,
     clock: Clock = None,
     columns: Columns = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Learn it also where the memory has this very touch already.")
+    ] = False,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     from scroll_tactile.learner import TactileLearner
@@ -87,10 +90,17 @@ def observe(
         TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         source = printable(str(file))[-LONGEST_SOURCE:]
-        receipt = learner.observe(material, recording.stream(learner.sensor), source=source)
+        stream = learner.stream(recording.stream(learner.sensor))
+        others = [name for name in learner.names_of(stream) if name != material]
+        receipt = learner.observe(material, stream, source=source, again=again)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
-    say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    if receipt.repeated:
+        say(f"{shown(material)}: this touch was learned already, as observation {receipt.sequence}")
+    else:
+        say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    if others:
+        say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 

@@ -67,7 +67,7 @@ def sample_of_windows(sample: TouchSample, scales: Collection[int], plan: Window
         own = touch.pairs[:, 0] < len(lengths)
         rows, pairs = touch.rows[own], touch.pairs[own]
         pairs[:, 1] -= before[pairs[:, 0]]
-        kept.add(material, key, SampledTouch(rows[pairs[:, 1] >= 0], pairs[pairs[:, 1] >= 0]))
+        kept.add(material, key, SampledTouch(rows[pairs[:, 1] >= 0], pairs[pairs[:, 1] >= 0], touch.copies))
     return kept
 
 

@@ -58,7 +58,13 @@ class GenerationChecks:
         totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in own}
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
         expect(all(touches), "observations", "a touch or more of each material", touches)
-        self._check_sample(arrays, _names("pool", attributes.get("pool"), materials))
+        sampled = _names("pool", attributes.get("pool"), materials)
+        self._check_sample(arrays, sampled)
+        if "copies" in attributes:  # before 0.7 there was nothing said of them
+            copies = attributes["copies"]
+            expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of pool", copies)
+            for each in copies:
+                whole("copies", each, 1, MOST_ROWS)
         if "kept" in attributes:
             self._check_kept(arrays, _names("kept", attributes["kept"], materials))
         if "exemplars" in attributes:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.changes import apply_appended, relabel
+from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
@@ -30,6 +31,7 @@ from scroll_tactile.memory.packing import pack_memory
 from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.rows import (
     DESCRIBE,
+    MEMBER,
     OBSERVE,
     RETRACT,
     SOURCE,
@@ -44,7 +46,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
-from store import CompactedError, ReadOnlyError, Record, Store, StoreClosedError, StoreError
+from store import CompactedError, DamageError, Head, ReadOnlyError, Record, Store, StoreClosedError, StoreError
 from store.files import is_there
 
 __all__ = ["Ledger"]
@@ -60,15 +62,24 @@ class Ledger:
     """The memory of one learner and the store that keeps it.
 
     load: reads the memory from the store, or makes an empty one without a store. bare: whether rows of observations
-    hold readings alone, to be embedded again when they are read.
+    hold readings alone, to be embedded again when they are read. contents: of a memory without a store that is not
+    empty.
 
     lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
     described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
     since it was last cleared; None where that is too much, or more has changed.
     """
 
-    def __init__(self, load: Callable[[], Memory], store: Store | None = None, bare: bool = False) -> None:
+    def __init__(
+        self,
+        load: Callable[[], Memory],
+        store: Store | None = None,
+        bare: bool = False,
+        contents: Contents | None = None,
+    ) -> None:
         self.store = store
+        # Of a store they are read from its heads when they are first asked for: 20 us each.
+        self._contents = contents or (Contents() if store is None else None)
         self._bare = bare
         self.lock = threading.RLock()
         self.version = 0
@@ -90,10 +101,25 @@ class Ledger:
             if self._undo is not None:
                 self._undo()
             else:
-                self._memory = self._load()
+                self._memory, self._contents = self._load(), None
             self._whole = True
             self._changed()
         return self._memory
+
+    def contents(self) -> Contents:
+        """Which touches the memory has, by their content; whoever calls holds the lock."""
+        memory = self.memory
+        if self._contents is None:
+            assert self.store is not None
+            gone = memory.retracted | memory.excluded
+            found = (head for head in _sound(self.store) if head.kind in (OBSERVE, MEMBER))
+            stand = (head for head in found if head.sequence not in gone and head.sequence <= memory.sequence)
+            self._contents = Contents((head.label, head.key, head.sequence) for head in stand)
+        return self._contents
+
+    def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
+        durable = self.store is not None and not self._batching
+        return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable, repeated)
 
     @contextmanager
     def _mutation(
@@ -154,20 +180,50 @@ class Ledger:
         except StoreError as error:  # of an earlier generation: the next commit would raise it instead of committing
             logger.warning("%s: no generation could be written: %s", store.path, error)
 
-    def observe(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None = None) -> Receipt:
-        """Append an observation to the journal, then add it to the memory."""
+    def observe(
+        self,
+        material: str,
+        stream: Stream,
+        columns: int,
+        codes: Codes,
+        source: str | None = None,
+        *,
+        again: bool = False,
+    ) -> Receipt:
+        """Append an observation to the journal, then add it to the memory; again: also one that is there already."""
         require_row(stream)
         with self.lock:
             self.require_open()
+            # In a memory opened to read the journal refuses all.
+            if not again and (self.store is None or self.store.mode == "write"):
+                known = self.contents().find(material, stream.key)
+                if known is not None:
+                    return self._receipt(known, material, stream, repeated=True)
             # Before the journal has it: every row there must fit at the next opening.
             self.memory.statistics.require_room(codes)
-            undo = self._memory.undo(material, stream.key, columns) if self.store is None else None
+            undo = self._undo_of(material, stream.key, columns) if self.store is None else None
             with self._mutation(_nothing, undo):
                 sequence = self._append(material, stream, columns, codes, source)
+                if self._contents is not None:
+                    self._contents.add(material, stream.key, sequence)
                 self._changed([(material, codes, 1)])
             self._snapshot_if_due()
-            durable = self.store is not None and not self._batching
-        return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable)
+            return self._receipt(sequence, material, stream)
+
+    def _undo_of(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
+        """What takes the next observation back, of a memory without a store."""
+        memory, sequence = self._memory.undo(material, key, columns), self._memory.sequence + 1
+
+        def undo() -> None:
+            memory()
+            self._contents_without(material, key, sequence)
+
+        return undo
+
+    def _contents_without(self, material: str, key: bytes, sequence: int) -> None:
+        """Take a touch out of the contents, if they were read."""
+        if self._contents is not None:
+            self._contents.remove(material, key, sequence)
 
     def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
         memory = self._memory
@@ -236,10 +292,16 @@ class Ledger:
             memory.sample, memory.kept, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
+            # Read again where this is cut short: what is believed to be there would not be learned.
+            contents, self._contents = self._contents, None
             retracted = [memory.retract(record) for record in records]
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
+            if contents is not None:
+                for record in records:
+                    contents.remove(record.label, record.key, record.sequence)
+            self._contents = contents
             self._changed(retracted)
         self._snapshot_if_due()
 
@@ -249,6 +311,7 @@ class Ledger:
             store = self.require_store("relabel anything")
             self._require_no_batch("a relabelling")
             record = observation_of(store, self.memory, receipt)
+            self._contents = None
             with self._mutation(), store.batch():
                 self._changed(relabel(self._memory, store, record, material))
             self._snapshot_if_due()
@@ -297,6 +360,7 @@ class Ledger:
             with _opened(other) as source:
                 source.read_with(memory.plan, thorough=True)
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
+                self._contents = None
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
             self._changed()
@@ -340,12 +404,13 @@ class Ledger:
             try:
                 if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
+                    self._contents = None
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
                     return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
-            self._memory, self._whole = self._load(), True
+            self._memory, self._contents, self._whole = self._load(), None, True
             self._changed()
             return True
 
@@ -418,6 +483,22 @@ class Ledger:
 
 def _nothing() -> None:
     """Nothing to revert: the journal refused the row before the memory was changed."""
+
+
+def _sound(store: Store) -> Iterator[Head]:
+    """The heads of a journal, without those that are damaged: of them nobody can say what they hold."""
+    after = 0
+    while True:
+        try:
+            for head in store.heads(after):
+                yield head
+                after = head.sequence
+            return
+        except DamageError as damage:
+            logger.warning("%s", damage)
+            if damage.sequence is None or damage.sequence <= after:
+                return
+            after = damage.sequence
 
 
 def _opened(other: str | os.PathLike[str] | Joint) -> AbstractContextManager[MemoryStore | Partial | Joint]:

@@ -149,8 +149,8 @@ class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed.
-    left_out: those of them that are counted once. descriptions: by material, those that we have not. Made by
-    `Incoming.of`.
+    left_out: those of them that are counted once, and what a fleet refused. descriptions: by material, those that we
+    have not. Made by `Incoming.of`.
     """
 
     source: Journal
@@ -183,7 +183,10 @@ class Incoming:
                 f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
                 'or count them twice, with shared="twice"'
             )
-        rows = incoming if not once else [head for head in incoming if (head.label, head.key) not in known]
+        refused = theirs.refused if isinstance(theirs, Joint) else frozenset()
+        out = {*(known if once else ()), *refused}
+        rows = [head for head in incoming if (head.label, head.key) not in out]
+        left_out = [head for head in incoming if (head.label, head.key) in out]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
@@ -196,7 +199,7 @@ class Incoming:
             for head in (known[head.label, head.key] for head in both):
                 if head.kind == OBSERVE and head.sequence > ours.compacted:
                     ours.record(head.sequence)
-        return cls(theirs, found, rows, len(both), both if once else [], described)
+        return cls(theirs, found, rows, len(both), left_out, described)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.

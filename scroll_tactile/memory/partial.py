@@ -228,18 +228,23 @@ class Partial:
 class Joint:
     """Partials with rows as one, read in place: touches one after another, and the sums of all of them.
 
-    parts: each with the numbers of its touches that are left out, since they came before. sums: those of the others.
-    descriptions: by material. Raises MismatchError where they are of different memories.
+    parts: each with the numbers of its touches that are left out, since they came before; one may come several times,
+    with some of them. sums: those of the others. descriptions: by material. refused: material and key of touches that
+    are in the sums, and that a merge leaves out. Raises MismatchError where they are of different memories.
     """
 
     has_rows = True
     compacted = 0
 
     def __init__(
-        self, parts: Sequence[tuple[Partial, Collection[int]]], sums: Partial, descriptions: Mapping[str, Description]
+        self,
+        parts: Sequence[tuple[Partial, Collection[int]]],
+        sums: Partial,
+        descriptions: Mapping[str, Description],
+        refused: Collection[tuple[str, bytes]] = (),
     ) -> None:
         self.path, self.identity, self._sums = sums.path, sums.identity, sums
-        self.descriptions = dict(descriptions)
+        self.descriptions, self.refused = dict(descriptions), frozenset(refused)
         self._parts = [partial for partial, _ in parts]
         for partial in self._parts:
             if partial.identity != self.identity:
@@ -283,8 +288,7 @@ class Joint:
 def sums_without(source: Partial | Joint, memory: Memory, left_out: Collection[int]) -> Memory:
     """What the touches of a source taught, without some of them, whose rows it must have, exactly.
 
-    memory: any of that making. What is left out must be somewhere else: no other touch takes its place in the samples.
-    Raises DamageError.
+    memory: any of that making. Raises DamageError.
     """
     found = source.sums()
     sums, gone = memory.of_sums(found.arrays, found.attributes), memory.of_nothing()
@@ -294,12 +298,10 @@ def sums_without(source: Partial | Joint, memory: Memory, left_out: Collection[i
         record = source.record(sequence)
         columns, codes = memory.codes(record)
         gone.statistics.add(record.label, codes, columns)
-    stays = {(head.label, head.key) for head in source.heads() if head.sequence not in left_out}
     rest = memory.of_nothing()
     rest.statistics = sums.statistics - gone.statistics
-    rest.sample.update(item for item in sums.sample if item[:2] in stays)
-    if rest.kept is not None and sums.kept is not None:
-        rest.kept.update(item for item in sums.kept if item[:2] in stays)
+    rest.exemplars = None  # the rows have them
+    rest.choose([head for head in source.heads() if head.sequence not in left_out], source, sums)
     return rest
 
 

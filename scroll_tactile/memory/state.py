@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import logging
 import sys
-from collections.abc import Callable
-from typing import Any, cast
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +46,14 @@ __all__ = ["Memory", "apply_description", "give_back_scratch"]
 logger = logging.getLogger(__name__)
 
 ATTEMPTS = 20  # of a reader, while a writer changes the store
+
+
+class Rows(Protocol):
+    """Where rows of observations can be read: a store, or a partial."""
+
+    def record(self, sequence: int) -> Record:
+        """A row with its arrays."""
+        ...
 
 
 class Memory:
@@ -117,7 +127,7 @@ class Memory:
         journal has is added by `replay`. Raises CapacityError before anything is added.
         """
         self.statistics.add(material, codes, columns)
-        if self.sample.wants(material, key):
+        if self.sample.wants(material, key) or self.sample.holds(material, key):
             self.sample.add(material, key, self._touch(columns, codes))
         if self.kept is not None:
             self.kept.take(material, key, readings)
@@ -128,7 +138,11 @@ class Memory:
     def undo(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
         """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
         chosen = [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
-        parts = [sample.undo(material, key) for sample in chosen if sample.wants(material, key)]
+        parts = [
+            sample.undo(material, key)
+            for sample in chosen
+            if sample.wants(material, key) or sample.holds(material, key)
+        ]
         parts.append(self.statistics.undo(material, columns))
         sequence = self.sequence
 
@@ -229,30 +243,37 @@ class Memory:
 
     def _chosen(self, store: Store, upto: int) -> Memory:
         """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
-        touches = {(material, key): touch for material, key, touch in self.sample}
         fresh = self._base_samples(store)
         for head in store.heads(self.base, kind=MERGE):
             if head.sequence <= upto:
                 fresh._join(store.record(head.sequence))
-        heads = [head for head in self.retractable(store) if head.sequence <= upto]
+        fresh.choose([head for head in self.retractable(store) if head.sequence <= upto], store, self)
+        return fresh
+
+    def choose(self, heads: Sequence[Head], source: Rows, made: Memory) -> None:
+        """Choose samples and exemplars among what they hold and some observations, whose rows `source` has.
+
+        made: a memory whose samples have some of them ready.
+        """
+        touches = {(material, key): touch for material, key, touch in made.sample}
 
         def touch(material: str, key: bytes, sequence: int) -> SampledTouch:
-            return touches.get((material, key)) or self._touch(*self.codes(store.record(sequence)))
+            own = touches.get((material, key))
+            return self._touch(*self.codes(source.record(sequence))) if own is None else replace(own, copies=1)
 
-        fresh.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
+        self.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
-        if fresh.kept is not None:
-            mine, made = {(material, key): own for material, key, own in self.kept or ()}, fresh.kept.made
+        if self.kept is not None:
+            mine, keeping = {(material, key): own for material, key, own in made.kept or ()}, self.kept.made
 
             def levels(material: str, key: bytes, sequence: int) -> LevelArray:
                 if (own := mine.get((material, key))) is not None:
                     return own
-                return made.levels(cast(Readings, unpack_readings(store.record(sequence).arrays)))
+                return keeping.levels(cast(Readings, unpack_readings(source.record(sequence).arrays)))
 
-            fresh.kept.refill(((head.label, head.key, head.sequence) for head in read), levels)
-        if fresh.exemplars is not None:
-            fresh.exemplars.update((head.label, head.key, head.sequence) for head in read)
-        return fresh
+            self.kept.refill(((head.label, head.key, head.sequence) for head in read), levels)
+        if self.exemplars is not None:
+            self.exemplars.update((head.label, head.key, head.sequence) for head in read)
 
     def _to_keep(self, record: Record) -> Readings | None:
         """The readings of an observation, where it belongs to the kept touches and its row holds them."""
@@ -276,17 +297,43 @@ class Memory:
                 "repair)",
                 damage,
             )
-            heads = (head for head in store.heads() if head.sequence <= self.base and head.kind in (OBSERVE, MEMBER))
-            compacted = {(head.label, head.key) for head in heads}
-            fresh.sample.update(item for item in self.sample if item[:2] in compacted)
+            compacted = self._counted(store, self.base)
+            fresh.sample.update(
+                (name, key, replace(touch, copies=compacted[name, key]))
+                for name, key, touch in self.sample
+                if compacted[name, key]
+            )
             if fresh.kept is not None and self.kept is not None:
                 fresh.kept.update(item for item in self.kept if item[:2] in compacted)
             if fresh.exemplars is not None and self.exemplars is not None:
                 fresh.exemplars.update(item for item in self.exemplars if item[:2] in compacted)
             return fresh
         if base is not None:
-            fresh._take(base.arrays, base.attributes, 0)
+            fresh._take_from(base, store)
         return fresh
+
+    def _counted(self, store: Store, upto: int) -> Counter[tuple[str, bytes]]:
+        """How often each stream was observed, by material and key, up to a row and without what was retracted."""
+        gone = self.retracted | self.excluded
+        return Counter(
+            (head.label, head.key)
+            for head in store.heads()
+            if head.sequence <= upto and head.kind in (OBSERVE, MEMBER) and head.sequence not in gone
+        )
+
+    def _take_from(self, generation: Generation, store: Store) -> None:
+        """Take in a generation of a store; what an earlier version wrote does not say how often a touch is there."""
+        self._take(generation.arrays, generation.attributes, 0)
+        if "copies" in generation.attributes or not len(self.sample):
+            return
+        try:
+            counted = self._counted(store, generation.upto)
+        except DamageError as damage:
+            logger.warning("%s; what was observed several times counts once in the calibration", damage)
+            return
+        for name, key, touch in self.sample:
+            if (more := counted[name, key] - touch.copies) > 0:
+                self.sample.add(name, key, replace(touch, copies=more))
 
     def require_base(self, store: Store) -> None:
         """Raise CompactedError where the store was compacted since this memory was read."""
@@ -338,6 +385,7 @@ class Memory:
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "pool": materials,
+            "copies": [touch.copies for *_, touch in self.sample],
             "capacity": [self.capacity, None],  # version 0.1 had a limit in bytes beside it
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
@@ -396,7 +444,7 @@ class Memory:
         earlier = None if current else newest
         start = store.base() if newest is None or earlier is not None else newest
         if start is not None:
-            self._take(start.arrays, start.attributes, 0)
+            self._take_from(start, store)
             self.sequence = start.upto
         self.generation = None if newest is None else newest.number
         self.saved = self.sequence if earlier is None else 0
@@ -433,7 +481,7 @@ class Memory:
     def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        sample = TouchSample.from_arrays(arrays, attributes["pool"])
+        sample = TouchSample.from_arrays(arrays, attributes["pool"], attributes.get("copies"))
         self.sample = sample_of_windows(sample, attributes["scales"], self.plan)
         if self.kept is not None and "kept" in attributes:
             self.kept.fill(arrays, attributes["kept"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -12,17 +13,23 @@ from multiprocessing import get_all_start_methods, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from typing import Any
 
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.pipelines.partials import LearnJob, Made, SumJob, learn_partial
 
 __all__ = ["Engine", "Processes", "engine"]
+
+STARTS = 5  # of a worker: what starts it may have been killed as well, and takes a moment to be noticed
+PAUSE = 0.1
 
 
 class Engine:
     """Who runs the jobs: an Executor of the caller's.
 
-    workers: how many jobs run at once, as far as is known. room: how many are handed over at once.
+    workers: how many jobs run at once, as far as is known. room: how many are handed over at once. own: whether they
+    are processes of ours, which can be ended.
     """
+
+    own = False
 
     def __init__(self, executor: Executor, workers: int) -> None:
         self._executor, self.workers, self.room = executor, workers, 2 * workers
@@ -30,6 +37,15 @@ class Engine:
     def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
         """Have a job done; the future raises where it could not be."""
         return self._executor.submit(what, job)
+
+    def abandon(self, future: Future[Made]) -> None:
+        """Wait no longer for a job."""
+        future.cancel()
+
+    @property
+    def name(self) -> str:
+        """What runs the jobs."""
+        return type(self._executor).__name__
 
     def __enter__(self) -> Engine:
         return self
@@ -41,10 +57,13 @@ class Engine:
 class Processes(Engine):
     """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
 
+    own = True
+
     def __init__(self, workers: int) -> None:
         self.workers = self.room = workers
         self._free: list[ProcessPoolExecutor] = []
         self._all: set[ProcessPoolExecutor] = set()
+        self._busy: dict[Future[Made], ProcessPoolExecutor] = {}
         method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
         self._context: Any = get_context(method)
         if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
@@ -52,15 +71,39 @@ class Processes(Engine):
 
     def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
         """As `Engine.submit`, by a process that has nothing else to do."""
-        pool = self._free.pop() if self._free else self._new()
-        try:
-            future = pool.submit(what, job)
-        except BrokenProcessPool:  # it died while it waited
-            self._all.discard(pool)
-            pool = self._new()
-            future = pool.submit(what, job)
+        for left in range(STARTS, 0, -1):
+            pool = self._free.pop() if self._free else self._new()
+            try:
+                future = pool.submit(what, job)
+            except (BrokenProcessPool, EOFError, OSError) as error:  # it died while it waited, or its fork server did
+                self._drop(pool)
+                if left == 1:
+                    why = f"{type(error).__name__}: {error}"
+                    raise ScrollTactileError(f"no worker can be started ({why}). Call again to go on") from error
+                time.sleep(PAUSE)
+            else:
+                break
+        self._busy[future] = pool
         future.add_done_callback(lambda done: self._back(pool, done))
         return future
+
+    def abandon(self, future: Future[Made]) -> None:
+        """End the process that does a job, however it is held."""
+        pool = self._busy.pop(future, None)
+        if pool is not None:
+            processes = list((pool._processes or {}).values())  # none after its end
+            self._drop(pool)
+            for process in processes:
+                process.kill()
+
+    @property
+    def name(self) -> str:
+        """What runs the jobs."""
+        return f"{self.workers} processes"
+
+    def _drop(self, pool: ProcessPoolExecutor) -> None:
+        self._all.discard(pool)
+        pool.shutdown(wait=False)
 
     def _new(self) -> ProcessPoolExecutor:
         pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
@@ -69,9 +112,8 @@ class Processes(Engine):
 
     def _back(self, pool: ProcessPoolExecutor, done: Future[Made]) -> None:
         broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
-        if broken:
-            self._all.discard(pool)
-            pool.shutdown(wait=False)
+        if self._busy.pop(done, None) is None or broken:  # it was abandoned, or died
+            self._drop(pool)
         else:
             self._free.append(pool)
 

@@ -10,35 +10,36 @@ Who runs the jobs is chosen by what is passed: processes on this machine, or a c
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, ObservationError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import usual_embedding
 from scroll_tactile.memory.merge import Choice
-from scroll_tactile.memory.partial import Joint, Partial
+from scroll_tactile.pipelines.addresses import expand, is_memory
+from scroll_tactile.pipelines.choosing import Part
 from scroll_tactile.pipelines.engines import Engine, engine
+from scroll_tactile.pipelines.gathering import FleetReport, Gathering
 from scroll_tactile.pipelines.partials import (
+    Contained,
     LearnJob,
     Made,
     Making,
     SumJob,
-    expand,
-    is_memory,
     learn_partial,
+    packed_path,
     sum_partials,
 )
-from scroll_tactile.pipelines.runfile import RunFile
+from scroll_tactile.pipelines.runfile import RunFile, alone_in
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
@@ -53,32 +54,13 @@ MOST_SOURCES = 1024  # of a job: of touches of 6 ms so many cost thirty times wh
 MOST_BYTES = 2**26  # of their files, where these are here
 JOBS_A_WORKER = 4  # at least, so that all have something to do to the end
 NOTES = "run.json"
+PARTS = (".part", ".partial")
 TRIES = 20  # of a job of one source whose worker died: on a machine that kills a worker a second, nearly all end sooner
 SLOW = 5  # tries that one counts for which took all the patience that there is
+QUEUED = 2  # times its patience, and GRACE seconds: so long may a job be under way, for it may wait behind another, and
+GRACE = 10.0  # a worker takes a moment to begin
 
 Progress = Callable[[str, int, int], object]
-
-
-@dataclass
-class FleetReport:
-    """What a run did.
-
-    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
-    those that had come before, by their names and contents. refused: what was not learned, and why. deaths: jobs whose
-    worker ended before them. seconds: of all, and of the merge at the end. processor: seconds of the workers' and of
-    this process, of learning, of sums and of the merge. held, digest: of the memory that came out.
-    """
-
-    sources: int = 0
-    observations: int = 0
-    repeated: int = 0
-    refused: list[Refused] = field(default_factory=list)
-    deaths: int = 0
-    seconds: float = 0.0
-    merging: float = 0.0
-    held: int = 0
-    digest: str = ""
-    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "sums": 0.0, "merge": 0.0})
 
 
 def learn(
@@ -109,15 +91,17 @@ def learn(
     the destination, where partials lie meanwhile.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
     destination comes first, then the sources in their order. patience: seconds that a job, or listing an address, may
-    take before it is given up. fan: how many partials are summed up at once. progress: called with (what is being done,
+    take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none to
+    any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
     sources done, sources in all).
 
     A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
     the report, and so are those whose workers die again and again; all others are learned.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
-    for a destination of another sensor; CapacityError beyond what exact sums hold; StoreFullError and other
-    StoreErrors: call again to go on.
+    for a destination of another sensor; CapacityError beyond what exact sums hold; LockedError while another fleet is
+    at work for this destination; ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors:
+    call again to go on.
     """
     begun = time.perf_counter()
     place = Path(destination).absolute()
@@ -125,11 +109,12 @@ def learn(
     report = FleetReport(refused=missing)
     settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "recall": recall}
     with ExitStack() as stack:
+        stack.enter_context(alone_in(_folder_of(place), place))
         held = None
         if place.exists():
             held = stack.enter_context(TactileLearner.open(place, sensor=sensor, embedding=embedding, **settings))
         making = _making(held, sensor, embedding, settings, options or SourceOptions(), patience)
-        folder = place.with_name(place.name + ".fleet")
+        folder = _folder_of(place)
         if held is not None and held.observations() and not (folder / NOTES).exists() and not add:
             raise InputError(
                 f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
@@ -138,18 +123,22 @@ def learn(
         run = _Run(folder, making, report, fan, progress)
         run.begin(found)
         with engine(client, workers) as chosen:
-            parts, sums = run.work(chosen)
+            sums = run.work(chosen)
         if held is None:
-            if not parts and not run.whole:
+            if sums is None and not run.whole:
                 raise InputError(_nothing(report))
             held = TactileLearner.open(place, sensor=making.sensor, embedding=making.embedding, **settings)
             stack.enter_context(held)
-        run.merge(held, parts, sums, descriptions)
+        run.merge(held, sums, descriptions)
         report.held, report.digest = sum(held.materials.values()), held.digest()
         held.close()
         run.end()
     report.seconds = time.perf_counter() - begun
     return report
+
+
+def _folder_of(place: Path) -> Path:
+    return place.with_name(place.name + ".fleet")
 
 
 def _nothing(report: FleetReport) -> str:
@@ -184,28 +173,37 @@ class _Run:
         self._notes = RunFile(folder / NOTES, plan)
         self._waiting: deque[tuple[LearnJob | SumJob, int]] = deque()
         self._order: dict[str, int] = {}
-        self._seen: set[bytes] = set()
-        self._parts: list[tuple[Made, tuple[int, ...]]] = []
+        self._seen: set[tuple[str, bytes]] = set()
+        self._parts: list[Part] = []
         self._ready: list[tuple[str, tuple[int, ...]]] = []
         self._sums = 0
+        self._outdated = 0  # sums up to this one are of partials that were not what they seemed
         self._begun = time.perf_counter()
-        self._learned: set[str] = set(self._notes.notes.get("learned", []))
-        self.whole: list[Made] = []
+        self._answered = -math.inf
+        noted = self._notes.notes.get("learned", [])
+        if not isinstance(noted, list) or not all(isinstance(source, str) for source in noted):
+            raise InputError(f"expected the sources that a run learned in {folder / NOTES}; they are {noted!r:.80}")
+        self._learned: set[str] = set(noted)
+        self.whole: list[Contained] = []
 
     def begin(self, found: Sequence[str]) -> None:
         """Take what an earlier run left behind, and cut the rest into jobs."""
         self._order = {source: place for place, source in enumerate(found)}
         learned = self._learned
         for path in sorted(self.folder.iterdir()):
-            if not path.name.startswith("learned-") or path.suffix != ".part":
+            if path.suffix not in PARTS:
+                continue
+            if not path.is_file():
+                raise InputError(f"{path} is no file, and in the way of one that this run writes: move it away")
+            if not path.name.startswith("learned-"):
                 continue
             try:
-                made = Made.of(path)
+                held = Contained.of(path, self.making, thorough=True)
             except (StoreError, ScrollTactileError) as error:
                 logger.warning("%s; its sources are learned again", error)
                 continue
-            if learned.isdisjoint(made.sources) and set(made.sources) <= set(found):
-                self._take(made)
+            if learned.isdisjoint(held.learned) and set(held.sources) <= set(found):
+                self._take(held)
         self.report.sources = len(learned & set(found))
         self._total = len(found)
         left = [source for source in found if source not in learned]
@@ -232,8 +230,8 @@ class _Run:
         if group:
             self._waiting.append((self._job(group), 0))
 
-    def work(self, engine: Engine) -> tuple[list[tuple[Made, tuple[int, ...]]], str | None]:
-        """Have all jobs done; returns the partials with rows, in the order of the sources, and the sum of all."""
+    def work(self, engine: Engine) -> str | None:
+        """Have all jobs done; returns the sum of all partials with rows."""
         self._cut(engine.workers)
         running: dict[Future[Made], tuple[LearnJob | SumJob, int, float]] = {}
         try:
@@ -243,14 +241,41 @@ class _Run:
                     job, tries = self._waiting.popleft()
                     what = learn_partial if isinstance(job, LearnJob) else sum_partials
                     running[engine.submit(what, job)] = job, tries, time.monotonic()
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                for future in wait(running, self._longest(running), FIRST_COMPLETED).done:
+                    self._answered = time.monotonic()
                     self._done(future, *running.pop(future))
+                self._give_up(engine, running)
         except BaseException:
             for future in running:
                 future.cancel()
             raise
-        parts = sorted(self._parts, key=lambda part: self._order.get(part[0].sources[0], 0) if part[0].sources else 0)
-        return parts, self._ready[0][0] if self._ready else None
+        return self._ready[0][0] if self._ready else None
+
+    @property
+    def _bound(self) -> float:
+        """Seconds in which a job that was handed over is answered."""
+        patience = self.making.patience
+        return math.inf if patience is None else QUEUED * patience + GRACE
+
+    def _longest(self, running: Mapping[Future[Made], tuple[LearnJob | SumJob, int, float]]) -> float | None:
+        """Seconds until the first of these jobs is given up; None where nobody has a patience."""
+        if math.isinf(self._bound) or not running:
+            return None
+        return max(0.0, min(begun for *_, begun in running.values()) + self._bound - time.monotonic())
+
+    def _give_up(self, engine: Engine, running: dict[Future[Made], tuple[LearnJob | SumJob, int, float]]) -> None:
+        """Hand jobs over again that nobody answers. Raises ScrollTactileError where nobody answers any."""
+        before = time.monotonic() - self._bound
+        late = [future for future, (*_, begun) in running.items() if begun <= before and not future.done()]
+        if late and not engine.own and len(late) == len(running) and self._answered <= before:
+            raise ScrollTactileError(
+                f"{engine.name} has answered no job for {self._bound:.0f} s: look whether it has workers, and whether "
+                f"they reach {self.folder}. What was learned is kept there: call again to go on"
+            )
+        for future in late:
+            job, tries, _ = running.pop(future)
+            engine.abandon(future)
+            self._lost(job, tries + SLOW, TimeoutError(f"no answer in {self._bound:.0f} s"))
 
     def _alone(self) -> bool:
         """Whether the one partial that is left has touches to be left out, and is no sum yet."""
@@ -262,11 +287,12 @@ class _Run:
             parts, self._ready = self._ready[: self._fan], self._ready[self._fan :]
             self._sums += 1
             target = self.folder / f"sum-{os.getpid()}-{self._sums}.part"
-            self._waiting.appendleft((SumJob(self.making, tuple(parts), str(target)), 0))
+            self._waiting.appendleft((SumJob(self.making, tuple(parts), str(target), self._sums), 0))
 
     def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int, begun: float) -> None:
         try:
-            made = future.result()
+            made = _sound(future.result(), job)
+            held = self._held_by(job, made) if isinstance(job, LearnJob) and made.path else None
         except (CapacityError, StoreFullError, KeyboardInterrupt):
             raise
         except Exception as error:
@@ -279,35 +305,46 @@ class _Run:
             return
         self.report.processor["learning"] += made.processor
         self.report.refused += made.refused
-        self.report.sources += len(made.sources)
-        if made.path:
-            self._take(made)
+        if held is not None:
+            self.report.sources += len(held.learned)
+            self._take(held)
         seconds = time.perf_counter() - self._begun
         count, done = len(self._seen), self.report.sources + len(self.report.refused)
         left = f", {seconds / done * (self._total - done):.0f} s left" if 0 < done <= self._total else ""
         failed = f", {len(self.report.refused)} refused" if self.report.refused else ""
         self._progress(f"{count} touches, {count / seconds:.0f} a second{left}{failed}", done, self._total)
 
-    def _take(self, made: Made) -> None:
-        """Take a partial in: what came before is left out of it."""
-        self._learned.update(made.sources)
-        if not made.has_rows:
-            self.whole.append(made)
+    def _held_by(self, job: LearnJob, made: Made) -> Contained:
+        """What is in the partial that a job made. Raises StoreError, MismatchError where it is not that of the job."""
+        held = Contained.of(Path(made.path), self.making, job.sources[0] if job.memory else None)
+        if held.sources != job.sources:
+            raise MismatchError(f"{made.path} is of other sources than those of its job")
+        return held
+
+    def _take(self, held: Contained) -> None:
+        """Take a partial in: of touches that came before, under their names, the sums have the first."""
+        self._learned.update(held.learned)
+        if not held.has_rows:
+            self.whole.append(held)
             return
-        left_out = []
-        for number, touch in enumerate(made.touches, start=1):
+        out = set()
+        for number, touch in enumerate(held.touches, start=1):
             if touch in self._seen:
-                left_out.append(number)
+                out.add(number)
             self._seen.add(touch)
-        self.report.repeated += len(left_out)
-        made.touches = []
-        self._parts.append((made, tuple(left_out)))
-        self._ready.append((made.path, tuple(left_out)))
+        part = Part(held, frozenset(out))
+        self._parts.append(part)
+        if held.touches:
+            self._ready.append(part.summed)
 
     def _lost(self, job: LearnJob | SumJob, tries: int, error: Exception) -> None:
         """A job ended without its partial: again, by halves, and in the end without the source that ends workers."""
         self.report.deaths += 1
         logger.info("a job of %s ended: %s: %s", job.making.sensor.name, type(error).__name__, error)
+        if isinstance(job, SumJob) and (
+            job.number <= self._outdated or (isinstance(error, StoreError | MismatchError) and self._learn_again())
+        ):
+            return
         if halves := job.halves():
             self._waiting.extendleft((half, 0) for half in halves)
         elif tries < TRIES:
@@ -319,81 +356,69 @@ class _Run:
         else:  # nobody's data but ours: what is wrong with it is raised here
             self._summed(job, sum_partials(job))
 
+    def _learn_again(self) -> bool:
+        """Have the sources of partials learned again that are not what they seemed; whether there are any."""
+        sound, spoilt = [], []
+        for part in self._parts:
+            address = part.held.sources[0] if part.held.memory else None
+            try:
+                sound.append(Contained.of(Path(part.held.path), self.making, address, thorough=True))
+            except (StoreError, MismatchError) as error:
+                logger.warning("%s; its sources are learned again", error)
+                spoilt.append(part.held)
+        if not spoilt:
+            return False
+        # All sums are begun anew: a touch that is left out of one partial may have been in another.
+        self._outdated = self._sums
+        self._waiting = deque((job, tries) for job, tries in self._waiting if isinstance(job, LearnJob))
+        self._seen, self._parts, self._ready = set(), [], []
+        for held in sound:
+            self._take(held)
+        for held in spoilt:
+            self._learned.difference_update(held.learned)
+            self.report.sources -= len(held.learned)
+            self._waiting.append((self._job(held.sources, memory=held.memory), 0))
+        return True
+
     def _summed(self, job: SumJob, made: Made) -> None:
         self.report.processor["sums"] += made.processor
-        self._ready.append((made.path, ()))
+        if job.number > self._outdated:
+            self._ready.append((made.path, ()))
         for path, _ in job.parts:
             if Path(path).name.startswith("sum-"):
                 Path(path).unlink(missing_ok=True)
 
-    def merge(
-        self,
-        held: TactileLearner,
-        parts: Sequence[tuple[Made, tuple[int, ...]]],
-        sums: str | None,
-        descriptions: Choice,
-    ) -> None:
+    def merge(self, held: TactileLearner, sums: str | None, descriptions: Choice) -> None:
         """Put everything into the memory; what is there already is left out."""
-        begun, processor = time.perf_counter(), time.process_time()
 
         def progress(what: str, done: int, of: int) -> None:
             self._progress(f"{what} {done} of {of} touches", self._total, self._total)
 
-        with ExitStack() as stack:
-            if sums is not None and parts:
-                opened = [(stack.enter_context(Partial(Path(made.path))), out) for made, out in parts]
-                described = _described([partial for partial, _ in opened], descriptions)
-                joint = Joint(opened, stack.enter_context(Partial(Path(sums))), described)
-                done = held.merge(joint, shared="once", descriptions=descriptions, progress=progress)
-                self.report.observations += done.observations
-                self.report.repeated += done.shared
-        for made in self._whole_sums():
-            try:
-                done = held.merge(made.path, shared="once", descriptions=descriptions, progress=progress)
-                self.report.observations += done.observations
-            except (MismatchError, ObservationError) as error:
-                self.report.refused += [Refused(source, str(error)) for source in made.sources]
-                self._learned.difference_update(made.sources)
-        self.report.merging = time.perf_counter() - begun
-        self.report.processor["merge"] += time.process_time() - processor
-
-    def _whole_sums(self) -> list[Made]:
-        """The partials without rows, as one where they add up and share no touch; each of the others by itself."""
-        together: list[Made] = []
-        alone: list[Made] = []
-        for made in sorted(self.whole, key=lambda made: self._order[made.sources[0]]):
-            adds_up = made.adds_up and not made.descriptions and self._seen.isdisjoint(made.touches)
-            (together if adds_up else alone).append(made)
-            self._seen.update(made.touches if adds_up else ())
-        if len(together) > 1:
-            target = self.folder / f"sum-{os.getpid()}-whole.part"
-            done = sum_partials(SumJob(self.making, tuple((made.path, ()) for made in together), str(target)))
-            self.report.processor["sums"] += done.processor
-            together = [Made(done.path, tuple(made.sources[0] for made in together), False)]
-        return [*together, *alone]
+        gathering = Gathering(self.folder, self.making, self.report, self._order, progress)
+        gathering.merge(held, [part.held for part in self._parts], sums, self.whole, descriptions)
+        self._learned -= gathering.refused
 
     def end(self) -> None:
         """Note what was learned, and remove the partials."""
         self._notes.note("learned", sorted(self._learned))
         for path in self.folder.iterdir():
-            if path.suffix in (".part", ".partial"):
+            if path.suffix in PARTS and path.is_file():
                 path.unlink()
 
 
-def _described(partials: Sequence[Partial], choice: Choice) -> dict[str, Description]:
-    """The descriptions of all; raises MismatchError where two differ and nobody chose."""
-    found: dict[str, tuple[Description, Path]] = {}
-    for partial in partials:
-        for material, description in partial.descriptions.items():
-            before = found.get(material)
-            if before is not None and repr(before[0]) != repr(description) and choice == "same":
-                raise MismatchError(
-                    f"{before[1]} and {partial.path} describe {material!r} differently: as {before[0]}, and as "
-                    f"{description}. Choose with descriptions='ours' (the first) or 'theirs' (the last)"
-                )
-            if before is None or choice == "theirs":
-                found[material] = description, partial.path
-    return {material: description for material, (description, _) in found.items()}
+def _sound(made: object, job: LearnJob | SumJob) -> Made:
+    """What a job gave back, as far as nobody but its worker can know it. Raises MismatchError for anything else."""
+    if not isinstance(made, Made):
+        raise MismatchError(f"expected what a job made; who runs the jobs gave {type(made).__name__}")
+    own = {str(job.target)}
+    if isinstance(job, LearnJob) and job.memory:
+        own = {str(packed_path(job)), str(Path(job.sources[0])), ""}
+    if made.path not in own:
+        raise MismatchError(f"expected the partial of a job in one of {sorted(own)}; came {made.path!r:.200}")
+    refused = isinstance(made.refused, list) and all(isinstance(each, Refused) for each in made.refused)
+    if not refused or not isinstance(made.processor, float) or (not made.path and not made.refused):
+        raise MismatchError(f"expected what a job refused, and what it took; came {made!r:.200}")
+    return made
 
 
 def _bytes_of(source: str) -> int:

@@ -10,6 +10,7 @@ from time import monotonic
 
 from scroll_tactile.errors import InputError, printable
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.memory.contents import refusal
 from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
@@ -52,23 +53,12 @@ def learn(
     Raises StoreError and CapacityError; what was learned until then is kept.
     """
     done, batch = Learned(), _Batch(learner)
-    standing = [row for row in learner.observations() if row.state != "retracted"]
-    names = {row.key: row.material for row in standing}
-    known = {(row.key, row.material) for row in standing}
     for number, address in enumerate(sources):
         progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
         for touch in source_touches(learner, address, options):
             if isinstance(touch, Refused):
                 done.refused.append(touch)
-                continue
-            key, material = touch.stream.key, str(touch.material)
-            if (key, material) in known:
-                done.skipped += 1
-            elif (name := names.setdefault(key, material)) != material:
-                why = f"the memory has this touch already, as {name!r} and not as {material!r}: relabel one of them"
-                done.refused.append(Refused(touch.source, why))
             else:
-                known.add((key, material))
                 batch.add(touch, done)
         done.files += 1
     batch.observe(done)
@@ -98,9 +88,17 @@ class _Batch:
         touches, self._touches, self._bytes = self._touches, [], 0
         with self._learner.batch():
             for touch in touches:
+                material = str(touch.material)
+                names = self._learner.names_of(touch.stream)
+                if material in names:
+                    done.skipped += 1
+                    continue
+                if (why := refusal(names, material)) is not None:
+                    done.refused.append(Refused(touch.source, why))
+                    continue
                 try:
-                    self._learner.observe(str(touch.material), touch.stream, source=touch.source)
-                    done.learned[str(touch.material)] += 1
+                    self._learner.observe(material, touch.stream, source=touch.source)
+                    done.learned[material] += 1
                 except InputError as error:  # one that is too long
                     done.refused.append(Refused(touch.source, str(error)))
 
@@ -123,10 +121,16 @@ def answers(
     progress: Progress = lambda what, done, of: None,
 ) -> Iterator[Answered | Refused]:
     """What each touch in sources feels like; the memory stays as it is. named: as of `source_touches`."""
+    for touch in _touches(learner, sources, options, progress, named=named):
+        yield touch if isinstance(touch, Refused) else Answered(touch, learner.predict(touch.stream, scene=scene))
+
+
+def _touches(
+    learner: TactileLearner, sources: Sequence[str], options: SourceOptions, progress: Progress, *, named: bool
+) -> Iterator[SourceTouch | Refused]:
     for number, address in enumerate(sources):
         progress(printable(Path(address).name), number, len(sources))
-        for touch in source_touches(learner, address, options, named=named):
-            yield touch if isinstance(touch, Refused) else Answered(touch, learner.predict(touch.stream, scene=scene))
+        yield from source_touches(learner, address, options, named=named)
 
 
 @dataclass(frozen=True)
@@ -134,11 +138,13 @@ class Evaluation:
     """Answers to touches whose material is known.
 
     answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory.
+    seen: touches that the memory had learned, under any name; left out, or answered where that was asked for.
     """
 
     answered: tuple[Answered, ...]
     refused: tuple[Refused, ...]
     learned: frozenset[str]
+    seen: int = 0
 
     @property
     def familiar(self) -> list[Answered]:
@@ -176,10 +182,23 @@ def evaluate_sources(
     sources: Sequence[str],
     options: SourceOptions,
     progress: Progress = lambda what, done, of: None,
+    *,
+    with_learned: bool = False,
 ) -> Evaluation:
-    """Answer every touch in sources with what the memory knows, settled, and keep what it should have said."""
+    """Answer every touch in sources with what the memory knows, settled, and keep what it should have said.
+
+    with_learned: also those that the memory learned, of which it says what it was told.
+    """
     learner.settle()
-    found = list(answers(learner, sources, options, named=True, progress=progress))
-    answered = tuple(each for each in found if isinstance(each, Answered))
-    refused = tuple(each for each in found if isinstance(each, Refused))
-    return Evaluation(answered, refused, frozenset(learner.materials))
+    answered: list[Answered] = []
+    refused: list[Refused] = []
+    seen = 0
+    for touch in _touches(learner, sources, options, progress, named=True):
+        if isinstance(touch, Refused):
+            refused.append(touch)
+            continue
+        known = bool(learner.names_of(touch.stream))
+        seen += known
+        if with_learned or not known:
+            answered.append(Answered(touch, learner.predict(touch.stream)))
+    return Evaluation(tuple(answered), tuple(refused), frozenset(learner.materials), seen)

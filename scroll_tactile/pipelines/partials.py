@@ -7,14 +7,11 @@ import hashlib
 import json
 import os
 import shutil
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from queue import Empty, Queue
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
@@ -26,22 +23,25 @@ from scroll_tactile.memory.packing import reduce_partials
 from scroll_tactile.memory.partial import Partial, write_partial
 from scroll_tactile.memory.rows import OBSERVE, SOURCE, pack_codes, pack_readings
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, source_touches
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.recordings.locations import file_system, is_remote, local
+from scroll_tactile.recordings.locations import is_remote, local
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 from store import Head, StoreError, StoreFullError
-from store.header import holds_store
-from store.packed import BEGIN
 
-__all__ = ["LearnJob", "Made", "Making", "SumJob", "expand", "is_memory", "learn_partial", "sum_partials"]
-
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
-PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual names of packed memories
-WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
-JOURNAL = "journal.sqlite"
+__all__ = [
+    "Again",
+    "Contained",
+    "LearnJob",
+    "Made",
+    "Making",
+    "SumJob",
+    "learn_partial",
+    "packed_path",
+    "sum_partials",
+]
 
 
 @dataclass(frozen=True)
@@ -113,59 +113,118 @@ class LearnJob:
 
 @dataclass(frozen=True)
 class SumJob:
-    """Partials to be summed up, each with the numbers of its touches that came before."""
+    """Partials to be summed up, each with the numbers of its touches that came before; number: of the sum in a run."""
 
     making: Making
     parts: tuple[tuple[str, tuple[int, ...]], ...]
     target: str
+    number: int = 0
 
     def halves(self) -> list[SumJob]:
         """Two jobs in place of this one; none of two partials."""
         middle = len(self.parts) // 2
         parts = (self.parts[:middle], self.parts[middle:])
         return (
-            [SumJob(self.making, part, f"{self.target}-{i}.part") for i, part in enumerate(parts)] if middle > 1 else []
+            [SumJob(self.making, part, f"{self.target}-{i}.part", self.number) for i, part in enumerate(parts)]
+            if middle > 1
+            else []
         )
 
 
 @dataclass
 class Made:
-    """A partial that a job made.
+    """What a job made: a partial, in a file, and what was not learned; path: "" where there is none.
 
-    path: its file, sources: those in it, with rows or without. adds_up: whether it is of the run's making.
-    refused: what was not learned. touches: a hash of each
-    touch's name and content, in the order of the file. descriptions: by material. seconds, processor: what it took.
+    seconds, processor: what it took.
     """
 
     path: str
-    sources: tuple[str, ...]
-    has_rows: bool = True
-    adds_up: bool = True
     refused: list[Refused] = field(default_factory=list)
-    touches: list[bytes] = field(default_factory=list)
-    descriptions: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     processor: float = 0.0
 
+
+@dataclass(frozen=True)
+class Again:
+    """A touch that came before in the same job, under its name: the sum has it once. said: where it came from."""
+
+    address: str
+    said: str
+    material: str
+    key: bytes
+
+
+@dataclass(frozen=True)
+class Contained:
+    """What a partial holds, by itself, and not by what a worker said of it.
+
+    path: its file. learned: the sources that it has all touches of. read: all of its sources, in order, each with how
+    many touches it has of it, which follow each other. touches: material and key of each. again: others that came.
+    memory: whether its source is one. adds_up: whether it is of the run's making; has_rows: and has a row for each
+    touch. described: whether it describes materials.
+    """
+
+    path: str
+    learned: tuple[str, ...]
+    read: tuple[tuple[str, int], ...]
+    touches: tuple[tuple[str, bytes], ...]
+    again: tuple[Again, ...] = ()
+    memory: bool = False
+    adds_up: bool = True
+    has_rows: bool = True
+    described: bool = False
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All that were read."""
+        return tuple(address for address, _ in self.read)
+
     @classmethod
-    def of(cls, path: Path, sources: tuple[str, ...] | None = None) -> Made:
-        """The partial in a file; sources: None for those of a run that was cut short, which left it behind.
+    def of(cls, path: Path, making: Making, address: str | None = None, *, thorough: bool = False) -> Contained:
+        """The partial in a file. address: of a memory; None for one that a job made of recordings.
 
-        Raises StoreError, MismatchError.
+        thorough: verify all of it, also that it sums up the touches that it names. Raises StoreError, MismatchError.
         """
+        if not path.is_file():
+            raise MismatchError(f"expected a partial of a fleet's run in {path}; it is no file")
         with Partial(path) as packed:
-            named = packed.note.get("sources") if sources is None else list(sources)
-            if not isinstance(named, list) or not all(isinstance(source, str) for source in named):
-                raise MismatchError(f"{path} is a partial, but none of a fleet's run")
-            packed.verify()
-            touches = [touch_hash(head.label, head.key) for head in packed.named]
-            described = dict(packed.descriptions)
-            return cls(str(path), tuple(named), packed.has_rows, touches=touches, descriptions=described)
+            if thorough:
+                packed.verify()
+            if thorough and address is None:
+                packed.read_with(window_plan(making.sensor, making.embedding))
+                packed.sums()
+            # Of other settings a memory is merged by itself, or refused there by what differs.
+            adds_up = packed.identity == making.identity.to_json()
+            touches = tuple((head.label, head.key) for head in packed.named)
+            described = bool(packed.descriptions)
+            if address is not None:
+                rows, whole = packed.has_rows and adds_up, ((address, len(touches)),)
+                return cls(str(path), (address,), whole, touches, (), True, adds_up, rows, described)
+            try:
+                learned, read, again = _noted(packed.note, len(touches))
+            except (KeyError, TypeError, ValueError) as error:
+                raise MismatchError(f"{path} is a partial, but none of a fleet's run: {error!r:.200}") from error
+            if not adds_up or packed.has_rows != bool(touches):
+                raise MismatchError(f"{path} is a partial of another run")
+            return cls(str(path), learned, read, touches, again, described=described)
 
 
-def touch_hash(material: str, key: bytes) -> bytes:
-    """What tells touches apart: their names and contents, in 16 bytes."""
-    return hashlib.blake2b(key + material.encode(), digest_size=16).digest()
+def _noted(
+    note: Mapping[str, Any], touches: int
+) -> tuple[tuple[str, ...], tuple[tuple[str, int], ...], tuple[Again, ...]]:
+    """What a job of recordings noted, of so many touches. Raises KeyError, TypeError or ValueError for another note."""
+    read = tuple((address, int(count)) for address, count in note["read"])
+    learned = tuple(note["sources"])
+    again = tuple(Again(address, said, name, bytes.fromhex(key)) for address, said, name, key in note["again"])
+    places = [address for address, _ in read]
+    texts = [*places, *learned, *(text for each in again for text in (each.address, each.said, each.material))]
+    if not all(isinstance(text, str) for text in texts):
+        raise TypeError("a source's name that is no text")
+    counts = [count for _, count in read]
+    known = {*learned, *(each.address for each in again)} <= set(places) and len(set(places)) == len(places)
+    if not known or min(counts, default=0) < 0 or sum(counts) != touches:
+        raise ValueError("touches of other sources than it names")
+    return learned, read, again
 
 
 @contextmanager
@@ -200,20 +259,22 @@ def _learn(job: LearnJob) -> Made:
     identity = making.identity
     reads = bool(identity.exemplars and identity.exemplars[0]) or bool(identity.recall) or identity.embedding.bare
     failed: set[str] = set()
-    touches: list[bytes] = []
-    seen: set[bytes] = set()
+    seen: set[tuple[str, bytes]] = set()
+    read: list[tuple[str, int]] = []
+    again: list[tuple[str, str, str, str]] = []
     with write_partial(job.target) as written:
         for address in job.sources:
+            before = len(seen)
             for touch in source_touches(learner, address, making.options):
                 if isinstance(touch, Refused):
                     refused.append(touch)
                     failed.add(address)
                     continue
                 material, key = str(touch.material), touch.stream.key
-                name = touch_hash(material, key)
-                if name in seen:
+                if (material, key) in seen:
+                    again.append((address, touch.source, material, key.hex()))
                     continue
-                seen.add(name)
+                seen.add((material, key))
                 image = extractor.image(touch.stream)
                 codes, columns = extractor.codes(image, key), image.shape[1]
                 memory.add(material, key, columns, codes, len(seen), None, touch.stream.readings)
@@ -222,17 +283,22 @@ def _learn(job: LearnJob) -> Made:
                 arrays = pack_readings(touch.stream.readings) if reads else {}
                 arrays |= {} if identity.embedding.bare else pack_codes(codes)
                 written.touch(Head(len(seen), OBSERVE, material, key, time.time(), said, 0), arrays)
-                touches.append(name)
-        learned = tuple(source for source in job.sources if source not in failed)
-        written.finish(identity.to_json(), memory, None, note={"sources": list(learned)})
-    return Made(str(job.target), learned, refused=refused, touches=touches)
+            read.append((address, len(seen) - before))
+        learned = [source for source in job.sources if source not in failed]
+        written.finish(identity.to_json(), memory, None, note={"sources": learned, "read": read, "again": again})
+    return Made(str(job.target), refused=refused)
+
+
+def packed_path(job: LearnJob) -> Path:
+    """The file of a memory that a job packs."""
+    return job.target.with_name(job.target.name.replace("learned", "packed"))
 
 
 def _pack(job: LearnJob, address: str) -> Made:
     """The partial of a source that is a memory: a packed file is one, of a folder one is made."""
     try:
         with local(address) as place:
-            path = job.target.with_name(job.target.name.replace("learned", "packed"))
+            path = packed_path(job)
             if place.is_dir():
                 with TactileLearner.open(place, embedding=job.making.embedding, mode="read") as learner:
                     learner.pack(path, source=address)
@@ -240,16 +306,12 @@ def _pack(job: LearnJob, address: str) -> Made:
                 shutil.copyfile(place, path)
             else:
                 path = place
-        made = Made.of(path, (address,))
-        with Partial(path) as packed:
-            # Of other settings it is merged by itself, or refused there by what differs.
-            made.adds_up = packed.identity == job.making.identity.to_json()
-            made.has_rows = made.has_rows and made.adds_up
-        return made
+        Contained.of(path, job.making, address, thorough=True)
+        return Made(str(path))
     except StoreFullError:
         raise
     except (ScrollTactileError, StoreError, OSError) as error:
-        return Made("", (), refused=[Refused(address, str(error))])
+        return Made("", refused=[Refused(address, str(error))])
 
 
 def sum_partials(job: SumJob) -> Made:
@@ -260,95 +322,4 @@ def sum_partials(job: SumJob) -> Made:
     with _within(job.making.patience):
         parts = [(Path(path), frozenset(left_out)) for path, left_out in job.parts]
         reduce_partials(parts, Path(job.target), job.making.memory(exemplars))
-    return Made(job.target, (), False, seconds=time.perf_counter() - begun[0], processor=time.process_time() - begun[1])
-
-
-def is_memory(address: str) -> bool:
-    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none."""
-    try:
-        return _is_remote_memory(address) if is_remote(address) else _is_local_memory(Path(address))
-    except Exception:  # each file system has errors of its own; reading it tells what is wrong
-        return False
-
-
-def _is_local_memory(path: Path) -> bool:
-    if path.is_dir():
-        return holds_store(path)
-    if not path.is_file():  # a pipe would be waited for
-        return False
-    with path.open("rb") as file:
-        return file.read(len(BEGIN)) == BEGIN
-
-
-def _is_remote_memory(address: str) -> bool:
-    if address.lower().endswith(RECORDINGS):
-        return False
-    files, path = file_system(address)
-    if files.isdir(path):
-        return bool(files.exists(f"{path.rstrip('/')}/{JOURNAL}"))
-    with files.open(path, "rb", cache_type="none") as file:
-        return bool(file.read(len(BEGIN)) == BEGIN)
-
-
-def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[str], list[Refused]]:
-    """The recordings and memories at some paths and addresses, each once, in order; and where there is none.
-
-    patience: seconds in which an address must answer.
-    """
-    found: dict[str, None] = {}
-    refused: list[Refused] = []
-    for path in paths:
-        inside: Sequence[str]
-        if is_remote(path):
-            try:
-                inside = _answered(partial(_listed, path), patience)
-            except Exception as error:  # each file system has errors of its own
-                refused.append(Refused(path, f"it cannot be listed: {type(error).__name__}: {error!s:.300}"))
-                continue
-            if not inside:
-                refused.append(Refused(path, "expected recordings or memories; nothing is there"))
-        elif is_memory(path):
-            inside = [path]
-        else:
-            inside, missing = find_sources([path])
-            refused += missing
-        found |= dict.fromkeys(inside)
-    return list(found), refused
-
-
-def _answered(ask: Callable[[], list[str]], patience: float | None) -> list[str]:
-    """The answer of a call. Raises what it raises, and TimeoutError where it takes longer; it is left alone then."""
-    answers: Queue[list[str] | Exception] = Queue()
-
-    def call() -> None:
-        try:
-            answers.put(ask())
-        except Exception as error:  # raised below
-            answers.put(error)
-
-    threading.Thread(target=call, daemon=True).start()
-    try:
-        answer = answers.get(timeout=patience)
-    except Empty:
-        raise TimeoutError(f"no answer in {patience:g} s") from None
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
-
-
-def _listed(address: str) -> list[str]:
-    """What a remote folder holds; the address itself where it is a file, or a folder that is one recording."""
-    files, path = file_system(address)
-    files.invalidate_cache()
-    if not files.isdir(path):
-        return [address]
-    scheme, place = address.partition("://")[0], path.rstrip("/")
-    names = sorted(str(name) for name in files.find(place))
-    inside = {name[len(place) + 1 :] for name in names}
-    if inside & {*WHOLE, JOURNAL}:
-        return [address]
-    folders = {name.rpartition("/")[0] for name in names if name.endswith((f"/{JOURNAL}", "/metadata.yaml"))}
-    alone = [
-        name for name in names if name.lower().endswith(RECORDINGS + PACKED) and not name.startswith(tuple(folders))
-    ]
-    return [f"{scheme}://{name}" for name in sorted({*folders, *alone})]
+    return Made(job.target, seconds=time.perf_counter() - begun[0], processor=time.process_time() - begun[1])

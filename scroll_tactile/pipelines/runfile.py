@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile.errors import InputError
+from store import LockedError
+from store.lock import flock
 
-__all__ = ["RunFile"]
+__all__ = ["RunFile", "alone_in"]
 
 _FORMAT = 1
 
@@ -41,12 +44,16 @@ class RunFile:
             self._write()
 
     def _read(self, path: Path) -> dict[str, Any]:
+        if not path.is_file():  # a pipe would be waited for
+            raise InputError(f"expected the notes of a run in {path}; it is no file: move it away")
         try:
             kept = json.loads(path.read_text(encoding="utf-8"))
             plan, notes = kept["plan"], kept["notes"]
             version = kept["format"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"expected the notes of a run in {path}; they cannot be read: {error!r}") from error
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise InputError(f"expected the notes of a run in {path}; they cannot be read: {error!r:.200}") from error
+        if not isinstance(plan, dict):
+            raise InputError(f"expected the notes of a run in {path}; its plan is a {type(plan).__name__}")
         if version != _FORMAT:
             raise InputError(f"{path} was written in format {version}; this version reads {_FORMAT}")
         differing = [
@@ -84,6 +91,37 @@ class RunFile:
                 f"{self.path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
                 "another folder, and start again"
             ) from error
+
+
+@contextmanager
+def alone_in(folder: Path, destination: Path) -> Iterator[None]:
+    """Keep other runs out of the folder of one, which is made; where the system has no locks nothing does.
+
+    An empty folder is removed again. Raises LockedError where another run is in it, for this destination.
+    """
+    descriptor = None
+    try:
+        with suppress(OSError):  # what is wrong with it is said where notes are written
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(folder, os.O_RDONLY)
+        if descriptor is not None and flock is not None:
+            import fcntl
+
+            try:
+                flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise LockedError(
+                    f"another run is at work for {destination}, in {folder}: wait until it has ended, or take another "
+                    "destination"
+                ) from error
+            except OSError:
+                pass
+        yield
+    finally:
+        if descriptor is not None:
+            with suppress(OSError):
+                folder.rmdir()
+            os.close(descriptor)
 
 
 def _draft(path: Path) -> Path:

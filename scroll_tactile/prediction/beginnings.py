@@ -100,7 +100,7 @@ def _left(model: Model, pooled: Pooled) -> list[_Left]:
 
 def _others(readout: Readout, material: str, sampled: SampledTouch) -> bool:
     place = readout.places.get(material)
-    return place is None or readout.counts[place] > sampled.pairs[:, 2].max()
+    return place is None or readout.counts[place] > sampled.learned.max()
 
 
 def without(model: Model, material: str, sampled: SampledTouch) -> Model:
@@ -115,7 +115,7 @@ def without(model: Model, material: str, sampled: SampledTouch) -> Model:
         own = rows_at(sampled, asked, scale)
         if own:
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
-            times = max(1, round(sampled.pairs[own[0], 2] / len(own)))
+            times = max(1, round(sampled.learned[own[0]] / len(own)))
             other.readouts[scale] = readout.without(material, np.repeat(sampled.rows[own], times, axis=0))
     return other
 

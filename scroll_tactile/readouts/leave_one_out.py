@@ -11,7 +11,7 @@ covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses i
 matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
 
 A touch of which the statistics hold more rows than the sample (copies; windows, in a memory that an earlier version
-compacted) leaves with as many of its own.
+compacted) leaves with as many of its own: one that was observed several times leaves with all of them.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
         judged = rows_at(touch, stages, readout.scale)
         if not judged or material not in own:
             continue
-        weight = float(max(touch.pairs[judged[0], 2], len(judged)))
+        weight = float(max(touch.learned[judged[0]], len(judged)))
         if readout.counts[readout.reference[own[material]]] > weight:
             at = touch.pairs[judged, 0].tolist()
             rows = touch.rows[judged] - readout.origin

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
+from scroll_tactile.memory.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Prediction
-from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
@@ -78,7 +78,6 @@ class Bridge:
         self._pictures = learner.sensor.camera and self.field.text == "data"
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
         self._ahead = 0.0  # of when a message is published, by its stamp
-        self._learned: tuple[Stream, str] | None = None
         self._warned: set[type[Exception]] = set()
 
     def receive(self, message: object, published: float) -> LiveState:
@@ -104,15 +103,17 @@ class Bridge:
     def learn(self, material: str) -> str:
         """Learn the last touch that ended under this name; durable when this returns. Says what was done.
 
-        Raises InputError where no touch ended since the last was learned, and what `learner.observe` raises.
+        Raises InputError where no touch has ended, or the memory has it under another name, and what `learner.observe`
+        raises.
         """
         touch = self.session.touch
         if touch is None:
             raise InputError("expected a touch to learn; none has ended yet")
-        if self._learned is not None and touch is self._learned[0]:
-            raise InputError(f"the last touch was learned already, as {self._learned[1]!r}: touch it again")
+        if (why := refusal(self.learner.names_of(touch), material)) is not None:
+            raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
-        self._learned = (touch, receipt.material)
+        if receipt.repeated:
+            return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         count = self.learner.materials[receipt.material]
         return (
             f"{receipt.material}: {receipt.seconds:g} s learned as observation {receipt.sequence}; "

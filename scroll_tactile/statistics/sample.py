@@ -7,8 +7,9 @@ share it evenly. Readouts are calibrated on a `TouchSample`; the candidates for 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -51,11 +52,17 @@ class SampledTouch:
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
     the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
-    shape (pairs, 3).
+    shape (pairs, 3). copies: how often this very content was observed under this name.
     """
 
     rows: npt.NDArray[np.int32]
     pairs: npt.NDArray[np.int64]
+    copies: int = 1
+
+    @property
+    def learned(self) -> npt.NDArray[np.int64]:
+        """For each pair, the rows that the statistics hold of this content: they leave together, shape (pairs,)."""
+        return self.pairs[:, 2] * self.copies
 
     @classmethod
     def of(cls, stages: Stages, codes: Codes) -> SampledTouch:
@@ -116,7 +123,10 @@ class Sample(Generic[T]):
         return len(self) < self.capacity or (rank, key, material) < self._last()
 
     def add(self, material: str, key: bytes, item: T) -> None:
-        """Add an item where it belongs in, and drop what falls out."""
+        """Add an item where it belongs in, and drop what falls out; one that is held is `joined` by it."""
+        if self.holds(material, key):
+            self._items[material, key] = self.joined(self._items[material, key], item)
+            return
         if not self.wants(material, key):
             return
         insort(self._keys.setdefault(material, []), key)
@@ -125,8 +135,16 @@ class Sample(Generic[T]):
             _, _, last = self._last()
             del self._items[last, self._keys[last].pop()]
 
+    def joined(self, held: T, item: T) -> T:
+        """What is held of a stream that is added once more."""
+        del item
+        return held
+
     def undo(self, material: str, key: bytes) -> Callable[[], None]:
-        """What takes the next `add` back, of an item that is wanted, however much was done; it can be repeated."""
+        """What takes the next `add` back, of an item that is wanted or held; however much was done, and repeatedly."""
+        if self.holds(material, key):
+            held = self._items[material, key]
+            return lambda: self._items.update({(material, key): held})
         touched = {material, self._last()[2]} if len(self) >= self.capacity else {material}
         keys = {name: list(self._keys.get(name, [])) for name in touched}
         # What falls out is the last of its material.
@@ -163,6 +181,23 @@ class TouchSample(Sample[SampledTouch]):
     def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
 
+    def joined(self, held: SampledTouch, item: SampledTouch) -> SampledTouch:
+        """The touch with the copies of both."""
+        return replace(held, copies=held.copies + item.copies)
+
+    def refill(
+        self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], SampledTouch]
+    ) -> None:
+        """As `Sample.refill`; a stream that comes several times is made once, and counted."""
+        behind = list(streams)
+        copies = Counter((material, key) for material, key, _ in behind)
+        copies.subtract({stream for stream in copies if not self.holds(*stream)})  # the one that is made
+        super().refill(behind, make)
+        for (material, key), more in copies.items():
+            if more and self.holds(material, key):
+                held = self._items[material, key]
+                self._items[material, key] = replace(held, copies=held.copies + more)
+
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the material of each touch."""
         touches = [touch for *_, touch in self]
@@ -174,8 +209,10 @@ class TouchSample(Sample[SampledTouch]):
         }, [material for material, *_ in self]
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> TouchSample:
-        """The sample that `to_arrays` described, of this version or an earlier one."""
+    def from_arrays(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str], copies: Sequence[int] | None = None
+    ) -> TouchSample:
+        """The sample that `to_arrays` described, of this version or an earlier one; copies: of each touch, else one."""
         sample = cls()
         edges = np.cumsum(arrays["pool-sizes"])[:-1]
         summed = "pool-sums" in arrays
@@ -183,5 +220,6 @@ class TouchSample(Sample[SampledTouch]):
         pairs = np.split(arrays["pool-pairs"], edges)
         made = SampledTouch.of_sums if summed else SampledTouch
         for i, material in enumerate(materials):
-            sample.add(material, arrays["pool-keys"][i].tobytes(), made(rows[i], pairs[i]))
+            touch = replace(made(rows[i], pairs[i]), copies=1 if copies is None else copies[i])
+            sample.add(material, arrays["pool-keys"][i].tobytes(), touch)
         return sample

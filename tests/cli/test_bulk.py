@@ -202,7 +202,7 @@ class TestEvaluate:
         touch(tmp_path / "more", "wool", 5)
         (tmp_path / "more" / "wool").rename(tmp_path / "more" / "silk")
         touch(tmp_path / "more", "denim", 0)
-        words = ("evaluate", learned, data, tmp_path / "more", "--label-by", "folder")
+        words = ("evaluate", learned, data, tmp_path / "more", "--label-by", "folder", "--with-learned")
         found = json.loads(run(*words, "--json").stdout)
         assert (found["touches"], found["never_learned"], found["accuracy"]) == (7, 1, 6 / 7)
         assert found["confusions"] == [["silk", "wool", 1]]
@@ -215,11 +215,22 @@ class TestEvaluate:
         assert len(rows) == 8
         assert [row["right"] for row in rows if row["material"] == "silk"] == ["True"] * 3 + ["False"]
 
+    def test_what_it_has_learned_is_left_out(self, learned: Path, data: Path, tmp_path: Path) -> None:
+        touch(tmp_path / "more", "wool", 5)
+        words = ("evaluate", learned, data, tmp_path / "more", "--label-by", "folder")
+        found = json.loads(run(*words, "--json").stdout)
+        assert (found["touches"], found["learned_before"], found["accuracy"]) == (1, 6, 1.0)
+        every = json.loads(run(*words, "--with-learned", "--json").stdout)
+        assert (every["touches"], every["learned_before"]) == (7, 6)
+        assert "touches that it has learned: 6, left out" in run(*words).stdout
+        assert "touches that it has learned: 6, answered all the same" in run(*words, "--with-learned").stdout
+
     def test_what_is_refused_is_exit_code_1(self, learned: Path, data: Path, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         result = run("evaluate", learned, data / "silk", tmp_path / "empty", "--label", "silk")
         assert result.exit_code == 1
-        assert "accuracy: 100.0 %" in result.stdout and "there is none in this folder" in result.stderr
+        assert "touches that it has learned: 3, left out; --with-learned answers them, too" in result.stdout
+        assert "accuracy" not in result.stdout and "there is none in this folder" in result.stderr
         assert "nothing names it" in run("evaluate", learned, data / "silk").stderr
 
 
@@ -244,6 +255,16 @@ class TestList:
         row = json.loads(run("memory", "list", memory, "--json").stdout)
         assert (row["sequence"], row["material"], row["state"]) == (1, "silk", "kept")
         assert row["source"] == str(data / "silk" / "0.npy")
+
+    def test_the_same_touch_is_told_and_learned_again_by_who_means_it(self, memory: Path, data: Path) -> None:
+        words = ("observe", memory, "silk", data / "silk" / "0.npy")
+        run(*words)
+        again = run(*words)
+        assert again.exit_code == 0 and "observed 1 time" in again.stdout
+        assert "this touch was learned already, as observation 1" in again.stdout
+        assert "observed 2 times" in run(*words, "--again").stdout
+        other = run("observe", memory, "wool", words[-1]).stdout
+        assert "is there as silk, too: relabel or retract one of them" in other and "observed 1 time" in other
 
     def test_an_empty_memory_lists_nothing(self, memory: Path) -> None:
         assert run("memory", "list", memory).stdout == ""

@@ -142,7 +142,7 @@ class History(RuleBasedStateMachine):
         sides: tuple[list[Any], list[Any]] = ([], [])
         for observation in self.state.observed:
             sides[rng.randrange(2)].append(observation.pair)
-        ours, theirs = (fed(side, embedding=self.learner.embedding).memory.statistics for side in sides)
+        ours, theirs = (fed(side, again=True, embedding=self.learner.embedding).memory.statistics for side in sides)
         whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
@@ -157,7 +157,7 @@ class History(RuleBasedStateMachine):
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
         assert seen(learner) == expected(self.state)
         made = {"embedding": EMBEDDINGS[self.state.embedding], "readout": learner.settings.readout, "recall": 5}
-        whole = fed(self.state.pairs, learner.descriptions, **made)
+        whole = fed(self.state.pairs, learner.descriptions, again=True, **made)
         if self.state.tuned is None:
             assert contents(learner) == contents(whole)
         assert repr(learner.descriptions) == repr({name: dict(parts) for name, parts in self.state.said})

@@ -294,7 +294,7 @@ def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
 
 
 def _do_observe(learner: TactileLearner, _: Path, material: str, touch: Touch) -> int:
-    return learner.observe(material, stream(touch)).sequence
+    return learner.observe(material, stream(touch), again=True).sequence
 
 
 def _do_batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...]) -> list[Any]:
@@ -367,7 +367,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
 def _pool(learner: TactileLearner) -> str:
     digest = hashlib.sha256()
     for name, key, touch in learner._ledger.memory.sample:
-        digest.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes())).encode())
+        digest.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.copies)).encode())
     return digest.hexdigest()
 
 
@@ -397,13 +397,14 @@ def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None
 
 @functools.lru_cache(maxsize=4096)
 def _observed(pairs: Pairs, embedding: str) -> dict[str, Any]:
-    return seen(fed(pairs, **settings() | {"embedding": EMBEDDINGS[embedding]}))
+    return seen(fed(pairs, again=True, **settings() | {"embedding": EMBEDDINGS[embedding]}))
 
 
 @functools.lru_cache(maxsize=4096)
 def tuned_digest(pairs: Pairs, embedding: str = "own") -> str | None:
     """The digest of the f* that is made from touches; None where none can be."""
     try:
-        return fed(pairs, **settings() | {"embedding": EMBEDDINGS[embedding]}).fine_tune(epochs=1).digest
+        made = settings() | {"embedding": EMBEDDINGS[embedding]}
+        return fed(pairs, again=True, **made).fine_tune(epochs=1).digest
     except InputError:
         return None

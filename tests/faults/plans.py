@@ -34,7 +34,7 @@ def prepare(home: Path) -> dict[str, Other]:
     for name, count, taken, keep in (("plain", 3, (), None), ("taken", 4, (1,), None), ("compacted", 4, (0,), 2)):
         observed = [(rng.choice(MATERIALS), touch(rng)) for _ in range(count)]
         with opened(home / name) as learner:
-            receipts = [learner.observe(material, stream(one)) for material, one in observed]
+            receipts = [learner.observe(material, stream(one), again=True) for material, one in observed]
             for i in taken:
                 learner.retract(receipts[i])
             left = tuple(one for i, one in enumerate(observed) if i not in taken)

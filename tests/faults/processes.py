@@ -52,7 +52,7 @@ def race(channel: Connection, path: Path) -> None:
         except Exception as error:
             channel.send(("raised", repr(error)))
             continue
-        channel.send(("won", learner.observe("a", stream((len(learner.materials), 25))).sequence))
+        channel.send(("won", learner.observe("a", stream((len(learner.materials), 25)), again=True).sequence))
         channel.recv()
         learner.close()
         channel.send("closed")

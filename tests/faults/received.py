@@ -236,7 +236,7 @@ def write(case: Case) -> str:
         with TactileLearner.open(case.path) as learner:
             came = case.judge(learner, warned)
             before, counted = learner.digest(), learner.materials.get("b", 0)
-            receipt = learner.observe("b", touch_of(learner))
+            receipt = learner.observe("b", touch_of(learner), again=True)
         with TactileLearner.open(case.path) as learner:
             if learner.materials.get("b") != counted + 1:
                 raise Wrong(f"an observation was lost: {learner.materials}, and {counted} before it")

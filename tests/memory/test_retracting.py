@@ -35,7 +35,7 @@ def path(tmp_path):
 
 class TestRetract:
     def test_of_a_stream_felt_twice_one_stays(self, path):
-        learner, receipts = filled(path, [*OBSERVED, OBSERVED[1]])
+        learner, receipts = filled(path, [*OBSERVED, OBSERVED[1]], again=True)
         with learner:
             learner.retract(receipts[1])
             require_same(learner, OBSERVED)

@@ -33,7 +33,7 @@ def touch_files(folder, touches):
     return paths
 
 
-TOUCHES = [(name, (seed, 40 + 5 * seed)) for seed in range(4) for name in "abc"]
+TOUCHES = [("abc"[i % 3], (i, 40 + 5 * (i // 3))) for i in range(12)]  # a content each
 
 
 def expected(touches=TOUCHES, **settings):

@@ -289,7 +289,7 @@ class TestEvaluate:
             return Prediction(material, probability, ((material, probability),), 0.0, known, touch.seconds)
 
         monkeypatch.setattr(TactileLearner, "predict", predict)
-        done = evaluate_sources(learner, sources_of(data / "a", data / "b", data / "new"), FOLDERS)
+        done = evaluate_sources(learner, sources_of(data / "a", data / "b", data / "new"), FOLDERS, with_learned=True)
         assert (len(done.familiar), len(done.strange)) == (4, 2)
         assert done.answers.accuracy == 0.75
         assert done.answers.confusions() == [("b", "a", 1)]
@@ -301,8 +301,12 @@ class TestEvaluate:
         learn(learner, sources_of(data), FOLDERS)
         before = learner.digest()
         np.save(data / "a" / "other.npy", np.zeros((60, 3)))
+        put(data / "b" / "9.npy", (9, 60))
         done = evaluate_sources(learner, sources_of(data), FOLDERS)
-        assert len(done.answered) == 6 and [Path(each.source).name for each in done.refused] == ["other.npy"]
+        assert (done.seen, len(done.answered)) == (6, 1)
+        done = evaluate_sources(learner, sources_of(data), FOLDERS, with_learned=True)
+        assert (done.seen, len(done.answered)) == (6, 7)
+        assert [Path(each.source).name for each in done.refused] == ["other.npy"]
         for each in done.answered:
             assert each.prediction == learner.predict(each.touch.stream)
         assert learner.digest() == before

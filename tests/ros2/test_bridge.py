@@ -126,8 +126,9 @@ def test_a_touch_is_learned_once_and_forgotten(tmp_path):
         run(made)
         assert made.learn("felt").startswith("felt: ")
         assert own.materials["felt"] == 1
-        with pytest.raises(errors.InputError, match="learned already, as 'felt'"):
-            made.learn("felt")
+        assert "learned already, as observation" in made.learn("felt") and own.materials["felt"] == 1
+        with pytest.raises(errors.InputError, match="already, as 'felt' and not as 'denim': relabel one of them"):
+            made.learn("denim")
         assert made.forget("felt") == "felt: 1 observation forgotten"
         with pytest.raises(errors.UnknownMaterialError):
             made.forget("felt")

@@ -1,0 +1,112 @@
+"""Where a fleet's sources lie: recordings and memories in files, folders and buckets, each found once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from queue import Empty, Queue
+
+from scroll_tactile.pipelines.sources import Refused, find_sources
+from scroll_tactile.recordings.locations import file_system, is_remote
+from store.header import holds_store
+from store.packed import BEGIN
+
+__all__ = ["expand", "is_memory"]
+
+RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
+PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual names of packed memories
+WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
+JOURNAL = "journal.sqlite"
+
+
+def is_memory(address: str) -> bool:
+    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none."""
+    try:
+        return _is_remote_memory(address) if is_remote(address) else _is_local_memory(Path(address))
+    except Exception:  # each file system has errors of its own; reading it tells what is wrong
+        return False
+
+
+def _is_local_memory(path: Path) -> bool:
+    if path.is_dir():
+        return holds_store(path)
+    if not path.is_file():  # a pipe would be waited for
+        return False
+    with path.open("rb") as file:
+        return file.read(len(BEGIN)) == BEGIN
+
+
+def _is_remote_memory(address: str) -> bool:
+    if address.lower().endswith(RECORDINGS):
+        return False
+    files, path = file_system(address)
+    if files.isdir(path):
+        return bool(files.exists(f"{path.rstrip('/')}/{JOURNAL}"))
+    with files.open(path, "rb", cache_type="none") as file:
+        return bool(file.read(len(BEGIN)) == BEGIN)
+
+
+def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[str], list[Refused]]:
+    """The recordings and memories at some paths and addresses, each once, in order; and where there is none.
+
+    patience: seconds in which an address must answer.
+    """
+    found: dict[str, None] = {}
+    refused: list[Refused] = []
+    for path in paths:
+        inside: Sequence[str]
+        if is_remote(path):
+            try:
+                inside = _answered(partial(_listed, path), patience)
+            except Exception as error:  # each file system has errors of its own
+                refused.append(Refused(path, f"it cannot be listed: {type(error).__name__}: {error!s:.300}"))
+                continue
+            if not inside:
+                refused.append(Refused(path, "expected recordings or memories; nothing is there"))
+        elif is_memory(path):
+            inside = [path]
+        else:
+            inside, missing = find_sources([path])
+            refused += missing
+        found |= dict.fromkeys(inside)
+    return list(found), refused
+
+
+def _answered(ask: Callable[[], list[str]], patience: float | None) -> list[str]:
+    """The answer of a call. Raises what it raises, and TimeoutError where it takes longer; it is left alone then."""
+    answers: Queue[list[str] | Exception] = Queue()
+
+    def call() -> None:
+        try:
+            answers.put(ask())
+        except Exception as error:  # raised below
+            answers.put(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    try:
+        answer = answers.get(timeout=patience)
+    except Empty:
+        raise TimeoutError(f"no answer in {patience:g} s") from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
+
+
+def _listed(address: str) -> list[str]:
+    """What a remote folder holds; the address itself where it is a file, or a folder that is one recording."""
+    files, path = file_system(address)
+    files.invalidate_cache()
+    if not files.isdir(path):
+        return [address]
+    scheme, place = address.partition("://")[0], path.rstrip("/")
+    names = sorted(str(name) for name in files.find(place))
+    inside = {name[len(place) + 1 :] for name in names}
+    if inside & {*WHOLE, JOURNAL}:
+        return [address]
+    folders = {name.rpartition("/")[0] for name in names if name.endswith((f"/{JOURNAL}", "/metadata.yaml"))}
+    alone = [
+        name for name in names if name.lower().endswith(RECORDINGS + PACKED) and not name.startswith(tuple(folders))
+    ]
+    return [f"{scheme}://{name}" for name in sorted({*folders, *alone})]

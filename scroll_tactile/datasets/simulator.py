@@ -140,7 +140,8 @@ class Scene:
     def step(self) -> _Floats:
         """Of the sensor's converter, in its unit: one for all channels, or one for each."""
         if self.response == "events":
-            return np.asarray(self.sensor.high) - np.asarray(self.sensor.low)
+            whole: _Floats = np.asarray(self.sensor.high) - np.asarray(self.sensor.low)
+            return whole
         return _step(self.sensor)
 
     def noise(self, random: np.random.Generator, count: int) -> _Floats:

@@ -15,10 +15,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
 
-__all__ = ["LARGEST", "Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
-
-LARGEST = 1 << 30
-"""The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
+__all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
 
 _ROWS = 4096  # of a block …
 _BYTES = 1 << 24  # … unless they would hold more than this

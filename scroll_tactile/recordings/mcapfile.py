@@ -84,17 +84,20 @@ class _Mcap:
             size, checksum = struct.unpack_from("<QI", data, 16)
             form, i = _text(data, 28)
             (length,) = struct.unpack_from("<Q", data, i)
-            inside = decompress(form, data[i + 8 : i + 8 + length], size, whole=whole)
+            inside = decompress(form, data[i + 8 : i + 8 + length], size, self.scan.budget, whole=whole)
             if whole and checksum and zlib.crc32(inside) != checksum:
                 raise ValueError("its checksum does not verify")
             i = 0
             while i + _HEAD.size <= len(inside):
                 kind, length = _HEAD.unpack_from(inside, i)
                 i += _HEAD.size
+                self.scan.budget.work()
                 if i + length > len(inside):
                     raise CutOff("a record ends beyond its chunk")
                 yield from self.record(kind, inside[i : i + length])
                 i += length
+        except RecordingError:  # a library is missing, or there is more than such a file can hold
+            raise
         except (*DAMAGE, CutOff):
             self.scan.damaged += whole
 

@@ -13,6 +13,7 @@ import numpy as np
 from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
+from scroll_tactile.recordings.bounds import require_file
 from scroll_tactile.recordings.clocks import choose
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Recording, assemble, resampled
@@ -155,6 +156,8 @@ def _open(path: Path, address: str, request: Request) -> Source:
             "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
             f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
+    if not path.is_dir():
+        require_file(path)
     source = kind(path, address, request)
     for name, value, takes in (("topic", request.topic, source.topics), ("labels", request.labels, source.labels)):
         if value is not None and not takes:
@@ -163,13 +166,13 @@ def _open(path: Path, address: str, request: Request) -> Source:
 
 
 def _kind(path: Path) -> Callable[[Path, str, Request], Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag
+    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
     if path.is_dir() and lerobot.is_lerobot(path):
         return lerobot.LeRobot
-    if arraystores.is_zarr(path):
+    if zarrfile.is_zarr(path):
         return arraystores.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".hdf"):

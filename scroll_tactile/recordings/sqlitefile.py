@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -10,8 +11,12 @@ from typing import Any
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, zstd
+from scroll_tactile.recordings.bounds import LARGEST, Budget
 
 __all__ = ["scan_db3"]
+
+_INSTRUCTIONS, _A_STEP = 20_000, 100  # of SQLite between two looks at their number; and in the time of a step of Python
+_TABLE = re.compile(r"CREATE TABLE\b", re.IGNORECASE)
 
 
 def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Message]:
@@ -19,20 +24,63 @@ def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Me
     import sqlite3
 
     with ExitStack() as stack:
+        budget = scan.budget
         base = stack.enter_context(closing(_connect(_whole_pages(path, scan, stack))))
+        _bound(base, budget)
         try:
             channels = _channels(base)
         except sqlite3.DatabaseError as error:
+            budget.work(0)
             raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
         wanted = [number for number, channel in channels.items() if scan.wanted(channel.topic)]
         marks = ",".join("?" * len(wanted))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
         try:
             for number, log, data in base.execute(query, wanted):
-                whole = zstd().decompress(data) if compressed else data
-                yield Message(channels[number], log, None, None, 0, whole)
+                if not isinstance(data, bytes) or not isinstance(log, int):
+                    scan.damaged += 1
+                    continue
+                budget.work()
+                budget.take(len(data))
+                yield Message(channels[number], log, None, None, 0, _inflated(data, budget) if compressed else data)
         except sqlite3.DatabaseError as error:
+            budget.work(0)
             scan.cut_off = str(error)
+
+
+def _inflated(data: bytes, budget: Budget) -> bytes:
+    """A message that was compressed by itself."""
+    inflating, parts = zstd().ZstdDecompressor(), []
+    while not inflating.eof:
+        part = inflating.decompress(data, max_length=1 << 24)
+        if not part and inflating.needs_input:
+            break  # it was cut off
+        budget.take(len(part))
+        parts.append(part)
+        data = b""
+    return b"".join(parts)
+
+
+def _bound(base: Any, budget: Budget) -> None:
+    """SQLite stops where a query costs more than a file of this size can ask for: a forged one can ask for ever."""
+    import sqlite3
+
+    def count() -> bool:
+        try:
+            budget.work(_INSTRUCTIONS // _A_STEP)
+        except RecordingError:
+            return True
+        return False
+
+    base.set_progress_handler(count, _INSTRUCTIONS)
+    limits = {
+        sqlite3.SQLITE_LIMIT_LENGTH: min(LARGEST, budget.room()),
+        sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1 << 20,
+        sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
+        sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    }
+    for limit, most in limits.items():
+        base.setlimit(limit, most)
 
 
 def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
@@ -63,6 +111,7 @@ def _connect(path: Path) -> Any:
         base = sqlite3.connect(f"{address}?{mode}", uri=True)
         base.text_factory = lambda data: data.decode(errors="replace")
         try:
+            base.execute("PRAGMA trusted_schema=OFF")
             base.execute("PRAGMA writable_schema=ON")  # otherwise SQLite gives nothing of a file that was cut off
             base.execute("SELECT 1 FROM sqlite_master").fetchone()
             return base
@@ -75,14 +124,20 @@ def _connect(path: Path) -> Any:
 
 
 def _channels(base: Any) -> dict[int, Channel]:
-    tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if not {"topics", "messages"} <= tables:
-        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)}")
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+    tables = {str(name): str(sql) for name, sql in base.execute(query)}
+    if not {"topics", "messages"} <= set(tables):
+        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")
+    for name in ("topics", "messages", "message_definitions"):
+        # A view may pose as a table, and a column may be computed when it is read.
+        hidden = any(row[6] for row in base.execute(f"PRAGMA table_xinfo({name})"))
+        if hidden or not _TABLE.match(tables.get(name, "CREATE TABLE")):
+            raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {tables[name]!r:.100}")
     definitions = {}
     if "message_definitions" in tables:  # since ROS 2 Iron
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        definitions = {name: (text, form == "ros2idl") for name, form, text in base.execute(query)}
+        definitions = {name: (str(text), form == "ros2idl") for name, form, text in base.execute(query)}
     return {
-        number: Channel(topic, name, form, *definitions.get(name, ("", False)))
+        number: Channel(str(topic), str(name), str(form), *definitions.get(name, ("", False)))
         for number, topic, name, form in base.execute("SELECT id, name, type, serialization_format FROM topics")
     }

@@ -21,6 +21,7 @@ __all__ = ["Delimited", "is_missing", "is_number", "is_table"]
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
 _LONGEST = 1 << 24  # characters in a line; a longer one is no table's
+_MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN = 200  # lines are looked at to say what a table is
 _TIME = re.compile(
     r"(?:time(?:[ _]?stamp)?s?|t|stamp|seconds)(?:[ _]*[\[(]?(s|sec|seconds|ms|us|µs|ns)[\])]?)?", re.IGNORECASE
@@ -64,6 +65,8 @@ class Delimited(Source):
         self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
         rows = [(number, self._cells(line, number)) for number, line in lines]
         self.width = len(rows[0][1])
+        if self.width > _MOST_COLUMNS:
+            raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
         mark = re.escape(self.delimiter)
         tokens = "|".join(re.escape(token) for token in sorted(_MISSING, key=len, reverse=True))
         self._empty = re.compile(rf"(?:(?<={mark})|^)[^\S{mark}]*(?:{tokens})[^\S{mark}]*(?={mark}|$)", re.IGNORECASE)

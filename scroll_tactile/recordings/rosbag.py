@@ -78,6 +78,8 @@ class RosBag(Source):
                 try:
                     decoded = self.types.decode(message.channel, message.data, self.budget)
                 except RecordingError as error:
+                    if isinstance(error.__cause__, ImportError):
+                        raise  # nothing is wrong with the file
                     self.notes.append(str(error))
                     entries[key] = []
                     continue

@@ -232,7 +232,8 @@ class ZarrBuffer(_Arrays):
 
     def blocks(self) -> Iterator[Block]:
         """The readings of one array, episode after episode."""
-        arrays, episode_ends = open_zarr(self.path, Budget(self.address))
+        self.budget = Budget(self.address)
+        arrays, episode_ends = open_zarr(self.path, self.budget)
         key, rest, clock = self._chosen({key: [array] for key, array in arrays.items()})
         for name in (key, clock):
             if name is not None and (why := arrays[name].why):

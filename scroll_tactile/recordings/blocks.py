@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
+from scroll_tactile.recordings.bounds import Budget
 
 __all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
 
@@ -103,6 +104,7 @@ class Source(ABC):
     names: what each episode is called, by its number.
     marks: what a topic of labels said when: seconds by the clock "log", and a text.
     continuous: whether time goes on from one episode to the next, and does not begin anew.
+    budget: what reading it may still cost.
     topics, labels: whether the format has topics, and something that labels.
     """
 
@@ -111,6 +113,7 @@ class Source(ABC):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request
         self.topic = request.topic
+        self.budget = Budget(address)
         self.notes: list[str] = []
         self.cut_off = False
         self.names: dict[int, str] = {}

@@ -33,7 +33,7 @@ class Budget:
 
     def __init__(self, address: str, stored: int = 0) -> None:
         self.address, self.stored = address, stored
-        self.bytes = self.steps = 0
+        self.bytes = self.steps = self.given = 0
 
     def add(self, stored: int) -> None:
         """Count the bytes of a further file."""
@@ -44,6 +44,12 @@ class Budget:
         self.bytes += count
         if self.bytes > SPARE + RATIO * self.stored:
             self._refuse(f"{self.bytes} bytes", f"{RATIO} times as many, and {SPARE >> 20} MiB")
+
+    def give(self, count: int) -> None:
+        """Give readings out that are kept, in bytes; raises RecordingError as `take` does, of which it is no part."""
+        self.given += count
+        if self.given > SPARE + RATIO * self.stored:
+            self._refuse(f"{self.given} bytes of readings", f"{RATIO} times as many, and {SPARE >> 20} MiB")
 
     def room(self) -> int:
         """How much memory is left, in bytes."""

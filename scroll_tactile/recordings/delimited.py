@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, rows_of
+from scroll_tactile.recordings.bounds import stored_bytes
 from scroll_tactile.recordings.paths import nearest
 
 __all__ = ["Delimited", "is_missing", "is_number", "is_table"]
@@ -58,6 +59,7 @@ class Delimited(Source):
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
+        self.budget.add(stored_bytes(path))
         if request.decimal not in (".", ","):
             raise RecordingError(f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}")
         with self._text() as file:

@@ -41,7 +41,6 @@ class LeRobot(Source):
             raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
         self.parquet: Any = parquet
         super().__init__(path, address, request)
-        self.budget = Budget(address)
         about = path / "meta" / "info.json"
         require_inside(path, about)
         if stored_bytes(about) > _LONGEST:

@@ -63,7 +63,7 @@ def read(
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request)
-        whole = _joined(_timed(source, request), address)
+        whole = _joined(_timed(source, request), source)
         recording = _recording(whole, source, _clock(whole, request.clock))
     _require(recording, preset)
     return recording if resample is None else resampled(recording, resample)
@@ -201,16 +201,19 @@ def _timed(source: Source, request: Request) -> Iterator[Block]:
         yield block
 
 
-def _joined(blocks: Iterator[Block], address: str) -> Block:
-    """All blocks as one; raises RecordingError where there are none."""
-    parts = list(blocks)
+def _joined(blocks: Iterator[Block], source: Source) -> Block:
+    """All blocks as one; raises RecordingError where there are none, or more than a file of this size can hold."""
+    parts = []
+    for block in blocks:
+        source.budget.give(block.readings.nbytes)
+        parts.append(block)
     if not parts:
-        raise RecordingError(f"{address} holds no readings")
+        raise RecordingError(f"{source.address} holds no readings")
     if len(parts) == 1:
         return parts[0]
     if len({part.readings.shape[1:] for part in parts}) > 1:
         shapes = sorted({part.readings.shape[1:] for part in parts})
-        raise RecordingError(f"{address}: readings are ragged: they have {shapes} values")
+        raise RecordingError(f"{source.address}: readings are ragged: they have {shapes} values")
 
     def whole(name: str) -> dict[str, Any]:
         columns = [getattr(part, name) for part in parts]

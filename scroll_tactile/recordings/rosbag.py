@@ -63,7 +63,6 @@ class RosBag(Source):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
         self.files, self.compressed = _files(path)
-        self.budget = Budget(address)
         self.types = MessageTypes(request)
 
     def contents(self) -> Contents:

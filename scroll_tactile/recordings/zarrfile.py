@@ -34,6 +34,7 @@ __all__ = ["ZarrArray", "is_zarr", "open_zarr"]
 _DESCRIPTIONS = ("zarr.json", ".zarray", ".zgroup")
 _LONGEST = 1 << 24  # bytes of a description; those of a group may hold all others' once more
 _DEEPEST = 8  # groups within each other
+_A_CHUNK = 10  # steps of work
 _NUMBERS = re.compile(r"[<>|](?:b1|[iu][1248]|f[248])")
 _NAMES = {"bool": "|b1"} | {
     f"{name}{8 * size}": f"<{kind}{size}"
@@ -80,7 +81,7 @@ class ZarrArray:
         along += [range(-(-size // step)) for size, step in zip(self.shape[1:], self.chunks[1:], strict=True)]
         chunk_bytes = math.prod(self.chunks) * self.dtype.itemsize
         for cell in itertools.product(*along):
-            budget.work()
+            budget.work(_A_CHUNK)
             key = f"{self.key}/{layout.name(cell)}" if self.key else layout.name(cell)
             there = layout.files.find(key)
             spans = [

@@ -106,7 +106,7 @@ class Npy(_Arrays):
         yield from self._slices(array, None, "", self.field(), None)
 
     def _rows(self, array: Any, begin: int, end: int) -> Any:
-        self.budget.take((end - begin) * array.strides[0] if array.ndim else 0)
+        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
         return array[begin:end]
 
     def _array(self) -> Any:

@@ -68,6 +68,8 @@ def take(file: BinaryIO, size: int, left: int) -> bytes:
     """The next `size` bytes; raises CutOff where there are fewer, before any memory is taken for them."""
     if size > left:
         raise CutOff(f"a record of {size} bytes is claimed where {left} are left")
+    if size > LARGEST:  # what is left may be a hole
+        raise CutOff(f"a record of {size} bytes is claimed")
     data = file.read(size)
     if len(data) < size:
         raise CutOff("it ends in the middle of a record")
@@ -150,7 +152,7 @@ def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
                 header, length = _record_head(file, size)
                 left = size - file.tell()
                 if length > left and header.get(b"op") == bytes([_CHUNK]):
-                    yield from reader.chunk(header, file.read(left), whole=False)
+                    yield from reader.chunk(header, file.read(min(left, LARGEST)), whole=False)
                     raise CutOff("it ends in the middle of a chunk")
                 yield from reader.record(header, take(file, length, size - file.tell()))
         except CutOff as error:

@@ -18,6 +18,7 @@ from scroll_tactile.recordings.bounds import Budget
 
 __all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
 
+_MESSAGE = 8000  # letters of an error
 _ROWS = 4096  # of a block …
 _BYTES = 1 << 24  # … unless they would hold more than this
 
@@ -161,7 +162,12 @@ def guarded(path: str) -> Iterator[None]:
     """Damaged bytes make parsers fail in many ways: all of them become a RecordingError that names the file."""
     try:
         yield
-    except (ScrollTactileError, GeneratorExit):
+    except ScrollTactileError as error:
+        text = str(error)
+        if len(text) > _MESSAGE:  # names and definitions in a file may have any length
+            error.args = (f"{text[:_MESSAGE]} …",)
+        raise
+    except GeneratorExit:
         raise
     except MemoryError as error:
         raise RecordingError(f"{path} claims to hold more than fits into memory, and may be damaged") from error

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from scroll_tactile.errors import RecordingError
 
-__all__ = ["LARGEST", "RATIO", "SPARE", "Budget", "require_file", "require_inside", "stored_bytes"]
+__all__ = ["LARGEST", "RATIO", "SPARE", "Budget", "read_text", "require_file", "require_inside", "stored_bytes"]
 
 SPARE, RATIO = 1 << 28, 100
 """Bytes that any recording may become in memory, and how many more for each byte on the disk."""
 
-SPARE_STEPS, STEPS_A_BYTE = 1 << 20, 16
+SPARE_STEPS, STEPS_A_BYTE = 1 << 19, 16
 """The same of steps of Python, of some 2 µs each: a record of a bag is one, and a message that is decoded eight."""
 
 LARGEST = 1 << 30
@@ -85,6 +85,17 @@ def require_inside(folder: Path, path: Path) -> None:
     """Raises RecordingError for a file that lies, by a link or by its name, outside of the recording's folder."""
     if not path.resolve().is_relative_to(folder.resolve()):
         raise RecordingError(f"{path} leads out of its recording, {folder}: copy what it leads to in its place")
+
+
+def read_text(folder: Path, path: Path, most: int) -> str:
+    """What is written in a file of a recording's folder; raises RecordingError where that is more than `most` bytes."""
+    require_inside(folder, path)
+    require_file(path)
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise RecordingError(f"{path} has more than {most} bytes; expected less of what describes a recording")
+    return data.decode()
 
 
 def _require_regular(about: os.stat_result, path: Path) -> None:

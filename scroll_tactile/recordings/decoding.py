@@ -39,7 +39,7 @@ class MessageTypes:
         self.readers: dict[Channel, _Reader] = {}
 
     def decode(self, channel: Channel, data: bytes, budget: Budget) -> object:
-        """Raises RecordingError for a type that is not defined, bytes that do not fit it, and a budget that is spent."""
+        """Raises RecordingError for a type that is not defined, bytes that do not fit it, or a budget that is spent."""
         reader = self.readers.get(channel)
         if reader is None:
             given = self.given.get(channel.type, "")

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
-from scroll_tactile.recordings.bounds import LARGEST, Budget, require_inside, stored_bytes
+from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.keys import matched
 from scroll_tactile.recordings.paths import select
 
@@ -41,11 +41,7 @@ class LeRobot(Source):
             raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
         self.parquet: Any = parquet
         super().__init__(path, address, request)
-        about = path / "meta" / "info.json"
-        require_inside(path, about)
-        if stored_bytes(about) > _LONGEST:
-            raise RecordingError(f"meta/info.json of {address} has more than {_LONGEST} bytes, and may be damaged")
-        self.info = json.loads(about.read_text(encoding="utf-8"))
+        self.info = json.loads(read_text(path, path / "meta" / "info.json", _LONGEST))
         version = str(self.info.get("codebase_version", ""))
         if not version.startswith("v3"):
             raise RecordingError(
@@ -75,7 +71,9 @@ class LeRobot(Source):
         shape = self.features[key]["shape"]
         width = 8 * math.prod(int(size) for size in shape)
         if not 0 < width <= LARGEST:
-            raise RecordingError(f"{self.address} claims readings of shape {shape!r:.60} in {key!r}, and may be damaged")
+            raise RecordingError(
+                f"{self.address} claims readings of shape {shape!r:.60} in {key!r}, and may be damaged"
+            )
         for path in self._files():
             with self._opened(path, columns) as file:
                 there = [name for name in columns if name in file.schema_arrow.names]

@@ -100,7 +100,9 @@ def _copied_folder(files: Any, root: str, target: Path, address: str) -> Path:
 def _named(part: str, address: str) -> str:
     """A part of a name as it may stand in a path; raises RecordingError for one that leads elsewhere."""
     if part in ("", ".", "..") or "\\" in part or "\0" in part or PurePath(part).name != part:
-        raise RecordingError(f"{address} names a file by {part!r:.100}, which leads out of its folder: it was not fetched")
+        raise RecordingError(
+            f"{address} names a file by {part!r:.100}, which leads out of its folder: it was not fetched"
+        )
     return part
 
 
@@ -108,8 +110,8 @@ def _require_room(size: int, folder: Path, address: str) -> None:
     free = shutil.disk_usage(folder).free
     if size > free:
         raise RecordingError(
-            f"{address} holds {size} bytes, and {free} are free where it would be copied to, {folder.parent}: set TMPDIR "
-            "to a folder with more room, or fetch it in parts"
+            f"{address} holds {size} bytes, and {free} are free where it would be copied to, {folder.parent}: set "
+            "TMPDIR to a folder with more room, or fetch it in parts"
         )
 
 

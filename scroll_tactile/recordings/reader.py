@@ -20,6 +20,8 @@ from scroll_tactile.recordings.recording import Recording, assemble, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
 
+_DEEPEST = 64  # folders within each other in which recordings are looked for
+
 _Address = str | PathLike[str]
 
 
@@ -128,11 +130,15 @@ def find(path: _Address) -> list[Path]:
     however they are numbered; `read` takes their folder as one that was split. Raises RecordingError for a path where
     nothing is.
     """
-    from scroll_tactile.recordings import rosbag
-
     place = Path(path)
     if not place.exists():
         raise RecordingError(f"expected recordings in {place}; it is not there")
+    return _found(place, 0)
+
+
+def _found(place: Path, depth: int) -> list[Path]:
+    from scroll_tactile.recordings import rosbag
+
     bags_alone = place.is_dir() and not (place / "metadata.yaml").exists() and rosbag.is_rosbag(place)
     if _kind(place) is not None and not bags_alone:
         return [place]
@@ -141,7 +147,7 @@ def find(path: _Address) -> list[Path]:
         if inside.is_symlink() and inside.is_dir():
             continue  # it may lead back here
         if inside.is_dir() and not inside.name.startswith("."):
-            found += find(inside)
+            found += _found(inside, depth + 1) if depth < _DEEPEST else []
         elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
             found.append(inside)
     return found

@@ -18,7 +18,7 @@ from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
-from scroll_tactile.recordings.bounds import Budget, require_file, require_inside, stored_bytes
+from scroll_tactile.recordings.bounds import Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.clocks import Stamps
 from scroll_tactile.recordings.decoding import MessageTypes
 from scroll_tactile.recordings.mcapfile import scan_mcap
@@ -34,7 +34,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
 
 _LOOKED = 2000  # messages are looked at to say what a bag holds
-_LISTS = 1 << 18  # bytes of metadata.yaml that say which files there are: thousands
+_LONGEST, _LISTS = 1 << 24, 1 << 18  # bytes of metadata.yaml; and of the part that lists files: thousands of them
 
 _PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
 
@@ -228,9 +228,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
     except ImportError as error:
         raise missing("rosbags", "ros", "a ROS recording") from error
-    require_file(listed)
-    require_inside(path, listed)
-    text = listed.read_text(encoding="utf-8")
+    text = read_text(path, listed, _LONGEST)
     parts = [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
     # The whole text takes as long as a hundred messages do.
     lists = "".join(parts) if len(parts) == 2 else text

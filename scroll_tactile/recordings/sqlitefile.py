@@ -95,6 +95,7 @@ def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
         if page < 512 or size % page == 0:
             return path
         scan.cut_off = "it ends in the middle of a page"
+        scan.budget.take(size)
         target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
         file.seek(0)
         with target.open("wb") as copy:

@@ -43,6 +43,7 @@ _NAMES = {"bool": "|b1"} | {
 }
 _CODECS = ("blosc", "bz2", "gzip", "lz4", "zlib", "zstd")
 _BLOSC = {0: "blosclz", 1: "lz4", 2: "snappy", 3: "zlib", 4: "zstd"}
+_NO_NUMBERS = np.dtype("V1")
 _WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -59,7 +60,7 @@ class ZarrArray:
 
     key: str
     shape: tuple[int, ...] = ()
-    dtype: np.dtype[Any] = np.dtype("V1")
+    dtype: np.dtype[Any] = _NO_NUMBERS
     chunks: tuple[int, ...] = ()
     layout: _Layout | None = None
     why: str | None = None

@@ -19,7 +19,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import bags
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -308,7 +307,9 @@ def mcap_chunk(data: bytes, form: str = "zstd") -> bytes:
     from backports import zstd
 
     packed = zstd.compress(data, 19) if form == "zstd" else data
-    return record(6, struct.pack("<QQQI", 0, 0, len(data), 0) + text(form.encode()) + struct.pack("<Q", len(packed)) + packed)
+    return record(
+        6, struct.pack("<QQQI", 0, 0, len(data), 0) + text(form.encode()) + struct.pack("<Q", len(packed)) + packed
+    )
 
 
 FLOATS = "float32[] data"
@@ -504,7 +505,9 @@ ATTACKS: dict[str, Attack] = {
     "R7 mcap: equal messages": mcap(lambda: [mcap_chunk(message(ONE, 2_000_000))]),
     "R7 mcap: equal messages of nobody": mcap(lambda: [mcap_chunk(record(9, b"") * 8_000_000)]),
     "R7 mcap: large pictures": mcap(large_pictures, COMPRESSED, "sensor_msgs/msg/CompressedImage"),
-    "R7 msg: an array of messages": mcap(lambda: [message(ONE)], "a/C[1000000000] data\n" + "=" * 80 + "\nMSG: a/C\nint8 x\n"),
+    "R7 msg: an array of messages": mcap(
+        lambda: [message(ONE)], "a/C[1000000000] data\n" + "=" * 80 + "\nMSG: a/C\nint8 x\n"
+    ),
     "R7 msg: an array of texts": mcap(lambda: [message(ONE)], "string[1000000000] data"),
     "R7 msg: fields": mcap(lambda: [message(ONE)], "".join(f"float32 f{i}\n" for i in range(20_000))),
     "R7 msg: a tower": mcap(lambda: [message(ONE)], tower(12, 10)),

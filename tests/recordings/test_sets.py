@@ -18,6 +18,8 @@ from scroll_tactile.recordings import describe, iterate, read, resampled
 from scroll_tactile.sensors import BIOTAC, CONTACTILE
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
+
+
 def test_lerobot_of_others_is_read_to_the_bit():
     if not SHARED.exists():
         pytest.skip(f"no recordings of others: {SHARED} does not exist, and the project ships none")

@@ -20,7 +20,7 @@ from scroll_tactile.recordings.zarrfile import open_zarr
 
 __all__ = ["Hdf5", "Npy", "ZarrBuffer"]
 
-_FILTERS = ("gzip", "shuffle", "fletcher32", "lzf")
+_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # of HDF5, by their numbers
 _DEFLATES = 1032  # times as many bytes at most
 _DEEPEST = 32  # groups of HDF5 within each other
 _VISIT = 20  # steps of work that it takes to look at one object
@@ -142,7 +142,7 @@ class Hdf5(_Arrays):
 
     def _rows(self, array: Any, begin: int, end: int) -> Any:
         self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
-        if array.chunks is not None and "gzip" in _filters(array):
+        if array.compression == "gzip":
             self._measure(array, begin, end)
         return array[begin:end]
 
@@ -197,29 +197,24 @@ class Hdf5(_Arrays):
 
     def _require_own(self, item: Any) -> None:
         """Raises RecordingError for numbers that lie in other files, or in what only a plugin decodes."""
+        import h5py
+
         if item is None:
             return
-        name = item.name
-        if item.is_virtual or item.external:
-            where = "other files (external storage)" if item.external else "other data sets (a virtual one)"
+        about = item.id.get_create_plist()
+        virtual = about.get_layout() == h5py.h5d.VIRTUAL
+        if virtual or about.get_external_count():
+            where = "other data sets (it is virtual)" if virtual else "other files (external storage)"
             raise RecordingError(
-                f"{self.address}: the numbers of {name!r} lie in {where}, which may be any on this machine. Copy it "
-                "with h5repack, which puts them in"
+                f"{self.address}: the numbers of {item.name!r} lie in {where}, which may be any on this machine. Copy "
+                "it with h5repack, which puts them in"
             )
-        filters = _filters(item)
-        if not set(filters) <= set(_FILTERS) or len(set(filters)) < len(filters):
+        numbers = [about.get_filter(i)[0] for i in range(about.get_nfilters())]
+        if not set(numbers) <= set(_FILTERS) or len(set(numbers)) < len(numbers):
             raise RecordingError(
-                f"{self.address}: {name!r} has the filters {', '.join(filters)}; expected at most one each of "
-                f"{', '.join(_FILTERS)}: copy it with h5repack"
+                f"{self.address}: {item.name!r} has the filters {[_FILTERS.get(n, n) for n in numbers]}; expected at "
+                f"most one each of {', '.join(_FILTERS.values())}: copy it with h5repack"
             )
-
-
-def _filters(item: Any) -> list[str]:
-    """What the chunks of a data set go through, by h5py's names, others by their number."""
-    properties = item.id.get_create_plist()
-    names = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
-    numbers = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
-    return [names.get(number, str(number)) for number in numbers]
 
 
 class ZarrBuffer(_Arrays):

@@ -45,7 +45,7 @@ class MessageTypes:
             given = self.given.get(channel.type, "")
             budget.work(_A_LINE * _lines(given or channel.definition))
             reader = self.readers[channel] = _reader(channel, given)
-        budget.work(_A_MESSAGE + reader.objects + (len(data) // _NESTED if reader.nested else 0))
+        budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
         try:
             return reader.read(data)
         except RecordingError:
@@ -59,10 +59,10 @@ class MessageTypes:
 
 @dataclass(frozen=True)
 class _Reader:
-    """What makes an object of bytes. objects: how many there are in each; nested: whether more come with its bytes."""
+    """What makes an object of bytes. steps: of work for each; nested: whether more come with its bytes."""
 
     read: Callable[[bytes], object]
-    objects: int = 0
+    steps: int = _A_MESSAGE
     nested: bool = True
 
 
@@ -108,8 +108,8 @@ def _reader(channel: Channel, given: str) -> _Reader:
     if objects > _MOST_OBJECTS:
         raise RecordingError(f"a message of {channel.type} holds {objects} values; expected at most {_MOST_OBJECTS}")
     if channel.encoding == "ros1":
-        return _Reader(lambda data: store.deserialize_ros1(data, channel.type), objects, nested)
-    return _Reader(functools.partial(_read_cdr, store, channel.type), objects, nested)
+        return _Reader(lambda data: store.deserialize_ros1(data, channel.type), _A_MESSAGE + objects, nested)
+    return _Reader(functools.partial(_read_cdr, store, channel.type), _A_MESSAGE + objects, nested)
 
 
 def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | None]) -> tuple[int, bool]:

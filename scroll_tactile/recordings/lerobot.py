@@ -16,6 +16,7 @@ from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.keys import matched
+from scroll_tactile.recordings.parquetpages import require_bounded_pages
 from scroll_tactile.recordings.paths import select
 
 __all__ = ["LeRobot", "is_lerobot"]
@@ -90,14 +91,7 @@ class LeRobot(Source):
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))
         file = self.parquet.ParquetFile(path)
-        claimed = Budget(self.address, self.budget.stored)
-        for i in range(file.metadata.num_row_groups):
-            group = file.metadata.row_group(i)
-            for j in range(group.num_columns):
-                self.budget.work()
-                about = group.column(j)
-                if about.path_in_schema.partition(".")[0] in columns or about.path_in_schema in columns:
-                    claimed.take(max(about.total_uncompressed_size, 0))
+        require_bounded_pages(path, file.metadata, columns, self.budget)
         return file
 
     def _table(self, path: Path, columns: list[str] | None = None) -> dict[str, list[Any]]:

@@ -452,14 +452,14 @@ def named(pattern: str) -> Attack:
     return robot_set(change)
 
 
-def rows_of_nothing(path: Path, about: Any, watched: Path) -> None:
-    """A parquet file of 3·10^7 equal rows in some hundred KB."""
-    count = 30_000_000
+def equal_rows(path: Path, about: Any, *, dictionary: bool) -> None:
+    """A parquet file of 2.5·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
+    count = 25_000_000
     name = "observation.tactile.tip"
     about["features"][name]["shape"] = [1]
     table = pa.table({name: pa.array(np.zeros(count, "f4")), "timestamp": pa.array(np.zeros(count, "f8"))})
-    for file in (path / "data").rglob("*.parquet"):
-        pq.write_table(table, file, compression="zstd", row_group_size=count)
+    file = path / "data/chunk-000/file-000.parquet"
+    pq.write_table(table, file, compression="zstd", row_group_size=count, use_dictionary=dictionary)
 
 
 def parquet_link(path: Path, about: Any, watched: Path) -> None:
@@ -523,7 +523,8 @@ ATTACKS: dict[str, Attack] = {
     "R7 lerobot: names by width": named("data/{chunk_index:0999999999d}.parquet"),
     "R7 lerobot: names by attribute": named("data/{chunk_index.__class__}.parquet"),
     "R7 lerobot: names that climb": named("../watched/{chunk_index}.parquet"),
-    "R7 lerobot: rows of nothing": robot_set(rows_of_nothing),
+    "R7 lerobot: equal rows": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=True)),
+    "R7 lerobot: long pages": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=False)),
     "R7 lerobot: a link": robot_set(parquet_link),
 } | {
     f"R7 {kind}: {name}": alone(name, kind)

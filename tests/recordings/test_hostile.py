@@ -11,6 +11,8 @@ import bags
 import fsspec
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import zarr
 from faults.recording_attacks import ATTACKS, RAN, SECRET
@@ -19,6 +21,7 @@ from numcodecs import Blosc
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings import bounds, describe, find, iterate, read, zarrfile
+from scroll_tactile.recordings.parquetpages import require_bounded_pages
 
 # How they are refused, where that says more than that they are.
 SAID = {
@@ -27,7 +30,7 @@ SAID = {
     "R2 copied from behind the frame": "a Blosc frame .* of 77840 bytes .* stands in 20 bytes",
     "R2 a chunk that is a link": "is a link; a Zarr group is made of files and folders",
     "R3 external storage": "lie in other files",
-    "R3 virtual": "lie in other data sets",
+    "R3 virtual": r"lie in other data sets \(it is virtual\)",
     "R7 zarr: rows never written": "expected at most 100 times as many, and 256 MiB",
     "R7 zarr: deflated": "expected 77824 bytes; came 77824 and more",
     "R7 hdf5: rows never written": "expected at most 100 times as many, and 256 MiB",
@@ -145,7 +148,7 @@ class TestHdf5:
     def test_filters_that_only_plugins_know_are_refused(self, tmp_path):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file.create_dataset("tactile", data=TIP.astype("i4"), chunks=(7, 19), scaleoffset=0)
-        with pytest.raises(RecordingError, match="has the filters 6; expected at most one each of gzip, shuffle"):
+        with pytest.raises(RecordingError, match=r"has the filters \[6\]; expected at most one each of gzip, shuffle"):
             read(tmp_path / "a.h5", field="tactile")
 
     def test_a_large_chunk_of_random_numbers_is_read(self, tmp_path):
@@ -162,6 +165,31 @@ class TestHdf5:
         assert len(read(path, field="obs/tactile")) == 60
         with pytest.raises(FieldError, match="no field 'away'"):
             read(path, field="away")
+
+
+@pytest.mark.parametrize("codec", ["zstd", "snappy", "gzip", "lz4", "none"])
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+@pytest.mark.parametrize("dictionary", [True, False])
+def test_the_pages_of_a_parquet_file_are_as_long_as_they_say(tmp_path, codec, version, dictionary):
+    rows = np.random.default_rng(2).integers(0, 99, (5000, 3)).astype("f4")
+    table = pa.table({"a": pa.array(rows.tolist()), "b": pa.array([f"x{i}" for i in range(5000)]), "c": rows[:, 0]})
+    options = {"compression": codec, "data_page_version": version, "use_dictionary": dictionary}
+    pq.write_table(table, tmp_path / "a.parquet", data_page_size=2000, row_group_size=2000, **options)
+    with pq.ParquetFile(tmp_path / "a.parquet") as file:
+        groups = [file.metadata.row_group(i) for i in range(3)]
+        total = sum(group.column(j).total_uncompressed_size for group in groups for j in range(3))
+        for most, refused in ((total, False), (total // 2, True)):  # the total counts the pages' headers as well
+            budget = bounds.Budget("a.parquet")
+            room = pytest.MonkeyPatch()
+            room.setattr(bounds, "SPARE", most)
+            try:
+                if refused:
+                    with pytest.raises(RecordingError, match="claims to hold"):
+                        require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
+                else:
+                    require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
+            finally:
+                room.undo()
 
 
 class TestPlaces:

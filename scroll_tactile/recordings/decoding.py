@@ -25,9 +25,9 @@ __all__ = ["MessageTypes"]
 # takes more than three for damage.
 _END, _WIDEST = 3, 8
 
-# rosbags writes code for each element of an array of fixed length, and parses a line of a definition in a millisecond.
-# The largest definitions of ROS's own packages, MoveIt's, have some 400 fields in all.
-_MOST_LINES, _MOST_OBJECTS = 4000, 4096
+# rosbags writes code for each element of an array of fixed length: a second for 4096 of them, or for 2500 fields. The
+# largest definitions of ROS's own packages, MoveIt's, have some 400 fields in all.
+_MOST_LINES, _MOST_OBJECTS = 4000, 1 << 14
 _A_LINE, _A_MESSAGE, _NESTED = 500, 8, 32  # steps of work; a nested message takes one for as many bytes
 
 
@@ -115,7 +115,8 @@ def _reader(channel: Channel, given: str) -> _Reader:
 def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | None]) -> tuple[int, bool]:
     """How many objects each message of a type becomes, arrays of numbers one each; whether it has lists of others.
 
-    known: those of other types; None while it is being found out. Raises RecordingError for a type that holds itself.
+    known: those of other types; None while it is being found out. Raises RecordingError for a type that holds itself,
+    or nothing.
     """
     from rosbags.interfaces import Nodetype
 
@@ -125,15 +126,22 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
         return found
     known[name] = None
     total, nested = 1, False
-    for _, (kind, about) in definitions[name][1]:
+    for field, (kind, about) in definitions[name][1]:
         array, several = kind == Nodetype.ARRAY, kind == Nodetype.SEQUENCE
         of, what = about[0] if array or several else (kind, about)
-        numbers = of == Nodetype.BASE and what[0] != "string"
+        plain = of == Nodetype.BASE and what[0] != "string"
         inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
-        total += inside * (about[1] if array and not numbers else 1)
-        nested |= deeper or (several and not numbers)
+        if (array and not about[1]) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
+            # There could be any number of them in no byte.
+            raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
+        total += inside * (about[1] if array and not plain else 1)
+        nested |= deeper or (several and not plain)
     known[name] = total, nested
     return total, nested
+
+
+def _is_empty(fields: Any) -> bool:
+    return not fields or [name for name, _ in fields] == ["structure_needs_at_least_one_member"]
 
 
 def _read_cdr(store: Any, kind: str, data: bytes) -> object:

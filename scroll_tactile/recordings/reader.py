@@ -57,7 +57,8 @@ def read(
     definitions: of messages that a bag does not define, the text of the .msg by the type's name.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
-    file is not there, damaged, ragged, empty, of no known format, or needs a library that is not installed;
+    file is not there, damaged, ragged, empty, of no known format, needs a library that is not installed, or claims to
+    hold more than one of its size can (see `bounds`);
     ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
     """
     request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})

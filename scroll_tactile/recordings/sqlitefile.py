@@ -16,6 +16,7 @@ from scroll_tactile.recordings.bounds import LARGEST, Budget
 __all__ = ["scan_db3"]
 
 _INSTRUCTIONS, _A_STEP = 20_000, 100  # of SQLite between two looks at their number; and in the time of a step of Python
+_TABLES = ("topics", "messages", "message_definitions")
 _TABLE = re.compile(r"CREATE TABLE\b", re.IGNORECASE)
 
 
@@ -124,16 +125,20 @@ def _connect(path: Path) -> Any:
     raise RecordingError(f"{path} cannot be opened as an SQLite file: is it being written, or readable at all?")
 
 
+def _plain(base: Any, table: str) -> bool:
+    """Whether no column of a table is computed or hidden."""
+    return not any(hidden for *_, hidden in base.execute("SELECT * FROM pragma_table_xinfo(?)", (table,)))
+
+
 def _channels(base: Any) -> dict[int, Channel]:
-    query = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
-    tables = {str(name): str(sql) for name, sql in base.execute(query)}
-    if not {"topics", "messages"} <= set(tables):
-        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")
-    for name in ("topics", "messages", "message_definitions"):
+    tables: set[str] = set()
+    for kind, name, sql in base.execute("SELECT type, name, sql FROM sqlite_master"):
         # A view may pose as a table, and a column may be computed when it is read.
-        hidden = any(row[6] for row in base.execute(f"PRAGMA table_xinfo({name})"))
-        if hidden or not _TABLE.match(tables.get(name, "CREATE TABLE")):
-            raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {tables[name]!r:.100}")
+        if str(name).lower() in _TABLES and not (kind == "table" and _TABLE.match(str(sql)) and _plain(base, name)):
+            raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {str(sql)!r:.100}")
+        tables |= {str(name)} if kind == "table" else set()
+    if not {"topics", "messages"} <= tables:
+        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")
     definitions = {}
     if "message_definitions" in tables:  # since ROS 2 Iron
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"

@@ -1,5 +1,6 @@
 """Recordings from elsewhere: they run nothing, reach nothing outside, and cost what their size allows."""
 
+import logging
 import os
 import shutil
 import subprocess
@@ -192,6 +193,26 @@ def test_the_pages_of_a_parquet_file_are_as_long_as_they_say(tmp_path, codec, ve
                 room.undo()
 
 
+@pytest.fixture
+def bucket(monkeypatch):
+    """An empty bucket of a real S3 interface, played by moto."""
+    s3fs = pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    s3fs.S3FileSystem.clear_instance_cache()
+    files = s3fs.S3FileSystem()
+    files.mkdir("robots")
+    yield files
+    server.stop()
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
 class TestPlaces:
     def test_pipes_in_a_folder_are_refused_by_name_and_stop_nothing(self, tmp_path):
         for name in ("a.npy", "b.csv", "c.mcap"):
@@ -209,7 +230,6 @@ class TestPlaces:
             ("../../escaped", "'..'"),
             ("a/../../../escaped", "'..'"),
             ("a\\..\\escaped", r"a\\\\\.\.\\\\escaped"),
-            ("a//b", "''"),
         ],
     )
     def test_keys_that_climb_out_of_a_folder_are_refused(self, tmp_path, key, part):

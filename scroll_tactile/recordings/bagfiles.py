@@ -136,6 +136,7 @@ def inflated(path: Path, folder: Path, budget: Budget) -> Path:
 # ROS 1: records of a header (fields name=value) and data; chunks hold records.
 
 _BAG = b"#ROSBAG V2.0\n"
+_A_RECORD = 4  # steps of work
 _MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 
 
@@ -204,7 +205,7 @@ class _Bag:
         self.total = 0
 
     def record(self, header: dict[bytes, bytes], data: bytes) -> Iterator[Message]:
-        self.scan.budget.work()
+        self.scan.budget.work(_A_RECORD)
         kind = header.get(b"op", b"\0")[0]
         if kind == _CHUNK:
             yield from self.chunk(header, data, whole=True)

@@ -32,33 +32,36 @@ class Budget:
     """
 
     def __init__(self, address: str, stored: int = 0) -> None:
-        self.address, self.stored = address, stored
+        self.address, self.stored = address, 0
         self.bytes = self.steps = self.given = 0
+        self.add(stored)
 
     def add(self, stored: int) -> None:
         """Count the bytes of a further file."""
         self.stored += stored
+        self.most = SPARE + RATIO * self.stored
+        self.most_steps = SPARE_STEPS + STEPS_A_BYTE * self.stored
 
     def take(self, count: int) -> None:
         """Take memory, in bytes; raises RecordingError where that is more than a recording of its size can hold."""
         self.bytes += count
-        if self.bytes > SPARE + RATIO * self.stored:
+        if self.bytes > self.most:
             self._refuse(f"{self.bytes} bytes", f"{RATIO} times as many, and {SPARE >> 20} MiB")
 
     def give(self, count: int) -> None:
         """Give readings out that are kept, in bytes; raises RecordingError as `take` does, of which it is no part."""
         self.given += count
-        if self.given > SPARE + RATIO * self.stored:
+        if self.given > self.most:
             self._refuse(f"{self.given} bytes of readings", f"{RATIO} times as many, and {SPARE >> 20} MiB")
 
     def room(self) -> int:
         """How much memory is left, in bytes."""
-        return SPARE + RATIO * self.stored - self.bytes
+        return self.most - self.bytes
 
     def work(self, steps: int = 1) -> None:
         """Take time, in steps; raises RecordingError as `take` does."""
         self.steps += steps
-        if self.steps > SPARE_STEPS + STEPS_A_BYTE * self.stored:
+        if self.steps > self.most_steps:
             self._refuse(f"{self.steps} steps of work", f"{STEPS_A_BYTE} for each, and {SPARE_STEPS}")
 
     def _refuse(self, what: str, most: str) -> None:

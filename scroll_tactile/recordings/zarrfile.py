@@ -34,7 +34,7 @@ __all__ = ["ZarrArray", "is_zarr", "open_zarr"]
 _DESCRIPTIONS = ("zarr.json", ".zarray", ".zgroup")
 _LONGEST = 1 << 24  # bytes of a description; those of a group may hold all others' once more
 _DEEPEST = 8  # groups within each other
-_A_CHUNK = 10  # steps of work
+_A_CHUNK = 20  # steps of work
 _NUMBERS = re.compile(r"[<>|](?:b1|[iu][1248]|f[248])")
 _NAMES = {"bool": "|b1"} | {
     f"{name}{8 * size}": f"<{kind}{size}"

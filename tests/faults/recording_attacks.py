@@ -66,8 +66,9 @@ ARRAY = {
 def group(folder: Path, **about: Any) -> Path:
     """A Zarr group with one array; its folder."""
     path = folder / "x.zarr"
-    path.mkdir()
-    (path / ".zgroup").write_text('{"zarr_format": 2}')
+    (path / "data").mkdir(parents=True)
+    for place in (path, path / "data"):
+        (place / ".zgroup").write_text('{"zarr_format": 2}')
     describe(path, "data/tactile", **about)
     return path
 
@@ -77,6 +78,8 @@ def pickled(*, ends: bool) -> Attack:
 
     def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
         path = buffer(folder, 2)
+        if not ends:
+            shutil.rmtree(path / "meta")
         key = "meta/episode_ends" if ends else "data/tactile"
         shutil.rmtree(path / key)
         filters = [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}]
@@ -123,7 +126,7 @@ def entry(name: str, kind: str, to: str = "/dev/zero") -> Attack:
     """A FIFO, socket or link where a file is expected, in a Zarr group."""
 
     def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = group(folder, shape=[40, 100], chunks=[40, 100])
+        path = group(folder, shape=[64, 64], chunks=[64, 64])
         place = path / "data/tactile" / name
         place.unlink(missing_ok=True)
         special(place, kind, watched, to)

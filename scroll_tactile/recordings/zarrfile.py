@@ -11,12 +11,8 @@ import bz2
 import itertools
 import json
 import math
-import os
 import re
-import stat
-import zipfile
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,14 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import RecordingError
-from scroll_tactile.recordings.bounds import LARGEST, Budget, stored_bytes
+from scroll_tactile.recordings.bounds import LARGEST, Budget
+from scroll_tactile.recordings.groupfiles import DEEPEST, DESCRIPTION, GroupFiles, opened
 from store.frames import decompress_blosc, decompress_zstd
 
 __all__ = ["ZarrArray", "is_zarr", "open_zarr"]
 
 _DESCRIPTIONS = ("zarr.json", ".zarray", ".zgroup")
-_LONGEST = 1 << 24  # bytes of a description; those of a group may hold all others' once more
-_DEEPEST = 8  # groups within each other
 _A_CHUNK = 20  # steps of work
 _NUMBERS = re.compile(r"[<>|](?:b1|[iu][1248]|f[248])")
 _NAMES = {"bool": "|b1"} | {
@@ -117,7 +112,7 @@ class _Layout:
     name. checksum: whether a crc32c lies behind it. shuffled: the size of the items whose bytes were shuffled.
     """
 
-    files: _Files
+    files: GroupFiles
     prefix: str
     separator: str
     order: tuple[int, ...]
@@ -129,7 +124,7 @@ class _Layout:
         return self.prefix + self.separator.join(map(str, cell)) if cell else self.prefix.rstrip("/.") or "0"
 
     def decoded(self, key: str, chunks: tuple[int, ...], dtype: np.dtype[Any], size: int) -> npt.NDArray[Any]:
-        data = self.files.read(key, 2 * size + _LONGEST)
+        data = self.files.read(key, 2 * size + DESCRIPTION)
         try:
             if self.checksum:
                 data = _checked(data)
@@ -187,7 +182,7 @@ def open_zarr(path: Path, budget: Budget) -> tuple[dict[str, ZarrArray], ZarrArr
     A file that is one array has it under "data". Each description is read here and none of the arrays. What is no array
     of numbers is among them and says why it cannot be read. Raises RecordingError for what is no Zarr group.
     """
-    files: _Files = _Folder(path, budget) if path.is_dir() else _Zip(path, budget)
+    files = opened(path, budget)
     if files.is_array(""):
         return {"data": _described(files, "")}, None
     found: dict[str, ZarrArray] = {}
@@ -197,22 +192,22 @@ def open_zarr(path: Path, budget: Budget) -> tuple[dict[str, ZarrArray], ZarrArr
     return {key: array for key, array in found.items() if not key.startswith("meta/")}, ends
 
 
-def _walk(files: _Files, before: str, depth: int) -> Iterator[str]:
+def _walk(files: GroupFiles, before: str, depth: int) -> Iterator[str]:
     for name in files.inside(before.rstrip("/")):
         key = f"{before}{name}"
         files.budget.work()
         if files.is_array(key):
             yield key
-        elif depth < _DEEPEST:
+        elif depth < DEEPEST:
             yield from _walk(files, f"{key}/", depth + 1)
 
 
-def _described(files: _Files, key: str) -> ZarrArray:
+def _described(files: GroupFiles, key: str) -> ZarrArray:
     """An array by its description; with the reason where that is not one of numbers in known codecs."""
     try:
         at = f"{key}/" if key else ""
         version = 3 if files.find(f"{at}zarr.json") else 2
-        about = json.loads(files.read(f"{at}{'zarr.json' if version == 3 else '.zarray'}", _LONGEST))
+        about = json.loads(files.read(f"{at}{'zarr.json' if version == 3 else '.zarray'}", DESCRIPTION))
         return (_of_version_3 if version == 3 else _of_version_2)(files, key, about)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, IndexError, RecursionError) as error:
         what = error.args[0] if isinstance(error, _UnreadableError) else f"{type(error).__name__}: {error}"
@@ -223,7 +218,7 @@ class _UnreadableError(ValueError):
     """What a description has that is not read, as a sentence."""
 
 
-def _of_version_2(files: _Files, key: str, about: Mapping[str, Any]) -> ZarrArray:
+def _of_version_2(files: GroupFiles, key: str, about: Mapping[str, Any]) -> ZarrArray:
     if not isinstance(about["dtype"], str) or not _NUMBERS.fullmatch(about["dtype"]):
         raise _UnreadableError(f"its data type is {str(about['dtype'])[:40]!r}; expected numbers")
     if about.get("filters"):
@@ -239,7 +234,7 @@ def _of_version_2(files: _Files, key: str, about: Mapping[str, Any]) -> ZarrArra
     return ZarrArray(key, *_shapes(about["shape"], about["chunks"], dtype), layout)
 
 
-def _of_version_3(files: _Files, key: str, about: Mapping[str, Any]) -> ZarrArray:
+def _of_version_3(files: GroupFiles, key: str, about: Mapping[str, Any]) -> ZarrArray:
     if about["data_type"] not in _NAMES:
         raise _UnreadableError(f"its data type is {str(about['data_type'])[:40]!r}; expected numbers")
     if about.get("storage_transformers") or about["chunk_grid"]["name"] != "regular":
@@ -317,99 +312,3 @@ def _fill(value: Any, dtype: np.dtype[Any]) -> Any:
     if dtype.kind in "iu" and int(number) != number:
         raise _UnreadableError(f"its fill value is {value!r:.40}, and its numbers are {dtype}")
     return np.array(int(number) if dtype.kind in "iu" else number, dtype)[()]
-
-
-class _Files(ABC):
-    """The files of a group by their keys, which are made of names that were listed here and of numbers."""
-
-    def __init__(self, path: Path, budget: Budget) -> None:
-        self.path, self.address, self.budget = path, budget.address, budget
-
-    @abstractmethod
-    def inside(self, key: str) -> Iterator[str]:
-        """The names of the folders in a folder, in order."""
-
-    @abstractmethod
-    def find(self, key: str) -> bool:
-        """Whether a file is there, whose bytes are then counted; raises RecordingError for a link, FIFO or device."""
-
-    @abstractmethod
-    def read(self, key: str, most: int) -> bytes:
-        """The bytes of a file that is there; raises RecordingError where there are more than `most`."""
-
-    def is_array(self, key: str) -> bool:
-        """Whether a folder is an array."""
-        at = f"{key}/" if key else ""
-        if not self.find(f"{at}zarr.json"):
-            return self.find(f"{at}.zarray")
-        about = json.loads(self.read(f"{at}zarr.json", _LONGEST))
-        return isinstance(about, dict) and about.get("node_type") == "array"
-
-    def _too_long(self, key: str, size: int, most: int) -> None:
-        if size > most:
-            raise RecordingError(f"{key} of {self.address} has {size} bytes, where at most {most} can be: is it whole?")
-
-
-class _Folder(_Files):
-    def __init__(self, path: Path, budget: Budget) -> None:
-        super().__init__(path, budget)
-        self._folders = {""}
-
-    def inside(self, key: str) -> Iterator[str]:
-        with os.scandir(self.path / key) as entries:
-            yield from sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
-
-    def find(self, key: str) -> bool:
-        parts = key.split("/")
-        for i in range(1, len(parts)):
-            folder = "/".join(parts[:i])
-            if folder not in self._folders:
-                if not self._is(folder, stat.S_ISDIR):
-                    return False
-                self._folders.add(folder)
-        return self._is(key, stat.S_ISREG)
-
-    def _is(self, key: str, kind: Any) -> bool:
-        try:
-            about = (self.path / key).lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        if not kind(about.st_mode):
-            what = "link" if stat.S_ISLNK(about.st_mode) else "FIFO, a device or another kind of entry than expected"
-            raise RecordingError(f"{key} of {self.address} is a {what}; a Zarr group is made of files and folders")
-        if stat.S_ISREG(about.st_mode):
-            self.budget.add(min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size))
-        return True
-
-    def read(self, key: str, most: int) -> bytes:
-        with (self.path / key).open("rb") as file:
-            self._too_long(key, os.fstat(file.fileno()).st_size, most)
-            return file.read(most)
-
-
-class _Zip(_Files):
-    def __init__(self, path: Path, budget: Budget) -> None:
-        super().__init__(path, budget)
-        budget.add(stored_bytes(path))
-        self._zip = zipfile.ZipFile(path)
-        self._there = {info.filename: info for info in self._zip.infolist()}
-        budget.work(len(self._there))
-        self._inside: dict[str, set[str]] = {}
-        for name in self._there:
-            parts = name.split("/")[: _DEEPEST + 2]
-            for i in range(len(parts) - 1):
-                self._inside.setdefault("/".join(parts[:i]), set()).add(parts[i])
-
-    def inside(self, key: str) -> Iterator[str]:
-        yield from sorted(self._inside.get(key, ()))
-
-    def find(self, key: str) -> bool:
-        return key in self._there
-
-    def read(self, key: str, most: int) -> bytes:
-        info = self._there[key]
-        self._too_long(key, info.file_size, most)
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise RecordingError(f"{key} of {self.address} is compressed in the zip; expected stored or deflated")
-        with self._zip.open(info) as file:
-            return file.read(most)

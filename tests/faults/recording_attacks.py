@@ -5,13 +5,11 @@ It returns the recording's path and what `read` takes to read it. Each may only 
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import pickle
 import shutil
 import socket
-import sqlite3
 import struct
 import zipfile
 import zlib
@@ -23,10 +21,10 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from made import SKIN, TIP, buffer, lerobot, ros
+from made import TIP, buffer, lerobot
 from numcodecs import Blosc
 
-Attack = Callable[[Path, Path], tuple[Path, dict[str, Any]]]
+from faults.bag_attacks import BAGS, Attack
 
 FIELD = {"field": "data/tactile"}
 SECRET = 0xA5  # what files are full of that nobody may read
@@ -295,144 +293,6 @@ def pickle_npy(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
     return folder / "x.npy", {}
 
 
-def record(kind: int, data: bytes) -> bytes:
-    """A record of MCAP."""
-    return struct.pack("<BQ", kind, len(data)) + data
-
-
-def text(value: bytes) -> bytes:
-    """A text of MCAP or CDR."""
-    return struct.pack("<I", len(value)) + value
-
-
-def mcap_chunk(data: bytes, form: str = "zstd") -> bytes:
-    """A chunk with a right length and no checksum."""
-    from backports import zstd
-
-    packed = zstd.compress(data, 19) if form == "zstd" else data
-    return record(
-        6, struct.pack("<QQQI", 0, 0, len(data), 0) + text(form.encode()) + struct.pack("<Q", len(packed)) + packed
-    )
-
-
-FLOATS = "float32[] data"
-
-
-def mcap(chunks: Callable[[], list[bytes]], definition: str = FLOATS, kind: str = "a/msg/B") -> Attack:
-    """An MCAP of one topic, /skin."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        head = record(3, struct.pack("<H", 1) + text(kind.encode()) + text(b"ros2msg") + text(definition.encode()))
-        head += record(4, struct.pack("<HH", 1, 1) + text(b"/skin") + text(b"cdr") + text(b""))
-        body = head + b"".join(chunks()) + record(15, bytes(4))
-        (folder / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + body)
-        return folder / "x.mcap", SKIN
-
-    return make
-
-
-def message(data: bytes, count: int = 1) -> bytes:
-    """Equal messages of topic 1."""
-    return record(5, struct.pack("<HIQQ", 1, 0, 10**9, 10**9) + data) * count
-
-
-ONE = struct.pack("<BBHI19f", 0, 1, 0, 19, *range(19))
-
-
-def large_pictures() -> list[bytes]:
-    """Six PNG of 132 million pixels."""
-    from PIL import Image
-
-    picture = io.BytesIO()
-    Image.new("L", (11500, 11500)).save(picture, "PNG")
-    stamp = struct.pack("<BBHiI", 0, 1, 0, 1, 1)
-    return [message(stamp + text(b"\0") + bytes(3) + text(b"png\0") + text(picture.getvalue())) for _ in range(6)]
-
-
-COMPRESSED = (
-    "std_msgs/Header header\nstring format\nuint8[] data\n" + "=" * 80 + "\nMSG: std_msgs/Header\n"
-    "builtin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80 + "\nMSG: builtin_interfaces/Time\n"
-    "int32 sec\nuint32 nanosec\n"
-)
-
-
-def tower(levels: int, wide: int) -> str:
-    """Messages of messages, the last of which takes no byte (in ROS 1)."""
-    parts = [f"a/L0[{wide}] data"]
-    parts += [f"MSG: a/L{i}\na/L{i + 1}[{wide}] data" for i in range(levels)]
-    return ("\n" + "=" * 80 + "\n").join([*parts, f"MSG: a/L{levels}\n"])
-
-
-def db3(change: Callable[[Any], None]) -> Attack:
-    """A ROS 2 SQLite file in which something else is done."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = next(ros(folder, "db3").glob("*.db3"))
-        base = sqlite3.connect(path, isolation_level=None)
-        change(base)
-        base.close()
-        return path, SKIN
-
-    return make
-
-
-ENDLESS = (
-    "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
-    "SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
-)
-
-
-def view(base: Any) -> None:
-    """A view that never ends, posing as a table."""
-    base.execute("PRAGMA writable_schema = ON")
-    base.execute("DELETE FROM sqlite_master WHERE tbl_name = 'messages' AND type = 'index'")
-    base.execute("UPDATE sqlite_master SET sql = ?, rootpage = 0 WHERE name = 'messages'", (ENDLESS,))
-
-
-def generated(base: Any) -> None:
-    """A column that is computed: 900 MB of zeros."""
-    base.execute("DROP TABLE messages")
-    base.execute(
-        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
-        "data BLOB AS (zeroblob(900000000)))"
-    )
-    base.execute("INSERT INTO messages(topic_id, timestamp) VALUES (1, 1)")
-
-
-def yaml(text: str) -> Attack:
-    """The metadata of a ROS 2 bag."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = ros(folder, "mcap")
-        (path / "metadata.yaml").write_text(text)
-        return path, SKIN
-
-    return make
-
-
-ALIASES = "rosbag2_bagfile_information:\n  a0: &a0 [x, x]\n" + "".join(
-    f"  a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 10)}]\n" for i in range(9)
-)
-ALIASES += "  compression_mode: ''\n  relative_file_paths: *a9\n"
-
-
-def yaml_fifo(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """A FIFO in place of the metadata."""
-    path = ros(folder, "mcap")
-    (path / "metadata.yaml").unlink()
-    os.mkfifo(path / "metadata.yaml")
-    return path, SKIN
-
-
-def part_outside(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """A part of a bag that is a link to a bag elsewhere."""
-    path = ros(folder, "mcap")
-    part = next(path.glob("*.mcap"))
-    shutil.move(part, watched.parent / "other.mcap")
-    part.symlink_to(watched.parent / "other.mcap")
-    return path, SKIN
-
-
 def robot_set(change: Callable[[Path, Any, Path], None]) -> Attack:
     """A LeRobotDataset in which something else is done."""
 
@@ -472,65 +332,50 @@ def parquet_link(path: Path, about: Any, watched: Path) -> None:
     file.symlink_to(watched.parent / "other.parquet")
 
 
-ATTACKS: dict[str, Attack] = {
-    "R1 pickled ends": pickled(ends=True),
-    "R1 pickled readings": pickled(ends=False),
-    "R1 pickle that compresses": pickled_by_lies,
-    "R2 a block far away": blosc(0x20, 4096 * 19, 2**31 - 1),
-    "R2 copied from behind the frame": blosc(2, 4096 * 19, 4096 * 19 + 16),
-    "R2 of items of none": blosc(0x21, 0, 20),
-    "R2 format 3": blosc_3,
-    "R2 a chunk that is a link": entry("0.0", "link"),
-    "R3 external storage": hdf5(external),
-    "R3 external storage in a FIFO": hdf5(external_fifo),
-    "R3 virtual": hdf5(virtual),
-    "R3 external link": hdf5(linked),
-    "R7 zarr: a chunk that is a FIFO": entry("0.0", "fifo"),
-    "R7 zarr: a chunk that is a device": entry("0.0", "device"),
-    "R7 zarr: a chunk that is a socket": entry("0.0", "socket"),
-    "R7 zarr: .zarray that is a FIFO": entry(".zarray", "fifo"),
-    "R7 zarr: .zarray that is a link": entry(".zarray", "link"),
-    "R7 zarr: a chunk's folder that is a link": through_a_folder,
-    "R7 zarr: rows never written": zarr_of(shape=[10**12, 19]),
-    "R7 zarr: chunks of one number, never written": zarr_of(shape=[10**7, 100], chunks=[1, 1]),
-    "R7 zarr: chunks beyond memory": zarr_of(shape=[10, 19], chunks=[10**12, 19]),
-    "R7 zarr: deflated": deflated,
-    "R7 zarr: zip": zip_bomb,
-    "R7 zarr: fill of another type": zarr_of(fill_value="x" * 1000),
-    "R7 zarr: deep": zarr_of(shape=json.loads("[" * 400 + "]" * 400)),
-    "R7 hdf5: rows never written": hdf5(never_written),
-    "R7 hdf5: deep": hdf5(deep),
-    "R7 hdf5: deflated": hdf5(bomb),
-    "R7 npy: rows of nothing": npy((10**10, 0)),
-    "R7 npy: sparse": sparse,
-    "R7 npy: pickle": pickle_npy,
-    "R7 mcap: chunks of zeros": mcap(lambda: [mcap_chunk(bytes(300 << 20), "zstd")] * 3),
-    "R7 mcap: equal messages": mcap(lambda: [mcap_chunk(message(ONE, 2_000_000))]),
-    "R7 mcap: equal messages of nobody": mcap(lambda: [mcap_chunk(record(9, b"") * 8_000_000)]),
-    "R7 mcap: large pictures": mcap(large_pictures, COMPRESSED, "sensor_msgs/msg/CompressedImage"),
-    "R7 msg: an array of messages": mcap(
-        lambda: [message(ONE)], "a/C[1000000000] data\n" + "=" * 80 + "\nMSG: a/C\nint8 x\n"
-    ),
-    "R7 msg: an array of texts": mcap(lambda: [message(ONE)], "string[1000000000] data"),
-    "R7 msg: fields": mcap(lambda: [message(ONE)], "".join(f"float32 f{i}\n" for i in range(20_000))),
-    "R7 msg: a tower": mcap(lambda: [message(ONE)], tower(12, 10)),
-    "R7 msg: of itself": mcap(lambda: [message(ONE)], "a/B data"),
-    "R7 db3: a view": db3(view),
-    "R7 db3: generated": db3(generated),
-    "R7 yaml: aliases": yaml(ALIASES),
-    "R7 yaml: a FIFO": yaml_fifo,
-    "R7 yaml: a name that climbs": yaml(
-        "rosbag2_bagfile_information:\n  compression_mode: ''\n  relative_file_paths:\n    - ..\n"
-    ),
-    "R7 bag: a part elsewhere": part_outside,
-    "R7 lerobot: names by width": named("data/{chunk_index:0999999999d}.parquet"),
-    "R7 lerobot: names by attribute": named("data/{chunk_index.__class__}.parquet"),
-    "R7 lerobot: names that climb": named("../watched/{chunk_index}.parquet"),
-    "R7 lerobot: equal rows": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=True)),
-    "R7 lerobot: long pages": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=False)),
-    "R7 lerobot: a link": robot_set(parquet_link),
-} | {
-    f"R7 {kind}: {name}": alone(name, kind)
-    for name in ("x.npy", "x.csv", "x.h5", "x.mcap", "x.bag", "x.db3", "x.zarr.zip")
-    for kind in ("fifo", "socket", "device")
-}
+ATTACKS: dict[str, Attack] = (
+    BAGS
+    | {
+        "R1 pickled ends": pickled(ends=True),
+        "R1 pickled readings": pickled(ends=False),
+        "R1 pickle that compresses": pickled_by_lies,
+        "R2 a block far away": blosc(0x20, 4096 * 19, 2**31 - 1),
+        "R2 copied from behind the frame": blosc(2, 4096 * 19, 4096 * 19 + 16),
+        "R2 of items of none": blosc(0x21, 0, 20),
+        "R2 format 3": blosc_3,
+        "R2 a chunk that is a link": entry("0.0", "link"),
+        "R3 external storage": hdf5(external),
+        "R3 external storage in a FIFO": hdf5(external_fifo),
+        "R3 virtual": hdf5(virtual),
+        "R3 external link": hdf5(linked),
+        "R7 zarr: a chunk that is a FIFO": entry("0.0", "fifo"),
+        "R7 zarr: a chunk that is a device": entry("0.0", "device"),
+        "R7 zarr: a chunk that is a socket": entry("0.0", "socket"),
+        "R7 zarr: .zarray that is a FIFO": entry(".zarray", "fifo"),
+        "R7 zarr: .zarray that is a link": entry(".zarray", "link"),
+        "R7 zarr: a chunk's folder that is a link": through_a_folder,
+        "R7 zarr: rows never written": zarr_of(shape=[10**12, 19]),
+        "R7 zarr: chunks of one number, never written": zarr_of(shape=[10**7, 100], chunks=[1, 1]),
+        "R7 zarr: chunks beyond memory": zarr_of(shape=[10, 19], chunks=[10**12, 19]),
+        "R7 zarr: deflated": deflated,
+        "R7 zarr: zip": zip_bomb,
+        "R7 zarr: fill of another type": zarr_of(fill_value="x" * 1000),
+        "R7 zarr: deep": zarr_of(shape=json.loads("[" * 400 + "]" * 400)),
+        "R7 hdf5: rows never written": hdf5(never_written),
+        "R7 hdf5: deep": hdf5(deep),
+        "R7 hdf5: deflated": hdf5(bomb),
+        "R7 npy: rows of nothing": npy((10**10, 0)),
+        "R7 npy: sparse": sparse,
+        "R7 npy: pickle": pickle_npy,
+        "R7 lerobot: names by width": named("data/{chunk_index:0999999999d}.parquet"),
+        "R7 lerobot: names by attribute": named("data/{chunk_index.__class__}.parquet"),
+        "R7 lerobot: names that climb": named("../watched/{chunk_index}.parquet"),
+        "R7 lerobot: equal rows": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=True)),
+        "R7 lerobot: long pages": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=False)),
+        "R7 lerobot: a link": robot_set(parquet_link),
+    }
+    | {
+        f"R7 {kind}: {name}": alone(name, kind)
+        for name in ("x.npy", "x.csv", "x.h5", "x.mcap", "x.bag", "x.db3", "x.zarr.zip")
+        for kind in ("fifo", "socket", "device")
+    }
+)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.bounds import LARGEST, Budget
 from scroll_tactile.recordings.groupfiles import DEEPEST, DESCRIPTION, GroupFiles, opened
-from store.frames import decompress_blosc, decompress_zstd
+from store.frames import decompress_blosc
 
 __all__ = ["ZarrArray", "is_zarr", "open_zarr"]
 
@@ -153,7 +153,9 @@ def _decompressed(codec: str | None, data: bytes, size: int) -> bytes | npt.NDAr
                 raise ValueError(f"it is written by {_BLOSC.get(kind, kind)} of Blosc; expected lz4 or zstd of Blosc")
             decompress_blosc(data, raw)
         elif codec == "zstd":
-            decompress_zstd(data, raw)
+            from numcodecs import zstd
+
+            zstd.decompress(data, raw)  # also where a frame does not say its size, as those that were streamed
         else:
             from numcodecs import lz4
 

@@ -97,6 +97,16 @@ class TestZarr:
                     raw = zarrfile._decompressed("blosc", frame, values.nbytes)
                     assert bytes(raw) == values.tobytes()
 
+    def test_a_frame_of_zstd_need_not_say_its_size(self):
+        from backports import zstd
+
+        streaming = zstd.ZstdCompressor()
+        frame = streaming.compress(b"ab" * 1000) + streaming.flush()
+        assert bytes(zarrfile._decompressed("zstd", frame, 2000)) == b"ab" * 1000
+        for size in (1000, 3000):
+            with pytest.raises(RuntimeError):
+                zarrfile._decompressed("zstd", frame, size)
+
     def test_other_codecs_are_named(self, tmp_path):
         path = buffer(tmp_path, 2, compressors=Blosc("blosclz"))
         with pytest.raises(RecordingError, match="written by blosclz of Blosc; expected lz4 or zstd"):

@@ -1,8 +1,9 @@
 """What a recording may cost: it comes from elsewhere, and may claim to hold more than anybody has room or time for.
 
 The bounds are ratios to the bytes that a recording has on the disk, so that they fit a touch and a day of touching.
-Numbers of sensors are compressed 2 to 20 times, those of a sensor at rest 100 times; deflate can make 1000 of one, and
-zstd a million. What is small is believed: a second's work is nobody's harm.
+Numbers of sensors are compressed 2 to 20 times, those of a sensor at rest and pictures of a gel 100 times, and LZ4
+makes at most 255 bytes of one; deflate can make 1032, and zstd a million. What is small is believed: a second's work is
+nobody's harm.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from scroll_tactile.errors import RecordingError
 
 __all__ = ["LARGEST", "RATIO", "SPARE", "Budget", "read_text", "require_file", "require_inside", "stored_bytes"]
 
-SPARE, RATIO = 1 << 28, 100
+SPARE, RATIO = 1 << 28, 256
 """Bytes that any recording may become in memory, and how many more for each byte on the disk."""
 
 SPARE_STEPS, STEPS_A_BYTE = 1 << 19, 16

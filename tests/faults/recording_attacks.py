@@ -316,8 +316,8 @@ def named(pattern: str) -> Attack:
 
 
 def equal_rows(path: Path, about: Any, *, dictionary: bool) -> None:
-    """A parquet file of 2.5·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
-    count = 25_000_000
+    """A parquet file of 3.6·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
+    count = 36_000_000
     name = "observation.tactile.tip"
     about["features"][name]["shape"] = [1]
     table = pa.table({name: pa.array(np.zeros(count, "f4")), "timestamp": pa.array(np.zeros(count, "f8"))})

@@ -32,13 +32,13 @@ SAID = {
     "R2 a chunk that is a link": "is a link; a Zarr group is made of files and folders",
     "R3 external storage": "lie in other files",
     "R3 virtual": r"lie in other data sets \(it is virtual\)",
-    "R7 zarr: rows never written": "expected at most 100 times as many, and 256 MiB",
+    "R7 zarr: rows never written": "expected at most 256 times as many, and 256 MiB",
     "R7 zarr: deflated": "expected 77824 bytes; came 77824 and more",
-    "R7 hdf5: rows never written": "expected at most 100 times as many, and 256 MiB",
+    "R7 hdf5: rows never written": "expected at most 256 times as many, and 256 MiB",
     "R7 hdf5: deep": "more than 32 groups within each other",
     "R7 hdf5: deflated": "more than the 8388608 bytes that are its own",
     "R7 mcap: equal messages": "steps of work",
-    "R7 mcap: chunks of zeros": "expected at most 100 times as many",
+    "R7 mcap: chunks of zeros": "expected at most 256 times as many",
     "R7 msg: fields": "a definition of a message has 20000 lines",
     "R7 db3: a view": "messages is no table as a ROS 2 bag has it: 'CREATE VIEW|\"CREATE VIEW",
     "R7 yaml: aliases": "has aliases, which no recorder writes",
@@ -283,7 +283,7 @@ class TestBounds:
     def test_a_recording_may_become_as_much_as_its_size_allows(self):
         budget = bounds.Budget("x", 10)
         budget.take(bounds.SPARE + 10 * bounds.RATIO)
-        with pytest.raises(RecordingError, match="in 10 bytes on the disk; expected at most 100 times as many"):
+        with pytest.raises(RecordingError, match="in 10 bytes on the disk; expected at most 256 times as many"):
             budget.take(1)
         budget.add(1)
         budget.take(bounds.RATIO - 1)

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
+import zlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import LARGEST, Block, Contents, Entry, Source, floats, missing, rows_of
+from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Source, floats, rows_of
+from scroll_tactile.recordings.bounds import LARGEST, SPARE, Budget, stored_bytes
 from scroll_tactile.recordings.keys import CLOCK_KEYS, matched
 from scroll_tactile.recordings.paths import select
+from scroll_tactile.recordings.zarrfile import open_zarr
 
-__all__ = ["Hdf5", "Npy", "ZarrBuffer", "is_zarr"]
+__all__ = ["Hdf5", "Npy", "ZarrBuffer"]
 
-
-def is_zarr(path: Path) -> bool:
-    """Whether this is a Zarr group, as a folder or a zip of one."""
-    if path.is_dir():
-        return any((path / name).exists() for name in (".zgroup", ".zarray", "zarr.json"))
-    return path.name.lower().endswith(".zarr.zip")
+_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # of HDF5, by their numbers
+_DEFLATES = 1032  # times as many bytes at most
+_DEEPEST = 32  # groups of HDF5 within each other
+_VISIT = 20  # steps of work that it takes to look at one object
+_EPISODES = 1 << 16  # may be empty
 
 
 class _Arrays(Source):
@@ -58,19 +62,32 @@ class _Arrays(Source):
             raise FieldError(
                 f"field {key!r} of {self.address} is {array.dtype} of shape {array.shape}; expected numbers"
             )
-        width = int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
-        if width > LARGEST:
-            raise RecordingError(f"{self.address} claims readings of {width} bytes in {key!r}, and may be damaged")
-        if times is not None and (times.ndim != 1 or times.shape[0] != array.shape[0]):
+        width = math.prod(array.shape[1:]) * array.dtype.itemsize
+        high = (getattr(array, "chunks", None) or (1,))[0]
+        if width * high > LARGEST or (not width and array.shape[0]):
             raise RecordingError(
-                f"{self.address}: the times have shape {times.shape}, and {key!r} has {array.shape[0]} readings"
+                f"{self.address} claims readings of {width} bytes in {key!r}, {high} at once, and may be damaged"
+            )
+        if times is not None and (times.ndim != 1 or times.shape[0] != array.shape[0] or times.dtype.kind not in "iuf"):
+            raise RecordingError(
+                f"{self.address}: the times are {times.dtype} of shape {times.shape}, and {key!r} has "
+                f"{array.shape[0]} readings"
             )
         rows = rows_of(width)
-        for i in range(0, array.shape[0], rows):
-            part = floats(np.asarray(array[i : i + rows]))
-            clocks = {} if times is None else {"times": np.asarray(times[i : i + rows]).astype(np.float64)}
-            episodes = None if number is None else np.full(len(part), number, np.int64)
-            yield Block(select(part, rest, key) if rest else part, clocks, {}, episodes)
+        step = max(rows // high, 1) * high  # chunks are decompressed whole, and once
+        for first in range(0, array.shape[0], step):
+            slab = self._rows(array, first, min(first + step, array.shape[0]))
+            for i in range(first, first + len(slab), rows):
+                part = floats(slab[i - first : i - first + rows])
+                clocks = {}
+                if times is not None:
+                    clocks = {"times": self._rows(times, i, i + len(part)).astype(np.float64)}
+                episodes = None if number is None else np.full(len(part), number, np.int64)
+                yield Block(select(part, rest, key) if rest else part, clocks, {}, episodes)
+
+    def _rows(self, array: Any, begin: int, end: int) -> Any:
+        """These rows of an array; raises RecordingError where a recording of this size cannot hold them."""
+        return np.asarray(array[begin:end])
 
 
 class Npy(_Arrays):
@@ -89,7 +106,12 @@ class Npy(_Arrays):
             raise FieldError(f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place")
         yield from self._slices(array, None, "", self.field(), None)
 
+    def _rows(self, array: Any, begin: int, end: int) -> Any:
+        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
+        return array[begin:end]
+
     def _array(self) -> Any:
+        self.budget = Budget(self.address, stored_bytes(self.path))
         array = np.load(self.path, mmap_mode="r", allow_pickle=False)
         if not isinstance(array, np.ndarray):
             array.close()
@@ -115,13 +137,45 @@ class Hdf5(_Arrays):
                 raise RecordingError(f"{self.address}: {key!r} is ragged: its demos have readings of {sorted(shapes)}")
             for number, part in arrays[key].items():
                 times = None if clock is None else arrays[clock].get(number)
+                for item in (part, times):
+                    self._require_own(item)
                 yield from self._slices(part, times, key, rest, number if number >= 0 else None)
+
+    def _rows(self, array: Any, begin: int, end: int) -> Any:
+        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
+        if array.compression == "gzip":
+            self._measure(array, begin, end)
+        return array[begin:end]
+
+    def _measure(self, array: Any, begin: int, end: int) -> None:
+        """Raises RecordingError for a chunk that deflate would make longer than a chunk is: HDF5 takes all that comes.
+
+        Only large ones can become so large that it matters, and these are decompressed here first.
+        """
+        size = math.prod(array.chunks) * array.dtype.itemsize
+        along = [range(begin, end, array.chunks[0])]
+        along += [range(0, whole, step) for whole, step in zip(array.shape[1:], array.chunks[1:], strict=True)]
+        for corner in itertools.product(*along):
+            self.budget.work()
+            about = array.id.get_chunk_info_by_coord(corner)
+            if about.size is None or about.size * _DEFLATES < SPARE:
+                continue
+            if about.size > self.budget.stored:
+                raise RecordingError(f"{self.address} claims a chunk of {about.size} bytes, and may be damaged")
+            _, data = array.id.read_direct_chunk(corner)
+            inflating, length = zlib.decompressobj(), 0
+            while data and length <= size:
+                length += len(inflating.decompress(data, 1 << 20))
+                data = inflating.unconsumed_tail
+            if length > size:
+                raise RecordingError(f"{self.address} has a chunk of more than the {size} bytes that are its own")
 
     def _open(self) -> Any:
         try:
             import h5py
         except ImportError as error:
             raise missing("h5py", "hdf5", "an HDF5 file") from error
+        self.budget = Budget(self.address, stored_bytes(self.path))
         return h5py.File(self.path, "r")
 
     def _arrays(self, file: Any) -> dict[str, dict[int, Any]]:
@@ -131,13 +185,37 @@ class Hdf5(_Arrays):
         found: dict[str, dict[int, Any]] = {}
 
         def visit(name: str, item: Any) -> None:
+            self.budget.work(_VISIT)
+            if name.count("/") > _DEEPEST:
+                raise RecordingError(f"{self.address} has more than {_DEEPEST} groups within each other")
             if isinstance(item, h5py.Dataset) and item.shape is not None:
                 match = re.fullmatch(r"data/demo_(\d{1,9})/(.+)", name)
                 key, number = (match.group(2), int(match.group(1))) if match else (name, -1)
                 found.setdefault(key, {})[number] = item
 
-        file.visititems(visit)
+        file.visititems(visit)  # which follows neither soft nor external links
         return {key: dict(sorted(parts.items())) for key, parts in found.items()}
+
+    def _require_own(self, item: Any) -> None:
+        """Raises RecordingError for numbers that lie in other files, or in what only a plugin decodes."""
+        import h5py
+
+        if item is None:
+            return
+        about = item.id.get_create_plist()
+        virtual = about.get_layout() == h5py.h5d.VIRTUAL
+        if virtual or about.get_external_count():
+            where = "other data sets (it is virtual)" if virtual else "other files (external storage)"
+            raise RecordingError(
+                f"{self.address}: the numbers of {item.name!r} lie in {where}, which may be any on this machine. Copy "
+                "it with h5repack, which puts them in"
+            )
+        numbers = [about.get_filter(i)[0] for i in range(about.get_nfilters())]
+        if not set(numbers) <= set(_FILTERS) or len(set(numbers)) < len(numbers):
+            raise RecordingError(
+                f"{self.address}: {item.name!r} has the filters {[_FILTERS.get(n, n) for n in numbers]}; expected at "
+                f"most one each of {', '.join(_FILTERS.values())}: copy it with h5repack"
+            )
 
 
 class ZarrBuffer(_Arrays):
@@ -145,55 +223,32 @@ class ZarrBuffer(_Arrays):
 
     def contents(self) -> Contents:
         """The arrays, those in `meta` left out."""
-        return self._listed(self._arrays(self._open()))
+        arrays, _ = open_zarr(self.path, Budget(self.address))
+        return self._listed({key: [array] for key, array in arrays.items()})
 
     def blocks(self) -> Iterator[Block]:
         """The readings of one array, episode after episode."""
-        group = self._open()
-        arrays = self._arrays(group)
-        key, rest, clock = self._chosen(arrays)
-        array = arrays[key][0]
-        times = arrays[clock][0] if clock is not None else None
-        ends = self._ends(group, array.shape[0])
+        self.budget = Budget(self.address)
+        arrays, episode_ends = open_zarr(self.path, self.budget)
+        key, rest, clock = self._chosen({key: [array] for key, array in arrays.items()})
+        for name in (key, clock):
+            if name is not None and (why := arrays[name].why):
+                raise RecordingError(f"{self.address}: {name!r} cannot be read: {why}")
+        array = arrays[key]
+        ends = None if episode_ends is None else self._ends(episode_ends, array.shape[0] if array.ndim else 0)
         done = 0
-        for block in self._slices(array, times, key, rest, None):
+        for block in self._slices(array, arrays[clock] if clock is not None else None, key, rest, None):
             if ends is not None:
                 index = np.arange(done, done + len(block.readings))
                 block.episodes = np.searchsorted(ends, index, side="right").astype(np.int64)
             done += len(block.readings)
             yield block
 
-    def _open(self) -> Any:
-        import zarr
-
-        store: Any = str(self.path)
-        if not self.path.is_dir():
-            store = zarr.storage.ZipStore(self.path, mode="r")
-        return zarr.open(store, mode="r")
-
-    def _arrays(self, group: Any) -> dict[str, list[Any]]:
-        import zarr
-
-        if isinstance(group, zarr.Array):
-            return {"data": [group]}
-        found: dict[str, list[Any]] = {}
-
-        def walk(inside: Any, before: str, depth: int) -> None:
-            for name, item in inside.members():
-                if isinstance(item, zarr.Array):
-                    found[f"{before}{name}"] = [item]
-                elif depth < 8 and (before or name != "meta"):
-                    walk(item, f"{before}{name}/", depth + 1)
-
-        walk(group, "", 0)
-        return found
-
-    def _ends(self, group: Any, count: int) -> Any:
-        import zarr
-
-        if isinstance(group, zarr.Array) or "meta/episode_ends" not in group:
-            return None
-        ends = np.asarray(group["meta/episode_ends"][:], np.int64).reshape(-1)
+    def _ends(self, array: Any, count: int) -> Any:
+        if array.why or array.ndim != 1 or array.dtype.kind not in "iu" or array.shape[0] > count + _EPISODES:
+            why = array.why or f"they are {array.dtype} of shape {array.shape}, of {count} readings"
+            raise RecordingError(f"{self.address}: meta/episode_ends cannot be read: {why}")
+        ends = array[:].astype(np.int64)
         if (np.diff(ends, prepend=0) < 0).any() or (len(ends) and ends[-1] > count):
             raise RecordingError(
                 f"{self.address}: meta/episode_ends does not rise to at most {count}, the readings' count"

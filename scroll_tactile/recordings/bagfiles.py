@@ -15,8 +15,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from scroll_tactile.errors import RecordingError
-from scroll_tactile.recordings.blocks import LARGEST, missing
+from scroll_tactile.errors import InputError, RecordingError
+from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.bounds import LARGEST, Budget
 
 __all__ = ["DAMAGE", "Channel", "CutOff", "Message", "Scan", "decompress", "inflated", "scan_bag", "take", "zstd"]
 
@@ -46,12 +47,12 @@ class Message(NamedTuple):
 class Scan:
     """What a scan is to give, and how it went.
 
-    wanted: whether messages of a topic are wanted; those of others are passed over.
+    wanted: whether messages of a topic are wanted; those of others are passed over. budget: what it may cost.
     cut_off: why the file ends before its end. damaged: how many chunks inside it could not be read.
     """
 
-    def __init__(self, wanted: Callable[[str], bool]) -> None:
-        self.wanted = wanted
+    def __init__(self, wanted: Callable[[str], bool], budget: Budget) -> None:
+        self.wanted, self.budget = wanted, budget
         self.cut_off: str | None = None
         self.damaged = 0
 
@@ -67,16 +68,22 @@ def take(file: BinaryIO, size: int, left: int) -> bytes:
     """The next `size` bytes; raises CutOff where there are fewer, before any memory is taken for them."""
     if size > left:
         raise CutOff(f"a record of {size} bytes is claimed where {left} are left")
+    if size > LARGEST:  # what is left may be a hole
+        raise CutOff(f"a record of {size} bytes is claimed")
     data = file.read(size)
     if len(data) < size:
         raise CutOff("it ends in the middle of a record")
     return data
 
 
-def decompress(kind: str, data: bytes, size: int, *, whole: bool) -> bytes:
-    """`data` decompressed, of `size` bytes; raises ValueError where they are not as many and it is `whole`."""
+def decompress(kind: str, data: bytes, size: int, budget: Budget, *, whole: bool) -> bytes:
+    """`data` decompressed, of `size` bytes; raises ValueError where they are not as many and it is `whole`.
+
+    Raises RecordingError where the budget has no room for as many, MissingLibraryError.
+    """
     if size > LARGEST:
         raise ValueError(f"a chunk of {size} bytes is claimed")
+    budget.take(size)
     if kind in ("", "none"):
         result = data
     else:
@@ -116,19 +123,20 @@ def zstd() -> Any:
     return zstd
 
 
-def inflated(path: Path, folder: Path) -> Path:
+def inflated(path: Path, folder: Path, budget: Budget) -> Path:
     """A whole file that was compressed by zstd, as it was before, in `folder`."""
-    import shutil
-
     target = folder / path.stem
     with path.open("rb") as file, zstd().open(file, "rb") as source, target.open("wb") as sink:
-        shutil.copyfileobj(source, sink, 1 << 20)
+        while part := source.read(1 << 20):
+            budget.take(len(part))
+            sink.write(part)
     return target
 
 
 # ROS 1: records of a header (fields name=value) and data; chunks hold records.
 
 _BAG = b"#ROSBAG V2.0\n"
+_A_RECORD = 4  # steps of work
 _MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 
 
@@ -145,7 +153,7 @@ def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
                 header, length = _record_head(file, size)
                 left = size - file.tell()
                 if length > left and header.get(b"op") == bytes([_CHUNK]):
-                    yield from reader.chunk(header, file.read(left), whole=False)
+                    yield from reader.chunk(header, file.read(min(left, LARGEST)), whole=False)
                     raise CutOff("it ends in the middle of a chunk")
                 yield from reader.record(header, take(file, length, size - file.tell()))
         except CutOff as error:
@@ -197,6 +205,7 @@ class _Bag:
         self.total = 0
 
     def record(self, header: dict[bytes, bytes], data: bytes) -> Iterator[Message]:
+        self.scan.budget.work(_A_RECORD)
         kind = header.get(b"op", b"\0")[0]
         if kind == _CHUNK:
             yield from self.chunk(header, data, whole=True)
@@ -209,13 +218,15 @@ class _Bag:
         """The messages of a chunk; of one that was cut off, those before the cut."""
         try:
             (size,) = struct.unpack("<I", header[b"size"])
-            inside = decompress(header[b"compression"].decode(), data, size, whole=whole)
+            inside = decompress(header[b"compression"].decode(), data, size, self.scan.budget, whole=whole)
             chunk = BytesIO(inside)
             while chunk.tell() < len(inside):
                 inner, length = _record_head(chunk, len(inside))
                 if inner.get(b"op") == bytes([_CHUNK]):
                     raise ValueError("a chunk is claimed inside a chunk")
                 yield from self.record(inner, take(chunk, length, len(inside) - chunk.tell()))
+        except InputError:  # a library is missing, or there is more than such a file can hold
+            raise
         except (*DAMAGE, CutOff):
             self.scan.damaged += whole
 

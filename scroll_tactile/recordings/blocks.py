@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.bounds import Budget
 
-__all__ = ["LARGEST", "Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "missing", "rows_of"]
+__all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "rows_of"]
 
-LARGEST = 1 << 30
-"""The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
-
+_MESSAGE = 8000  # letters of an error
 _ROWS = 4096  # of a block …
 _BYTES = 1 << 24  # … unless they would hold more than this
 
@@ -107,6 +105,7 @@ class Source(ABC):
     names: what each episode is called, by its number.
     marks: what a topic of labels said when: seconds by the clock "log", and a text.
     continuous: whether time goes on from one episode to the next, and does not begin anew.
+    budget: what reading it may still cost.
     topics, labels: whether the format has topics, and something that labels.
     """
 
@@ -115,6 +114,7 @@ class Source(ABC):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request
         self.topic = request.topic
+        self.budget = Budget(address)
         self.notes: list[str] = []
         self.cut_off = False
         self.names: dict[int, str] = {}
@@ -157,7 +157,12 @@ def guarded(path: str) -> Iterator[None]:
     """Damaged bytes make parsers fail in many ways: all of them become a RecordingError that names the file."""
     try:
         yield
-    except (ScrollTactileError, GeneratorExit):
+    except ScrollTactileError as error:
+        text = str(error)
+        if len(text) > _MESSAGE:  # names and definitions in a file may have any length
+            error.args = (f"{text[:_MESSAGE]} …",)
+        raise
+    except GeneratorExit:
         raise
     except MemoryError as error:
         raise RecordingError(f"{path} claims to hold more than fits into memory, and may be damaged") from error

@@ -7,13 +7,16 @@ import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from scroll_tactile.errors import RecordingError
+from scroll_tactile.libraries import missing
 from scroll_tactile.recordings.bagfiles import Channel
-from scroll_tactile.recordings.blocks import Request, missing
+from scroll_tactile.recordings.blocks import Request
+from scroll_tactile.recordings.bounds import Budget
 from scroll_tactile.recordings.paths import fields_of
 
 __all__ = ["MessageTypes"]
@@ -23,21 +26,29 @@ __all__ = ["MessageTypes"]
 # takes more than three for damage.
 _END, _WIDEST = 3, 8
 
+# rosbags writes code for each element of an array of fixed length: a second for 4096 of them, or for 2500 fields. The
+# largest definitions of ROS's own packages, MoveIt's, have some 400 fields in all.
+_MOST_LINES, _MOST_OBJECTS = 4000, 1 << 14
+_A_LINE, _A_MESSAGE, _NESTED = 500, 8, 32  # steps of work; a nested message takes one for as many bytes
+
 
 class MessageTypes:
     """Turns the bytes of messages into objects, by the definitions that come with them, or else ROS 2's own."""
 
     def __init__(self, request: Request) -> None:
         self.given = request.definitions
-        self.readers: dict[Channel, Callable[[bytes], object]] = {}
+        self.readers: dict[Channel, _Reader] = {}
 
-    def decode(self, channel: Channel, data: bytes) -> object:
-        """Raises RecordingError for a type that is not defined, and for bytes that do not fit it."""
+    def decode(self, channel: Channel, data: bytes, budget: Budget) -> object:
+        """Raises RecordingError for a type that is not defined, bytes that do not fit it, or a budget that is spent."""
         reader = self.readers.get(channel)
         if reader is None:
-            reader = self.readers[channel] = _reader(channel, self.given.get(channel.type, ""))
+            given = self.given.get(channel.type, "")
+            budget.work(_A_LINE * _lines(given or channel.definition))
+            reader = self.readers[channel] = _reader(channel, given)
+        budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
         try:
-            return reader(data)
+            return reader.read(data)
         except RecordingError:
             raise
         except Exception as error:
@@ -47,10 +58,27 @@ class MessageTypes:
             ) from error
 
 
+@dataclass(frozen=True)
+class _Reader:
+    """What makes an object of bytes. steps: of work for each; nested: whether more come with its bytes."""
+
+    read: Callable[[bytes], object]
+    steps: int = _A_MESSAGE
+    nested: bool = True
+
+
+def _lines(text: str) -> int:
+    """How many lines of a definition define something; raises RecordingError where they are too many."""
+    count = sum(1 for line in re.split(r"[\n;]", text) if line.strip() and not line.lstrip().startswith("#"))
+    if count > _MOST_LINES:
+        raise RecordingError(f"a definition of a message has {count} lines; expected at most {_MOST_LINES}")
+    return count
+
+
 @functools.lru_cache(256)  # as many bags as touches have the same messages
-def _reader(channel: Channel, given: str) -> Callable[[bytes], object]:
+def _reader(channel: Channel, given: str) -> _Reader:
     if channel.encoding == "json":
-        return json.loads
+        return _Reader(json.loads)
     if channel.encoding not in ("cdr", "ros1"):
         raise RecordingError(
             f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
@@ -77,9 +105,44 @@ def _reader(channel: Channel, given: str) -> Callable[[bytes], object]:
             f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
             f"pass definitions={{{channel.type!r}: text of its .msg file}}"
         )
+    objects, nested = _objects(store.fielddefs, channel.type, {})
+    if objects > _MOST_OBJECTS:
+        raise RecordingError(f"a message of {channel.type} holds {objects} values; expected at most {_MOST_OBJECTS}")
     if channel.encoding == "ros1":
-        return lambda data: store.deserialize_ros1(data, channel.type)
-    return functools.partial(_read_cdr, store, channel.type)
+        return _Reader(lambda data: store.deserialize_ros1(data, channel.type), _A_MESSAGE + objects, nested)
+    return _Reader(functools.partial(_read_cdr, store, channel.type), _A_MESSAGE + objects, nested)
+
+
+def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | None]) -> tuple[int, bool]:
+    """How many objects each message of a type becomes, arrays of numbers one each; whether it has lists of others.
+
+    known: those of other types; None while it is being found out. Raises RecordingError for a type that holds itself,
+    or nothing.
+    """
+    from rosbags.interfaces import Nodetype
+
+    if name in known:
+        if (found := known[name]) is None:
+            raise RecordingError(f"a message of {name} holds itself")
+        return found
+    known[name] = None
+    total, nested = 1, False
+    for field, (kind, about) in definitions[name][1]:
+        array, several = kind == Nodetype.ARRAY, kind == Nodetype.SEQUENCE
+        of, what = about[0] if array or several else (kind, about)
+        plain = of == Nodetype.BASE and what[0] != "string"
+        inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
+        if (array and not about[1]) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
+            # There could be any number of them in no byte.
+            raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
+        total += inside * (about[1] if array and not plain else 1)
+        nested |= deeper or (several and not plain)
+    known[name] = total, nested
+    return total, nested
+
+
+def _is_empty(fields: Any) -> bool:
+    return not fields or [name for name, _ in fields] == ["structure_needs_at_least_one_member"]
 
 
 def _read_cdr(store: Any, kind: str, data: bytes) -> object:

@@ -15,12 +15,14 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, rows_of
+from scroll_tactile.recordings.bounds import stored_bytes
 from scroll_tactile.recordings.paths import nearest
 
 __all__ = ["Delimited", "is_missing", "is_number", "is_table"]
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
 _LONGEST = 1 << 24  # characters in a line; a longer one is no table's
+_MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN = 200  # lines are looked at to say what a table is
 _TIME = re.compile(
     r"(?:time(?:[ _]?stamp)?s?|t|stamp|seconds)(?:[ _]*[\[(]?(s|sec|seconds|ms|us|µs|ns)[\])]?)?", re.IGNORECASE
@@ -57,6 +59,7 @@ class Delimited(Source):
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
+        self.budget.add(stored_bytes(path))
         if request.decimal not in (".", ","):
             raise RecordingError(f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}")
         with self._text() as file:
@@ -64,6 +67,8 @@ class Delimited(Source):
         self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
         rows = [(number, self._cells(line, number)) for number, line in lines]
         self.width = len(rows[0][1])
+        if self.width > _MOST_COLUMNS:
+            raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
         mark = re.escape(self.delimiter)
         tokens = "|".join(re.escape(token) for token in sorted(_MISSING, key=len, reverse=True))
         self._empty = re.compile(rf"(?:(?<={mark})|^)[^\S{mark}]*(?:{tokens})[^\S{mark}]*(?={mark}|$)", re.IGNORECASE)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
+from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
+from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.keys import matched
+from scroll_tactile.recordings.parquetpages import require_bounded_pages
 from scroll_tactile.recordings.paths import select
 
 __all__ = ["LeRobot", "is_lerobot"]
 
+_LONGEST = 1 << 24  # bytes of info.json
+_PLACEHOLDER = re.compile(r"\{(?:episode_)?(?:chunk|file)_index(?::0?\d?d)?\}")
+_TABLE_ROW = 100  # steps of work
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
@@ -35,7 +43,7 @@ class LeRobot(Source):
             raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
         self.parquet: Any = parquet
         super().__init__(path, address, request)
-        self.info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+        self.info = json.loads(read_text(path, path / "meta" / "info.json", _LONGEST))
         version = str(self.info.get("codebase_version", ""))
         if not version.startswith("v3"):
             raise RecordingError(
@@ -57,21 +65,42 @@ class LeRobot(Source):
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the column, file after file."""
+        self.budget = Budget(self.address)
         key, rest = self._column()
         clock = self.request.clock or "timestamp"
         tasks = self._tasks()
         columns = list(dict.fromkeys([key, clock, *_BOOKKEEPING]))
         shape = self.features[key]["shape"]
+        width = 8 * math.prod(int(size) for size in shape)
+        if not 0 < width <= LARGEST:
+            raise RecordingError(
+                f"{self.address} claims readings of shape {shape!r:.60} in {key!r}, and may be damaged"
+            )
         for path in self._files():
-            with self.parquet.ParquetFile(path) as file:
+            with self._opened(path, columns) as file:
                 there = [name for name in columns if name in file.schema_arrow.names]
                 for name in (key, clock):
                     if name not in there:
                         raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
-                width = 8 * int(np.prod(shape, dtype=np.int64))
                 for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
+                    self.budget.take(batch.nbytes)
                     if batch.num_rows:
                         yield self._block(batch, key, rest, clock, tasks)
+
+    def _opened(self, path: Path, columns: list[str]) -> Any:
+        """A parquet file; raises RecordingError where these columns claim more than one of its size can hold."""
+        require_inside(self.path, path)
+        self.budget.add(stored_bytes(path))
+        file = self.parquet.ParquetFile(path)
+        require_bounded_pages(path, file.metadata, columns, self.budget)
+        return file
+
+    def _table(self, path: Path, columns: list[str] | None = None) -> dict[str, list[Any]]:
+        """A small parquet table, or some columns of one, whole."""
+        with self._opened(path, columns or ["task_index", "task", "__index_level_0__"]) as file:
+            self.budget.work(_TABLE_ROW * max(file.metadata.num_rows, 0))
+            table: dict[str, list[Any]] = file.read(columns=columns).to_pydict()
+            return table
 
     def _block(self, batch: Any, key: str, rest: str, clock: str, tasks: dict[int, str]) -> Block:
         values = select(floats(self._rows(batch.column(key), key)), rest, self.field())
@@ -123,14 +152,16 @@ class LeRobot(Source):
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
         for path in sorted((self.path / "meta" / "episodes").glob("**/*.parquet")):
-            table = self.parquet.read_table(path, columns=["data/chunk_index", "data/file_index"])
-            listed |= dict.fromkeys(zip(*(column.to_pylist() for column in table.columns), strict=True))
+            table = self._table(path, ["data/chunk_index", "data/file_index"])
+            listed |= dict.fromkeys(zip(table["data/chunk_index"], table["data/file_index"], strict=True))
         pattern = str(self.info["data_path"])
+        if re.search(r"[{}\\]", _PLACEHOLDER.sub("", pattern)):
+            raise RecordingError(f"{self.address} names its data {pattern!r:.100}; expected chunk_index and file_index")
         files = [self.path / pattern.format(chunk_index=chunk, file_index=file) for chunk, file in sorted(listed)]
         files = files or sorted((self.path / "data").glob("**/*.parquet"))
         root = self.path.resolve()
         if not all(file.resolve().is_relative_to(root) for file in files):
-            raise RecordingError(f"{self.address} names data outside its folder: {pattern!r}")
+            raise RecordingError(f"{self.address} names data outside its folder: {pattern!r:.100}")
         absent = [str(file.relative_to(self.path)) for file in files if not file.is_file()]
         if absent or not files:
             raise RecordingError(
@@ -144,7 +175,7 @@ class LeRobot(Source):
         if not path.is_file():
             self.notes.append("the tasks are missing, meta/tasks.parquet: episodes have no name")
             return {}
-        table = self.parquet.read_table(path).to_pydict()
+        table = self._table(path)
         indices = table.pop("task_index")
         # pandas writes an index without a name under one of its own
         texts: list[Any] = next(iter(table.values()), [])

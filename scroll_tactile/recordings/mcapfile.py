@@ -9,8 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from scroll_tactile.errors import RecordingError
+from scroll_tactile.errors import InputError, RecordingError
 from scroll_tactile.recordings.bagfiles import DAMAGE, Channel, CutOff, Message, Scan, decompress, take
+from scroll_tactile.recordings.bounds import LARGEST
 
 __all__ = ["scan_mcap"]
 
@@ -32,6 +33,7 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
         _summary(file, size, reader)
         try:
             while True:
+                scan.budget.work()
                 kind, length = _HEAD.unpack(take(file, _HEAD.size, size - file.tell()))
                 if kind in (_FOOTER, _DATA_END):
                     return
@@ -42,7 +44,7 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
                     continue
                 left = size - file.tell()
                 if kind == _MCAP_CHUNK and length > left:
-                    yield from reader.chunk(file.read(left), whole=False)
+                    yield from reader.chunk(file.read(min(left, LARGEST)), whole=False)
                     raise CutOff("it ends in the middle of a chunk")
                 data = take(file, length, size - file.tell())
                 yield from reader.chunk(data, whole=True) if kind == _MCAP_CHUNK else reader.record(kind, data)
@@ -60,6 +62,7 @@ def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
         with suppress(*DAMAGE, CutOff):
             file.seek(start if 0 < start < size else size)
             while file.tell() < size - tail:
+                reader.scan.budget.work()
                 kind, length = _HEAD.unpack(take(file, _HEAD.size, size - file.tell()))
                 data = take(file, length, size - file.tell())
                 if kind in (_SCHEMA, _CHANNEL):
@@ -84,17 +87,20 @@ class _Mcap:
             size, checksum = struct.unpack_from("<QI", data, 16)
             form, i = _text(data, 28)
             (length,) = struct.unpack_from("<Q", data, i)
-            inside = decompress(form, data[i + 8 : i + 8 + length], size, whole=whole)
+            inside = decompress(form, data[i + 8 : i + 8 + length], size, self.scan.budget, whole=whole)
             if whole and checksum and zlib.crc32(inside) != checksum:
                 raise ValueError("its checksum does not verify")
             i = 0
             while i + _HEAD.size <= len(inside):
                 kind, length = _HEAD.unpack_from(inside, i)
                 i += _HEAD.size
+                self.scan.budget.work()
                 if i + length > len(inside):
                     raise CutOff("a record ends beyond its chunk")
                 yield from self.record(kind, inside[i : i + length])
                 i += length
+        except InputError:  # a library is missing, or there is more than such a file can hold
+            raise
         except (*DAMAGE, CutOff):
             self.scan.damaged += whole
 

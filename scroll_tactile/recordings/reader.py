@@ -13,12 +13,15 @@ import numpy as np
 from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
+from scroll_tactile.recordings.bounds import require_file
 from scroll_tactile.recordings.clocks import choose
 from scroll_tactile.recordings.columns import only_columns
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Recording, assemble, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
+
+_DEEPEST = 64  # folders within each other in which recordings are looked for
 
 _Address = str | PathLike[str]
 
@@ -57,14 +60,15 @@ def read(
     definitions: of messages that a bag does not define, the text of the .msg by the type's name.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
-    file is not there, damaged, ragged, empty, or of no known format; MissingLibraryError where it needs a library that
-    is not installed; ChannelCountError where a preset is of another sensor; InputError for a clock that is not there.
+    file is not there, damaged, ragged, empty, of no known format, or claims to hold more than one of its size can (see
+    `bounds`); MissingLibraryError where it needs a library that is not installed; ChannelCountError where a preset is
+    of another sensor; InputError for a clock that is not there.
     """
     request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request, preset)
-        whole = _joined(_timed(source, request), address)
+        whole = _joined(_timed(source, request), source)
         recording = _recording(whole, source, _clock(whole, request.clock), columns)
     _require(recording, preset)
     return recording if resample is None else resampled(recording, resample)
@@ -129,11 +133,15 @@ def find(path: _Address) -> list[Path]:
     however they are numbered; `read` takes their folder as one that was split. Raises RecordingError for a path where
     nothing is.
     """
-    from scroll_tactile.recordings import rosbag
-
     place = Path(path)
     if not place.exists():
         raise RecordingError(f"expected recordings in {place}; it is not there")
+    return _found(place, 0)
+
+
+def _found(place: Path, depth: int) -> list[Path]:
+    from scroll_tactile.recordings import rosbag
+
     bags_alone = place.is_dir() and not (place / "metadata.yaml").exists() and rosbag.is_rosbag(place)
     if _kind(place) is not None and not bags_alone:
         return [place]
@@ -142,7 +150,7 @@ def find(path: _Address) -> list[Path]:
         if inside.is_symlink() and inside.is_dir():
             continue  # it may lead back here
         if inside.is_dir() and not inside.name.startswith("."):
-            found += find(inside)
+            found += _found(inside, depth + 1) if depth < _DEEPEST else []
         elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
             found.append(inside)
     return found
@@ -161,6 +169,8 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
             "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
             f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
+    if not path.is_dir():
+        require_file(path)
     if known is not None and kind.topics:
         request = replace(request, field=request.field or known.field, likely=known.topic)
     source = kind(path, address, request)
@@ -171,13 +181,13 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag
+    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
     if path.is_dir() and lerobot.is_lerobot(path):
         return lerobot.LeRobot
-    if arraystores.is_zarr(path):
+    if zarrfile.is_zarr(path):
         return arraystores.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".hdf"):
@@ -206,16 +216,19 @@ def _timed(source: Source, request: Request) -> Iterator[Block]:
         yield block
 
 
-def _joined(blocks: Iterator[Block], address: str) -> Block:
-    """All blocks as one; raises RecordingError where there are none."""
-    parts = list(blocks)
+def _joined(blocks: Iterator[Block], source: Source) -> Block:
+    """All blocks as one; raises RecordingError where there are none, or more than a file of this size can hold."""
+    parts = []
+    for block in blocks:
+        source.budget.give(block.readings.nbytes)
+        parts.append(block)
     if not parts:
-        raise RecordingError(f"{address} holds no readings")
+        raise RecordingError(f"{source.address} holds no readings")
     if len(parts) == 1:
         return parts[0]
     if len({part.readings.shape[1:] for part in parts}) > 1:
         shapes = sorted({part.readings.shape[1:] for part in parts})
-        raise RecordingError(f"{address}: readings are ragged: they have {shapes} values")
+        raise RecordingError(f"{source.address}: readings are ragged: they have {shapes} values")
 
     def whole(name: str) -> dict[str, Any]:
         columns = [getattr(part, name) for part in parts]

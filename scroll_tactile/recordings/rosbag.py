@@ -15,9 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
+from scroll_tactile.libraries import missing
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, missing, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
+from scroll_tactile.recordings.bounds import Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.clocks import Stamps
 from scroll_tactile.recordings.decoding import MessageTypes
 from scroll_tactile.recordings.mcapfile import scan_mcap
@@ -33,6 +35,9 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
 
 _LOOKED = 2000  # messages are looked at to say what a bag holds
+_LONGEST, _LISTS = 1 << 24, 1 << 18  # bytes of metadata.yaml; and of the part that lists files: thousands of them
+
+_PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
 
 
 def is_rosbag(path: Path) -> bool:
@@ -71,7 +76,7 @@ class RosBag(Source):
             seen.setdefault(key, []).append(message.log)
             if key not in entries:
                 try:
-                    decoded = self.types.decode(message.channel, message.data)
+                    decoded = self.types.decode(message.channel, message.data, self.budget)
                 except RecordingError as error:
                     self.notes.append(str(error))
                     entries[key] = []
@@ -97,7 +102,10 @@ class RosBag(Source):
         width, most = -1, 1
         for i, (message, decoded) in enumerate(self._decoded(topic)):
             row = picture(decoded) if path.text == "data" else None
-            row = path.reading(decoded) if row is None else row
+            if row is None:
+                row = path.reading(decoded)
+            else:
+                self.budget.take(row.nbytes)
             if width < 0:
                 width, most = row.size, rows_of(max(row.nbytes, 4 * row.size))
                 if not width:
@@ -125,7 +133,7 @@ class RosBag(Source):
         decoded, unfit = None, 0
         for message in self._messages(lambda name: name in (topic, labels)):
             try:
-                decoded = self.types.decode(message.channel, message.data)
+                decoded = self.types.decode(message.channel, message.data, self.budget)
             except RecordingError:
                 if decoded is None:
                     raise
@@ -162,7 +170,7 @@ class RosBag(Source):
             if topic not in topics:
                 topics[topic] = False
                 with suppress(RecordingError):
-                    topics[topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
+                    topics[topic] = path.reading(self.types.decode(message.channel, message.data, self.budget)).size > 0
                 if topics[topic] and topic == self.request.likely:
                     return [topic]
         return [topic for topic, has in topics.items() if has]
@@ -181,13 +189,15 @@ class RosBag(Source):
 
     def _messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
         self.notes, self.cut_off, self.marks = [], False, []
+        self.budget = Budget(self.address)
         for path in self.files:
-            scan = Scan(wanted)
+            self.budget.add(stored_bytes(path))
+            scan = Scan(wanted, self.budget)
             if path.suffix.lower() != ".zstd":
                 yield from self._scanned(path, scan)
             else:
                 with tempfile.TemporaryDirectory() as folder:
-                    yield from self._scanned(inflated(path, Path(folder)), scan)
+                    yield from self._scanned(inflated(path, Path(folder), self.budget), scan)
             if scan.cut_off is not None:
                 self.cut_off = True
                 self.notes.append(f"{path.name} was cut off: {scan.cut_off}; what comes before was read")
@@ -210,22 +220,35 @@ def _files(path: Path) -> tuple[list[Path], bool]:
     there = _parts(path)
     listed = path / "metadata.yaml"
     if not listed.exists():
+        for file in there:
+            require_inside(path, file)
         return there, False
     try:
-        from ruamel.yaml import YAML  # comes with rosbags
+        from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
     except ImportError as error:
         raise missing("rosbags", "ros", "a ROS recording") from error
-    text = listed.read_text(encoding="utf-8")
-    yaml, parts = YAML(typ="safe"), [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
+    text = read_text(path, listed, _LONGEST)
+    parts = [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
     # The whole text takes as long as a hundred messages do.
-    about = yaml.load("".join(parts)) if len(parts) == 2 else yaml.load(text)["rosbag2_bagfile_information"]
-    files = [path / Path(str(name)).name for name in about["relative_file_paths"]]
+    lists = "".join(parts) if len(parts) == 2 else text
+    if len(lists) > _LISTS:
+        raise RecordingError(f"{listed} lists its files in {len(lists)} letters; expected at most {_LISTS}")
+    if any(isinstance(event, AliasEvent) for event in YAML(typ="safe").parse(lists)):
+        raise RecordingError(f"{listed} has aliases, which no recorder writes, and which can stand for any length")
+    about = YAML(typ="safe").load(lists)
+    about = about if len(parts) == 2 else about["rosbag2_bagfile_information"]
+    names = [str(name) for name in about["relative_file_paths"]]
+    if any("\\" in name or Path(name).name in ("", "..") for name in names):
+        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
+    files = [path / Path(name).name for name in names]
     absent = [file.name for file in files if not file.exists()]
     if absent:
         raise RecordingError(
             f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
             f"{', '.join(p.name for p in there) or 'none'}, one by one"
         )
+    for file in files:
+        require_inside(path, file)
     return files, str(about.get("compression_mode", "")).lower() == "message"
 
 
@@ -293,5 +316,8 @@ def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
         from PIL import Image
     except ImportError as error:
         raise missing("Pillow", "gelsight", "a topic of compressed pictures") from error
-    with Image.open(BytesIO(data)) as picture:
+    # Of what sensors send; other formats start other programs, or are decoded by what was not made for strangers.
+    with Image.open(BytesIO(data), formats=("JPEG", "PNG")) as picture:
+        if picture.width * picture.height > _PIXELS:
+            raise RecordingError(f"a picture of {picture.width} × {picture.height} pixels; expected at most {_PIXELS}")
         return np.asarray(picture.convert("RGB"))

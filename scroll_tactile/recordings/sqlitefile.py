@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -10,8 +11,13 @@ from typing import Any
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, zstd
+from scroll_tactile.recordings.bounds import LARGEST, Budget
 
 __all__ = ["scan_db3"]
+
+_INSTRUCTIONS, _A_STEP = 20_000, 100  # of SQLite between two looks at their number; and in the time of a step of Python
+_TABLES = ("topics", "messages", "message_definitions")
+_TABLE = re.compile(r"CREATE TABLE\b", re.IGNORECASE)
 
 
 def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Message]:
@@ -19,20 +25,63 @@ def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Me
     import sqlite3
 
     with ExitStack() as stack:
+        budget = scan.budget
         base = stack.enter_context(closing(_connect(_whole_pages(path, scan, stack))))
+        _bound(base, budget)
         try:
             channels = _channels(base)
         except sqlite3.DatabaseError as error:
+            budget.work(0)
             raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
         wanted = [number for number, channel in channels.items() if scan.wanted(channel.topic)]
         marks = ",".join("?" * len(wanted))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
         try:
             for number, log, data in base.execute(query, wanted):
-                whole = zstd().decompress(data) if compressed else data
-                yield Message(channels[number], log, None, None, 0, whole)
+                if not isinstance(data, bytes) or not isinstance(log, int):
+                    scan.damaged += 1
+                    continue
+                budget.work()
+                budget.take(len(data))
+                yield Message(channels[number], log, None, None, 0, _inflated(data, budget) if compressed else data)
         except sqlite3.DatabaseError as error:
+            budget.work(0)
             scan.cut_off = str(error)
+
+
+def _inflated(data: bytes, budget: Budget) -> bytes:
+    """A message that was compressed by itself."""
+    inflating, parts = zstd().ZstdDecompressor(), []
+    while not inflating.eof:
+        part = inflating.decompress(data, max_length=1 << 24)
+        if not part and inflating.needs_input:
+            break  # it was cut off
+        budget.take(len(part))
+        parts.append(part)
+        data = b""
+    return b"".join(parts)
+
+
+def _bound(base: Any, budget: Budget) -> None:
+    """SQLite stops where a query costs more than a file of this size can ask for: a forged one can ask for ever."""
+    import sqlite3
+
+    def count() -> bool:
+        try:
+            budget.work(_INSTRUCTIONS // _A_STEP)
+        except RecordingError:
+            return True
+        return False
+
+    base.set_progress_handler(count, _INSTRUCTIONS)
+    limits = {
+        sqlite3.SQLITE_LIMIT_LENGTH: min(LARGEST, budget.room()),
+        sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1 << 20,
+        sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
+        sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    }
+    for limit, most in limits.items():
+        base.setlimit(limit, most)
 
 
 def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
@@ -47,6 +96,7 @@ def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
         if page < 512 or size % page == 0:
             return path
         scan.cut_off = "it ends in the middle of a page"
+        scan.budget.take(size)
         target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
         file.seek(0)
         with target.open("wb") as copy:
@@ -63,6 +113,7 @@ def _connect(path: Path) -> Any:
         base = sqlite3.connect(f"{address}?{mode}", uri=True)
         base.text_factory = lambda data: data.decode(errors="replace")
         try:
+            base.execute("PRAGMA trusted_schema=OFF")
             base.execute("PRAGMA writable_schema=ON")  # otherwise SQLite gives nothing of a file that was cut off
             base.execute("SELECT 1 FROM sqlite_master").fetchone()
             return base
@@ -74,15 +125,25 @@ def _connect(path: Path) -> Any:
     raise RecordingError(f"{path} cannot be opened as an SQLite file: is it being written, or readable at all?")
 
 
+def _plain(base: Any, table: str) -> bool:
+    """Whether no column of a table is computed or hidden."""
+    return not any(hidden for *_, hidden in base.execute("SELECT * FROM pragma_table_xinfo(?)", (table,)))
+
+
 def _channels(base: Any) -> dict[int, Channel]:
-    tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    tables: set[str] = set()
+    for kind, name, sql in base.execute("SELECT type, name, sql FROM sqlite_master"):
+        # A view may pose as a table, and a column may be computed when it is read.
+        if str(name).lower() in _TABLES and not (kind == "table" and _TABLE.match(str(sql)) and _plain(base, name)):
+            raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {str(sql)!r:.100}")
+        tables |= {str(name)} if kind == "table" else set()
     if not {"topics", "messages"} <= tables:
-        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)}")
+        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")
     definitions = {}
     if "message_definitions" in tables:  # since ROS 2 Iron
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        definitions = {name: (text, form == "ros2idl") for name, form, text in base.execute(query)}
+        definitions = {name: (str(text), form == "ros2idl") for name, form, text in base.execute(query)}
     return {
-        number: Channel(topic, name, form, *definitions.get(name, ("", False)))
+        number: Channel(str(topic), str(name), str(form), *definitions.get(name, ("", False)))
         for number, topic, name, form in base.execute("SELECT id, name, type, serialization_format FROM topics")
     }

@@ -148,7 +148,7 @@ class Bench:
 
     def _begin(self, memory: Memory, told: Told, attack: Any) -> None:
         for name in ("memory", "out"):
-            _remove(self.own / name)
+            remove(self.own / name)
         (self.own / "out").mkdir()
         shutil.copytree(memory.path, self.own / "memory")
         told.about += f": {attack(self.own / 'memory')}"[:300]
@@ -161,15 +161,15 @@ class Bench:
         reads = reader in READING
         before = fingerprint(case.path) if reads else {}
         names = {path.name for path in self.own.iterdir()} | {"target"}
-        size, start, worked = _size(case.path), _begin_peak(), time.process_time()
+        held, start, worked = size(case.path), begin_peak(), time.process_time()
         came = self._came(reader, case, told)
         told.outcomes.append(f"{reader.__name__}: {came}")
         if (worked := time.process_time() - worked) > SECONDS:
             told.findings.append((f"worked for {worked:.0f} s", reader.__name__))
-        grown = _peak() - start
+        grown = peak() - start
         told.peak = max(told.peak, grown)
-        if grown > SPARE + size:
-            told.findings.append((f"took {grown >> 20} MB for {size >> 10} KB", reader.__name__))
+        if grown > SPARE + held:
+            told.findings.append((f"took {grown >> 20} MB for {held >> 10} KB", reader.__name__))
         if reads and (now := fingerprint(case.path)) != before:
             changed = sorted(name for name in {*now, *before} if now.get(name) != before.get(name))
             told.findings.append((f"{reader.__name__} left another {changed[:4]}", ""))
@@ -180,8 +180,8 @@ class Bench:
         if more := {path.name for path in self.own.iterdir()} - names:
             told.findings += [(f"{reader.__name__} left {sorted(more)} beside the folder", "")] if reads else []
             for name in more:
-                _remove(self.own / name)
-        _remove(case.home)
+                remove(self.own / name)
+        remove(case.home)
         case.home.mkdir()
 
     def _came(self, reader: Reader, case: Case, told: Told) -> str:
@@ -191,14 +191,14 @@ class Bench:
         try:
             return reader(case)
         except OURS as error:
-            if _is_memory(error):
-                told.findings.append(("memory ran out", _place(error)))
+            if is_memory(error):
+                told.findings.append(("memory ran out", place(error)))
             return type(error).__name__
         except Wrong as error:
             told.findings.append((f"{reader.__name__}: {error}"[:300], ""))
             return "WRONG"
         except Exception as error:
-            told.findings.append((f"{type(error).__name__}: {error}"[:160], f"{reader.__name__}: {_place(error)}"))
+            told.findings.append((f"{type(error).__name__}: {error}"[:160], f"{reader.__name__}: {place(error)}"))
             if self.verbose:
                 traceback.print_exc()
             return "UNTYPED"
@@ -248,19 +248,19 @@ class Bench:
 
     def _bounded(self, told: Told, size: int, do: Callable[[], Any], typed: tuple[type[Exception], ...]) -> None:
         """Do what may only end in a value or in a typed error, soon, and in a bounded room."""
-        start = _begin_peak()
+        start = begin_peak()
         signal.setitimer(signal.ITIMER_REAL, self.seconds)
         try:
             told.outcomes.append(do() or "nothing")
         except typed as error:
             told.outcomes.append(type(error).__name__)
         except Exception as error:
-            told.findings.append((f"{type(error).__name__}: {error}"[:160], _place(error)))
+            told.findings.append((f"{type(error).__name__}: {error}"[:160], place(error)))
             if self.verbose:
                 traceback.print_exc()
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        told.peak = _peak() - start
+        told.peak = peak() - start
         if told.peak > SPARE + size:
             told.findings.append((f"took {told.peak >> 20} MB for {size} bytes", told.kind))
 
@@ -273,34 +273,34 @@ class Bench:
         except Wrong as error:
             return [(str(error), "merge")]
         finally:
-            _remove(self.own)
+            remove(self.own)
         return []
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
 
 
-def _size(path: Path) -> int:
+def size(path: Path) -> int:
     """The bytes that a folder takes on the disk."""
     return sum(file.lstat().st_blocks * 512 for file in path.rglob("*"))
 
 
-def _begin_peak() -> int:
+def begin_peak() -> int:
     """Forget the most memory that this process had, and return what it has."""
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    return _peak()
+    return peak()
 
 
-def _peak() -> int:
+def peak() -> int:
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     return int(status.split("VmHWM:")[1].split()[0]) * 1024
 
 
-def _is_memory(error: BaseException | None) -> bool:
+def is_memory(error: BaseException | None) -> bool:
     seen = 0
     while error is not None and seen < 10:
         if isinstance(error, MemoryError):
@@ -309,7 +309,7 @@ def _is_memory(error: BaseException | None) -> bool:
     return False
 
 
-def _place(error: BaseException) -> str:
+def place(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "/store/" in frame.filename or "/scroll_tactile/" in frame.filename]
     last = (own or frames)[-1]

@@ -26,9 +26,9 @@ from hypothesis.stateful import (
 from touches import SMALL, SmallSample, contents, fed, stream
 
 from faults.common import parser, progress, run
+from faults.learned_files import learn_files
 from faults.model import EMBEDDINGS, MATERIALS, State, after, expected, opened, perform, seen, unsound_copies
 from faults.plans import KINDS, draw, prepare, touch
-from faults.recorded import learn_files
 from scroll_tactile.errors import StreamError
 from scroll_tactile.statistics.statistics import Statistics
 

@@ -8,6 +8,8 @@ folder, or of the folder where it is only read; a memory into which it was merge
 longer what it was when that is taken back; and a memory that opens without a word and holds something else than before
 its bytes were changed.
 
+`--recordings` mutates recordings instead, see `recorded`.
+
 `--case N` does case N of a seed once more, with the traceback; `--without gate` lets all that is read through, which
 must not go unnoticed.
 """
@@ -33,11 +35,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from faults import recorded
 from faults.bench import Bench, Finding, Told, prepared
 from faults.common import folder, parser, progress, quiet_coroutines, run
 from faults.model import one_scale, warm
 from faults.named import NAMED
-from faults.received import Memory
+from faults.recorded import RecordingBench
+from faults.recording_attacks import ATTACKS
 from faults.zygote import Child, Zygote
 from scroll_tactile.memory.gate import Gate
 
@@ -47,9 +51,7 @@ BATCH = 250  # cases a process
 PATIENCE = 120  # seconds without a word from a child
 
 
-def work(
-    channel: Connection, home: Path, memories: list[Memory], codes: Any, options: argparse.Namespace, numbers: Any
-) -> None:
+def work(channel: Connection, home: Path, corpus: Any, options: argparse.Namespace, numbers: Any) -> None:
     """The child: cases one after another, each told of before and after."""
     quiet_coroutines()
     with (home / f"log-{os.getpid()}").open("w", encoding="utf-8") as log, Path(os.devnull).open("w") as nowhere:
@@ -58,12 +60,19 @@ def work(
             os.dup2(nowhere.fileno(), 2)
         now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (now + ADDRESSES, now + ADDRESSES))
-        bench = Bench(home, memories, codes, options, log)
+        make: Any = RecordingBench if options.recordings else Bench
+        bench = make(home, *corpus, options, log)
+        names = named(options)
         for number in numbers:
             channel.send(("begin", number, str(log.name)))
-            told = bench.once(number) if number < NAMES else bench.named(sorted(NAMED)[number - NAMES], number)
+            told = bench.once(number) if number < NAMES else bench.named(names[number - NAMES], number)
             channel.send(("told", number, told))
         channel.send(("end", numbers[-1], bench.close()))
+
+
+def named(options: argparse.Namespace) -> list[str]:
+    """The attacks that have names."""
+    return sorted(ATTACKS if options.recordings else NAMED)
 
 
 @dataclass
@@ -81,7 +90,8 @@ class Hostile:
 
     def __init__(self, home: Path, zygote: Zygote, options: argparse.Namespace) -> None:
         self.home, self.zygote, self.options = home, zygote, options
-        self.memories, self.codes = prepared(home)
+        self.corpus = (recorded.prepared(home),) if options.recordings else prepared(home)
+        self.named = named(options)
         self.outcomes: dict[str, Counter[str]] = {}
         self.wrong: dict[str, dict[str, Any]] = {}
         self.again: set[int] = set()
@@ -92,9 +102,9 @@ class Hostile:
         """Do as many as asked, from where an earlier run ended."""
         self._resume()
         begun = time.monotonic() - self.seconds
-        if not self.done:
-            named = list(range(NAMES, NAMES + len(NAMED)))
-            self.run([named[i :: self.options.workers] for i in range(self.options.workers)])
+        if not self.done and not (self.options.quick and self.options.recordings):  # tests/recordings does these
+            numbers = list(range(NAMES, NAMES + len(self.named)))
+            self.run([numbers[i :: self.options.workers] for i in range(self.options.workers)])
         columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, disable=not sys.stderr.isatty()) as bar:
             task = bar.add_task("cases", total=cases, completed=self.done)
@@ -114,7 +124,7 @@ class Hostile:
         running: dict[Connection, Batch] = {}
         while waiting or running:
             for numbers in waiting:
-                child = self.zygote.spawn(work, self.home, self.memories, self.codes, self.options, numbers)
+                child = self.zygote.spawn(work, self.home, self.corpus, self.options, numbers)
                 running[child.channel] = Batch(child, numbers, numbers[0])
             waiting = []
             ready = wait(list(running), PATIENCE)
@@ -155,7 +165,7 @@ class Hostile:
         text = Path(batch.log).read_text(encoding="utf-8") if batch.log else ""
         places = [line.strip() for line in text.splitlines() if "/store/" in line or "/scroll_tactile/" in line]
         place = places[0].rsplit("/", 1)[-1] if places else text[:100]
-        name = f" ({sorted(NAMED)[batch.begun - NAMES]})" if batch.begun >= NAMES else ""
+        name = f" ({self.named[batch.begun - NAMES]})" if batch.begun >= NAMES else ""
         self._fail("crash", f"case {batch.begun}{name}", (names.get(status, f"ended with {status}"), place))
         return [number for number in batch.numbers if number > batch.begun]
 
@@ -196,14 +206,17 @@ class Hostile:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many cases as asked."""
-    cases = min(2000, options.cases) if options.quick else options.cases
+    cases = min(300 if options.recordings else 2000, options.cases) if options.quick else options.cases
     if options.quick:
         options.seconds = max(options.seconds, 60)  # with the tests, which may run on any machine
     if options.without == "gate":
         for name in ("head", "record", "generation"):
             setattr(Gate, name, lambda self, read: read)
-    warm()
-    one_scale()
+    if options.recordings:
+        recorded.warm()
+    else:
+        warm()
+        one_scale()
     with Zygote() as zygote, folder(options, in_memory=True) as home:
         (home / "corpus").mkdir()
         hostile = Hostile(home, zygote, options)
@@ -216,7 +229,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
     by_class = {kind: dict(sorted(counted.items())) for kind, counted in sorted(hostile.outcomes.items())}
     return {
         "cases": hostile.done,
-        "attacks by name": len(NAMED),
+        "attacks by name": len(hostile.named),
         "most memory beyond the start, MB": hostile.peak >> 20,
         f"begun again after {options.seconds} s": len(hostile.again),
         "seconds in cases": round(hostile.seconds),
@@ -226,4 +239,6 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run("hostile", parser(__doc__, cases=100_000, case=-1, seconds=10, workers=1, without="").parse_args(), main)
+    options = parser(__doc__, cases=100_000, case=-1, seconds=10, workers=1, without="")
+    options.add_argument("--recordings", action="store_true", help="recordings in place of memories")
+    run("hostile", options.parse_args(), main)

@@ -51,6 +51,13 @@ def test_a_few_of_each_fault_do_no_harm(name, records):
         pytest.skip("; ".join(record["skipped"]))
 
 
+def test_hostile_recordings_do_no_harm(tmp_path):
+    code, record = quick("hostile", tmp_path, "--recordings")
+    assert record["failures"] == []
+    assert record["cases"]
+    assert code == 0
+
+
 def test_a_power_cut_would_be_noticed_where_the_log_was_not_synced(tmp_path):
     code, record = quick("power_cut", tmp_path, "--without", "log")
     assert code == 1

@@ -1,59 +1,23 @@
 """Data sets of arrays: LeRobot, robomimic, Zarr replay buffers, `.npy`; and addresses."""
 
-import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import fsspec
-import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import zarr
+from made import PAD, RNG, TIP, lerobot, robomimic
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, iterate, read, resampled
 from scroll_tactile.sensors import BIOTAC, CONTACTILE
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "recordings"
-RNG = np.random.default_rng(3)
-TIP = RNG.standard_normal((30, 19)).astype(np.float32)
-PAD = RNG.standard_normal((30, 4, 6, 3)).astype(np.float32)
-
-
-def lerobot(folder: Path) -> Path:
-    """A LeRobotDataset v3 of three episodes in two files, as its writer lays it out."""
-    episode = np.repeat([0, 1, 2], 10)
-    columns = {
-        "tip": pa.FixedSizeListArray.from_arrays(pa.array(TIP.ravel()), 19),
-        "pad": pa.array(PAD.tolist(), pa.list_(pa.list_(pa.list_(pa.float32())))),
-        "timestamp": pa.array(np.tile(np.arange(10) / 100, 3).astype(np.float32)),
-        "frame_index": pa.array(np.tile(np.arange(10), 3)),
-        "episode_index": pa.array(episode),
-        "index": pa.array(np.arange(30)),
-        "task_index": pa.array(np.where(episode == 1, 1, 0)),
-    }
-    table = pa.table({("observation.tactile." + k if k in ("tip", "pad") else k): v for k, v in columns.items()})
-    for name in ("data/chunk-000", "meta/episodes/chunk-000"):
-        (folder / name).mkdir(parents=True)
-    pq.write_table(table[:20], folder / "data/chunk-000/file-000.parquet")
-    pq.write_table(table[20:], folder / "data/chunk-000/file-001.parquet")
-    episodes = {"episode_index": [0, 1, 2], "data/chunk_index": [0, 0, 0], "data/file_index": [0, 0, 1]}
-    pq.write_table(pa.table(episodes), folder / "meta/episodes/chunk-000/file-000.parquet")
-    tasks = pa.table({"task_index": [0, 1], "__index_level_0__": ["slide over felt", "slide over cork"]})
-    pq.write_table(tasks, folder / "meta/tasks.parquet")
-    features = {
-        "observation.tactile.tip": {"dtype": "float32", "shape": [19]},
-        "observation.tactile.pad": {"dtype": "float32", "shape": [4, 6, 3]},
-        "observation.image": {"dtype": "video", "shape": [4, 4, 3]},
-    } | {name: {"dtype": "int64", "shape": [1]} for name in list(columns)[2:]}
-    about = {"codebase_version": "v3.0", "fps": 100, "total_frames": 30, "features": features}
-    about["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-    (folder / "meta/info.json").write_text(json.dumps(about))
-    return folder
 
 
 def test_lerobot_of_others_is_read_to_the_bit():
@@ -139,18 +103,6 @@ def test_lerobot_tasks_may_be_missing_and_rows_may_not_differ(tmp_path):
         pq.write_table(table.set_column(1, "observation.tactile.pad", column), path)
         with pytest.raises(RecordingError, match=r"ragged|without a value"):
             read(folder, field="pad")
-
-
-def robomimic(path: Path, odd: bool = False) -> Path:
-    with h5py.File(path, "w") as file:
-        for i in (10, 2, 0):
-            demo = file.create_group(f"data/demo_{i}")
-            demo["obs/tactile"] = TIP[: i + 3, : 18 if odd and i == 2 else 19]
-            demo["obs/pad"] = PAD[: i + 3]
-            demo["obs/time"] = np.arange(i + 3) / 20
-            demo["actions"] = np.zeros((i + 3, 7))
-        file["name"] = "cup"
-    return path
 
 
 def test_robomimic_demos_are_episodes_in_the_order_of_their_numbers(tmp_path):

@@ -1,0 +1,109 @@
+"""What a recording may cost: it comes from elsewhere, and may claim to hold more than anybody has room or time for.
+
+The bounds are ratios to the bytes that a recording has on the disk, so that they fit a touch and a day of touching.
+Numbers of sensors are compressed 2 to 20 times, those of a sensor at rest and pictures of a gel 100 times, and LZ4
+makes at most 255 bytes of one; deflate can make 1032, and zstd a million. What is small is believed: a second's work is
+nobody's harm.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from scroll_tactile.errors import RecordingError
+
+__all__ = ["LARGEST", "RATIO", "SPARE", "Budget", "read_text", "require_file", "require_inside", "stored_bytes"]
+
+SPARE, RATIO = 1 << 28, 256
+"""Bytes that any recording may become in memory, and how many more for each byte on the disk."""
+
+SPARE_STEPS, STEPS_A_BYTE = 1 << 19, 16
+"""The same of steps of Python, of some 2 µs each: a record of a bag is one, and a message that is decoded eight."""
+
+LARGEST = 1 << 30
+"""The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
+
+
+class Budget:
+    """What one pass over a recording may still cost.
+
+    address: the recording's, for the error. stored: its bytes on the disk; `add` counts those of further files.
+    """
+
+    def __init__(self, address: str, stored: int = 0) -> None:
+        self.address, self.stored = address, 0
+        self.bytes = self.steps = self.given = 0
+        self.add(stored)
+
+    def add(self, stored: int) -> None:
+        """Count the bytes of a further file."""
+        self.stored += stored
+        self.most = SPARE + RATIO * self.stored
+        self.most_steps = SPARE_STEPS + STEPS_A_BYTE * self.stored
+
+    def take(self, count: int) -> None:
+        """Take memory, in bytes; raises RecordingError where that is more than a recording of its size can hold."""
+        self.bytes += count
+        if self.bytes > self.most:
+            self._refuse(f"{self.bytes} bytes", f"{RATIO} times as many, and {SPARE >> 20} MiB")
+
+    def give(self, count: int) -> None:
+        """Give readings out that are kept, in bytes; raises RecordingError as `take` does, of which it is no part."""
+        self.given += count
+        if self.given > self.most:
+            self._refuse(f"{self.given} bytes of readings", f"{RATIO} times as many, and {SPARE >> 20} MiB")
+
+    def room(self) -> int:
+        """How much memory is left, in bytes."""
+        return self.most - self.bytes
+
+    def work(self, steps: int = 1) -> None:
+        """Take time, in steps; raises RecordingError as `take` does."""
+        self.steps += steps
+        if self.steps > self.most_steps:
+            self._refuse(f"{self.steps} steps of work", f"{STEPS_A_BYTE} for each, and {SPARE_STEPS}")
+
+    def _refuse(self, what: str, most: str) -> None:
+        raise RecordingError(
+            f"{self.address} claims to hold {what} in {self.stored} bytes on the disk; expected at most {most}. It may "
+            "be damaged or made to harm. If it is neither, write it with less compression, or in parts"
+        )
+
+
+def stored_bytes(path: Path) -> int:
+    """The bytes that a file has on the disk, holes left out; raises RecordingError for what is no file."""
+    about = path.stat()
+    _require_regular(about, path)
+    # Some file systems tell of no blocks.
+    return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
+
+
+def require_file(path: Path) -> None:
+    """Raises RecordingError for what is no file: opening a FIFO or a device waits for ever, or changes something."""
+    _require_regular(path.stat(), path)
+
+
+def require_inside(folder: Path, path: Path) -> None:
+    """Raises RecordingError for a file that lies, by a link or by its name, outside of the recording's folder."""
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise RecordingError(f"{path} leads out of its recording, {folder}: copy what it leads to in its place")
+
+
+def read_text(folder: Path, path: Path, most: int) -> str:
+    """What is written in a file of a recording's folder; raises RecordingError where that is more than `most` bytes."""
+    require_inside(folder, path)
+    require_file(path)
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise RecordingError(f"{path} has more than {most} bytes; expected less of what describes a recording")
+    return data.decode()
+
+
+def _require_regular(about: os.stat_result, path: Path) -> None:
+    if not stat.S_ISREG(about.st_mode):
+        kinds = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "folder": stat.S_ISDIR}
+        kind = next((kind for kind, of in kinds.items() if of(about.st_mode)), "device")
+        raise RecordingError(f"{path} is a {kind}; expected a file. It was passed over")

@@ -1,0 +1,387 @@
+"""Recordings from elsewhere: they run nothing, reach nothing outside, and cost what their size allows."""
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import tracemalloc
+import zlib
+
+import bags
+import fsspec
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import zarr
+from faults.recording_attacks import ATTACKS, RAN, SECRET
+from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, ros
+from numcodecs import Blosc
+
+from scroll_tactile.errors import FieldError, RecordingError
+from scroll_tactile.recordings import bounds, describe, find, iterate, read, zarrfile
+from scroll_tactile.recordings.parquetpages import require_bounded_pages
+
+# How they are refused, where that says more than that they are.
+SAID = {
+    "R1 pickled ends": r"meta/episode_ends cannot be read: .*its data type is '\|O'; expected numbers",
+    "R1 pickle that compresses": "it is compressed by 'pickle'; expected one of blosc",
+    "R2 copied from behind the frame": "a Blosc frame .* of 77840 bytes .* stands in 20 bytes",
+    "R2 a chunk that is a link": "is a link; a Zarr group is made of files and folders",
+    "R3 external storage": "lie in other files",
+    "R3 virtual": r"lie in other data sets \(it is virtual\)",
+    "R7 zarr: rows never written": "expected at most 256 times as many, and 256 MiB",
+    "R7 zarr: deflated": "expected 77824 bytes; came 77824 and more",
+    "R7 hdf5: rows never written": "expected at most 256 times as many, and 256 MiB",
+    "R7 hdf5: deep": "more than 32 groups within each other",
+    "R7 hdf5: deflated": "more than the 8388608 bytes that are its own",
+    "R7 mcap: equal messages": "steps of work",
+    "R7 mcap: chunks of zeros": "expected at most 256 times as many",
+    "R7 msg: fields": "a definition of a message has 20000 lines",
+    "R7 db3: a view": "messages is no table as a ROS 2 bag has it: 'CREATE VIEW|\"CREATE VIEW",
+    "R7 yaml: aliases": "has aliases, which no recorder writes",
+    "R7 bag: a part elsewhere": "leads out of its recording",
+    "R7 lerobot: names by width": "expected chunk_index and file_index",
+}
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("name", ATTACKS)
+def test_what_was_made_to_harm_is_refused(tmp_path, name):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    secret = tmp_path / "elsewhere" / "secret"
+    secret.write_bytes(bytes([SECRET]) * 4096)
+    path, options = ATTACKS[name](tmp_path / "in", secret)
+    with pytest.raises(RecordingError, match=SAID.get(name)):
+        read(path, **options)
+    assert not (tmp_path / "elsewhere" / RAN).exists()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_is_ordinary_is_read(tmp_path, name):
+    make, options = FORMATS[name]
+    path = make(tmp_path)
+    recording = read(path, **options)
+    if recording.readings.shape == TIP.shape:
+        np.testing.assert_array_equal(recording.readings, TIP)
+    assert sum(len(block) for block in iterate(path, **options)) == len(recording) > 0
+    assert describe(path).entries
+
+
+class TestZarr:
+    @pytest.mark.parametrize("codec", CODECS)
+    @pytest.mark.parametrize("kind", ["f4", ">f8", "i2", "u1", "?", "f2", "<u8"])
+    def test_every_codec_gives_what_zarr_reads(self, tmp_path, codec, kind):
+        values = np.random.default_rng(5).integers(0, 100, (531, 6, 2)).astype(kind)
+        group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2)
+        for i, (chunks, order) in enumerate([((100, 6, 2), "C"), ((531, 4, 1), "F"), ((7, 5, 2), "C")]):
+            array = group.create_array(
+                f"a{i}", shape=values.shape, chunks=chunks, dtype=kind, compressors=CODECS[codec], order=order
+            )
+            array[:] = values
+            np.testing.assert_array_equal(
+                read(tmp_path / "a.zarr", field=f"a{i}").readings, values.reshape(531, 12).astype(float)
+            )
+
+    @pytest.mark.parametrize("name", ["lz4", "lz4hc", "zstd"])
+    @pytest.mark.parametrize("shuffle", [Blosc.NOSHUFFLE, Blosc.SHUFFLE, Blosc.BITSHUFFLE])
+    def test_frames_of_blosc_are_read_without_it(self, name, shuffle):
+        rng = np.random.default_rng(shuffle)
+        for size in (1, 16, 1000, 4095, 70_001, 300_000):
+            for values in (rng.integers(0, 4, size, np.uint16), rng.standard_normal(size)):
+                for level in (1, 5):
+                    frame = bytes(Blosc(name, level, shuffle).encode(values))
+                    raw = zarrfile._decompressed("blosc", frame, values.nbytes)
+                    assert bytes(raw) == values.tobytes()
+
+    def test_a_frame_of_zstd_need_not_say_its_size(self):
+        from backports import zstd
+
+        streaming = zstd.ZstdCompressor()
+        frame = streaming.compress(b"ab" * 1000) + streaming.flush()
+        assert bytes(zarrfile._decompressed("zstd", frame, 2000)) == b"ab" * 1000
+        for size in (1000, 3000):
+            with pytest.raises(RuntimeError):
+                zarrfile._decompressed("zstd", frame, size)
+
+    def test_other_codecs_are_named(self, tmp_path):
+        path = buffer(tmp_path, 2, compressors=Blosc("blosclz"))
+        with pytest.raises(RecordingError, match="written by blosclz of Blosc; expected lz4 or zstd"):
+            read(path, field="tactile")
+        shutil.rmtree(path)
+        with pytest.raises(RecordingError, match="Arrays in shards have to be written without"):
+            read(buffer(tmp_path, 3, shards=(14, 20)), field="tactile")
+
+    def test_what_was_never_written_is_its_fill_value(self, tmp_path):
+        for version, fill in ((2, 7.5), (3, float("nan")), (3, float("-inf"))):
+            array = zarr.create_array(
+                tmp_path / f"{version}{fill}.zarr",
+                shape=(50, 3),
+                chunks=(20, 2),
+                dtype="f4",
+                zarr_format=version,
+                fill_value=fill,
+            )
+            array[25:30] = 1
+            expected = np.full((50, 3), fill)
+            expected[25:30] = 1
+            np.testing.assert_array_equal(read(tmp_path / f"{version}{fill}.zarr").readings, expected)
+
+    def test_a_chunk_is_decompressed_once(self, tmp_path, monkeypatch):
+        """A file as people have it: one chunk of all."""
+        values = np.tile(np.arange(19, dtype="f4"), (20_000, 1))
+        buffer(tmp_path, 2)
+        array = zarr.open_group(tmp_path / "b.zarr", mode="a")
+        del array["data/tactile"], array["data/timestamp"]
+        array.create_array("data/tactile", data=values, chunks=values.shape)
+        calls = []
+        decompressed = zarrfile._decompressed
+        monkeypatch.setattr(zarrfile, "_decompressed", lambda *a: calls.append(a[2]) or decompressed(*a))
+        blocks = list(iterate(tmp_path / "b.zarr", field="tactile"))
+        assert calls.count(values.nbytes) == 1
+        assert [len(block) for block in blocks] == [4096] * 4 + [20_000 - 4 * 4096]
+        np.testing.assert_array_equal(np.concatenate([block.readings for block in blocks]), values)
+
+    def test_arrays_of_texts_stand_beside_those_that_are_read(self, tmp_path):
+        path = buffer(tmp_path, 2)
+        group = zarr.open_group(path, mode="a")
+        group.create_array("data/task", shape=(30,), dtype="U9")
+        np.testing.assert_array_equal(read(path, field="tactile").readings, TIP)
+        assert [entry.field for entry in describe(path).entries] == ["data/tactile"]
+        with pytest.raises(RecordingError, match=r"'data/task' cannot be read: .* its data type is '<U9'"):
+            read(path, field="task")
+
+
+class TestHdf5:
+    def test_filters_that_only_plugins_know_are_refused(self, tmp_path):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.create_dataset("tactile", data=TIP.astype("i4"), chunks=(7, 19), scaleoffset=0)
+        with pytest.raises(RecordingError, match=r"has the filters \[6\]; expected at most one each of gzip, shuffle"):
+            read(tmp_path / "a.h5", field="tactile")
+
+    def test_a_large_chunk_of_random_numbers_is_read(self, tmp_path):
+        values = np.random.default_rng(1).standard_normal((70_000, 4))
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.create_dataset("tactile", data=values, chunks=values.shape, compression="gzip", shuffle=True)
+        np.testing.assert_array_equal(read(tmp_path / "a.h5", field="tactile").readings, values)
+
+    def test_links_inside_a_file_are_passed_over(self, tmp_path):
+        path = hdf5(tmp_path)
+        with h5py.File(path, "a") as file:
+            file["soft"] = h5py.SoftLink("/data/demo_0/obs/tactile")
+            file["away"] = h5py.ExternalLink("/nowhere.h5", "/tactile")
+        assert len(read(path, field="obs/tactile")) == 60
+        with pytest.raises(FieldError, match="no field 'away'"):
+            read(path, field="away")
+
+
+@pytest.mark.parametrize("codec", ["zstd", "snappy", "gzip", "lz4", "none"])
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+@pytest.mark.parametrize("dictionary", [True, False])
+def test_the_pages_of_a_parquet_file_are_as_long_as_they_say(tmp_path, codec, version, dictionary):
+    rows = np.random.default_rng(2).integers(0, 99, (5000, 3)).astype("f4")
+    table = pa.table({"a": pa.array(rows.tolist()), "b": pa.array([f"x{i}" for i in range(5000)]), "c": rows[:, 0]})
+    options = {"compression": codec, "data_page_version": version, "use_dictionary": dictionary}
+    pq.write_table(table, tmp_path / "a.parquet", data_page_size=2000, row_group_size=2000, **options)
+    with pq.ParquetFile(tmp_path / "a.parquet") as file:
+        groups = [file.metadata.row_group(i) for i in range(3)]
+        total = sum(group.column(j).total_uncompressed_size for group in groups for j in range(3))
+        for most, refused in ((total, False), (total // 2, True)):  # the total counts the pages' headers as well
+            budget = bounds.Budget("a.parquet")
+            room = pytest.MonkeyPatch()
+            room.setattr(bounds, "SPARE", most)
+            try:
+                if refused:
+                    with pytest.raises(RecordingError, match="claims to hold"):
+                        require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
+                else:
+                    require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
+            finally:
+                room.undo()
+
+
+@pytest.fixture
+def bucket(monkeypatch):
+    """An empty bucket of a real S3 interface, played by moto."""
+    s3fs = pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    s3fs.S3FileSystem.clear_instance_cache()
+    files = s3fs.S3FileSystem()
+    files.mkdir("robots")
+    yield files
+    server.stop()
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+class TestPlaces:
+    def test_pipes_in_a_folder_are_refused_by_name_and_stop_nothing(self, tmp_path):
+        for name in ("a.npy", "b.csv", "c.mcap"):
+            os.mkfifo(tmp_path / name)
+        np.save(tmp_path / "d.npy", TIP)
+        assert [path.name for path in find(tmp_path)] == ["a.npy", "b.csv", "c.mcap", "d.npy"]
+        for path in find(tmp_path)[:3]:
+            with pytest.raises(RecordingError, match=f"{path.name} is a FIFO; expected a file. It was passed over"):
+                read(path)
+        assert len(read(tmp_path / "d.npy")) == 30
+
+    @pytest.mark.parametrize(
+        ("key", "part"),
+        [
+            ("../../escaped", "'..'"),
+            ("a/../../../escaped", "'..'"),
+            ("a\\..\\escaped", r"a\\\\\.\.\\\\escaped"),
+        ],
+    )
+    def test_keys_that_climb_out_of_a_folder_are_refused(self, tmp_path, key, part):
+        files, address = fsspec.filesystem("memory"), f"memory://robots{hash(key)}/b.zarr"
+        files.put(str(buffer(tmp_path)), address, recursive=True)
+        assert len(read(address, field="tactile")) == 30
+        name = address.removeprefix("memory:/")
+        files.store[f"{name}/{key}"] = files.store[f"{name}/zarr.json"]
+        with pytest.raises(RecordingError, match=f"names a file by .?{part}.?, which leads out of its folder"):
+            read(address, field="tactile")
+
+    @pytest.mark.parametrize(
+        "address", ["dir://x", "ftp://127.0.0.1:1/x.npy", "jupyter://x", "nosuch://x/a.npy", "://"]
+    )
+    def test_any_address_that_fails_is_refused(self, address):
+        with pytest.raises(RecordingError):
+            read(address)
+
+    def test_an_address_of_a_file_is_that_file(self, tmp_path):
+        np.save(tmp_path / "a.npy", TIP)
+        assert len(read(f"file://{tmp_path}/a.npy")) == 30
+        with pytest.raises(RecordingError, match="is a device"):
+            shutil.copy(tmp_path / "a.npy", tmp_path / "b.npy")
+            (tmp_path / "b.npy").unlink()
+            (tmp_path / "b.npy").symlink_to("/dev/zero")
+            read(f"file://{tmp_path}/b.npy")
+
+    def test_what_is_elsewhere_must_have_room(self, tmp_path, monkeypatch):
+        files = fsspec.filesystem("memory")
+        np.save(tmp_path / "a.npy", TIP)
+        files.put(str(tmp_path / "a.npy"), "/robots/a.npy")
+        files.put(str(buffer(tmp_path)), "/robots/room.zarr", recursive=True)
+        usage = type("Usage", (), {"free": 1000})
+        monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
+        for address in ("memory://robots/a.npy", "memory://robots/room.zarr"):
+            with pytest.raises(RecordingError, match="bytes, and 1000 are free"):
+                read(address)
+
+
+class TestBounds:
+    def test_a_recording_may_become_as_much_as_its_size_allows(self):
+        budget = bounds.Budget("x", 10)
+        budget.take(bounds.SPARE + 10 * bounds.RATIO)
+        with pytest.raises(RecordingError, match="in 10 bytes on the disk; expected at most 256 times as many"):
+            budget.take(1)
+        budget.add(1)
+        budget.take(bounds.RATIO - 1)
+        budget.work(bounds.SPARE_STEPS + 11 * bounds.STEPS_A_BYTE)
+        with pytest.raises(RecordingError, match="steps of work"):
+            budget.work()
+
+    def test_holes_are_no_bytes_on_the_disk(self, tmp_path):
+        path = tmp_path / "a.npy"
+        np.save(path, TIP)
+        whole = path.stat().st_size
+        assert bounds.stored_bytes(path) == whole
+        with path.open("r+b") as file:
+            file.truncate(1 << 30)
+        assert bounds.stored_bytes(path) < 1 << 20
+
+    def test_an_hour_of_a_sensor_at_rest_is_read(self, tmp_path):
+        """19 channels of zeros at 100 Hz, compressed; and an array of 10^6 rows in one chunk."""
+        store = bags.typestore(2)
+        kind = "std_msgs/msg/Float32MultiArray"
+        one = bytes(store.serialize_cdr(bags.array(store, np.zeros(19)), kind))
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+        writer = Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection("/skin", kind, typestore=store)
+            for i in range(60_000):
+                writer.write(connection, 10**18 + i * 10**7 + i * i % 4999, one)
+        assert len(read(tmp_path / "b", **SKIN)) == 60_000
+        array = zarr.create_array(
+            tmp_path / "a.zarr", shape=(10**6, 19), chunks=(10**6, 19), dtype="f4", zarr_format=2, compressors=Blosc()
+        )
+        array[::1000] = 1
+        assert sum(len(block) for block in iterate(tmp_path / "a.zarr")) == 10**6
+
+    @pytest.mark.parametrize("form", ["bag", "mcap", "db3"])
+    def test_a_long_file_is_read_in_little_memory(self, tmp_path, form):
+        store = bags.typestore(1 if form == "bag" else 2)
+        kind = store.types["std_msgs/msg/UInt8MultiArray"]
+        layout = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+        pictures = [(bags.START + i / 10, kind(layout=layout, data=np.full(1 << 20, i, np.uint8))) for i in range(48)]
+        messages = [(bags.START + i / 100, bags.array(store, np.full(19, i))) for i in range(480)]
+        path = tmp_path / ("b.bag" if form == "bag" else "b")
+        bags.write(path, store, {"/camera": pictures, "/skin": messages}, form=form)
+        del pictures
+        tracemalloc.start()
+        try:
+            count = sum(len(block) for block in iterate(path, topic="/skin", field="data"))
+            width = [block.readings.shape for block in iterate(path, topic="/camera", field="data")]
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert count == 480
+        assert sum(shape[0] for shape in width) == 48
+        assert peak < 2**26  # blocks of 16 MB, and what they are made of
+
+    def test_a_shape_that_is_only_claimed_is_not_allocated(self, tmp_path):
+        head = {"descr": "<f4", "fortran_order": False, "shape": (10, 1 << 40)}
+        with (tmp_path / "a.npy").open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, head)
+            file.write(b"\0" * 100)
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.create_dataset("tactile", shape=(10, 1 << 40), chunks=(1, 1024), dtype="f4")
+        group = zarr.open_group(tmp_path / "a.zarr", mode="w")
+        group.create_array("tactile", shape=(10, 1 << 40), chunks=(1, 1024), dtype="f4")
+        for name in ("a.npy", "a.h5", "a.zarr"):
+            with pytest.raises(RecordingError):
+                read(tmp_path / name, field=None if name == "a.npy" else "tactile")
+
+
+@pytest.mark.parametrize(
+    ("form", "compress", "lacks", "named"),
+    [
+        ("mcap", "STORAGE ZSTD", "backports", "a file compressed by zstd needs backports.zstd"),
+        ("bag", "lz4", "lz4", "a file compressed by lz4 needs lz4"),
+        ("mcap", "", "rosbags", "a ROS recording needs rosbags"),
+        ("db3", "", "rosbags", "a ROS recording needs rosbags"),
+    ],
+)
+def test_a_whole_file_is_not_called_damaged_where_a_library_is_missing(tmp_path, form, compress, lacks, named):
+    path = ros(tmp_path, form, compress)
+    path = path if path.is_file() else next(path.glob(f"*.{form}"))
+    code = f"""
+import sys
+sys.modules |= dict.fromkeys(({lacks!r}, {lacks + ".zstd"!r}, {lacks + ".frame"!r}, 'compression'))
+from scroll_tactile.recordings import describe, read
+from scroll_tactile.errors import MissingLibraryError
+for look in (lambda: read({str(path)!r}, topic='/skin', field='data'), lambda: describe({str(path)!r})):
+    try:
+        look()
+    except MissingLibraryError as error:
+        assert {named!r} in str(error) and 'damaged' not in str(error), error
+    else:
+        raise AssertionError('read without it')
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_deflate_makes_at_most_as_many_bytes_as_is_reckoned_with():
+    assert len(zlib.compress(bytes(10**7), 9)) * 1032 > 10**7

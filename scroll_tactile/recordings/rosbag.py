@@ -35,7 +35,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
 
 _LOOKED = 2000  # messages are looked at to say what a bag holds
-_LONGEST, _LISTS = 1 << 24, 1 << 18  # bytes of metadata.yaml; and of the part that lists files: thousands of them
+_LONGEST, _LISTS = 1 << 24, 1 << 16  # bytes of metadata.yaml; and of the part that lists files: two thousand of them
 
 _PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
 

@@ -12,8 +12,6 @@ import bags
 import fsspec
 import h5py
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import zarr
 from faults.recording_attacks import ATTACKS, RAN, SECRET
@@ -22,7 +20,6 @@ from numcodecs import Blosc
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.recordings import bounds, describe, find, iterate, read, zarrfile
-from scroll_tactile.recordings.parquetpages import require_bounded_pages
 
 # How they are refused, where that says more than that they are.
 SAID = {
@@ -176,31 +173,6 @@ class TestHdf5:
         assert len(read(path, field="obs/tactile")) == 60
         with pytest.raises(FieldError, match="no field 'away'"):
             read(path, field="away")
-
-
-@pytest.mark.parametrize("codec", ["zstd", "snappy", "gzip", "lz4", "none"])
-@pytest.mark.parametrize("version", ["1.0", "2.0"])
-@pytest.mark.parametrize("dictionary", [True, False])
-def test_the_pages_of_a_parquet_file_are_as_long_as_they_say(tmp_path, codec, version, dictionary):
-    rows = np.random.default_rng(2).integers(0, 99, (5000, 3)).astype("f4")
-    table = pa.table({"a": pa.array(rows.tolist()), "b": pa.array([f"x{i}" for i in range(5000)]), "c": rows[:, 0]})
-    options = {"compression": codec, "data_page_version": version, "use_dictionary": dictionary}
-    pq.write_table(table, tmp_path / "a.parquet", data_page_size=2000, row_group_size=2000, **options)
-    with pq.ParquetFile(tmp_path / "a.parquet") as file:
-        groups = [file.metadata.row_group(i) for i in range(3)]
-        total = sum(group.column(j).total_uncompressed_size for group in groups for j in range(3))
-        for most, refused in ((total, False), (total // 2, True)):  # the total counts the pages' headers as well
-            budget = bounds.Budget("a.parquet")
-            room = pytest.MonkeyPatch()
-            room.setattr(bounds, "SPARE", most)
-            try:
-                if refused:
-                    with pytest.raises(RecordingError, match="claims to hold"):
-                        require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
-                else:
-                    require_bounded_pages(tmp_path / "a.parquet", file.metadata, ["a", "b", "c"], budget)
-            finally:
-                room.undo()
 
 
 @pytest.fixture

@@ -24,14 +24,18 @@ from examples.paper.commands.sets import (
 )
 from examples.paper.studies.default_learner import Answering, Checkout, answers
 from examples.paper.studies.replay import subset
-from examples.paper.studies.robustness_study import FIGURES, NOW, Robustness, Series, summary
-from scroll_tactile.cli.terminal import console, percent, progress_bar, say
+from examples.paper.studies.robustness_study import FIGURES, NOW, Robustness, Series, Simulated, summary
+from scroll_tactile.cli.terminal import console, percent, progress_bar
 from scroll_tactile.errors import InputError
 
 __all__ = ["robustness"]
 
 USUAL = (Dataset.BIOTAC, Dataset.ROBOSKIN, Dataset.UNMIXED)
 BEFORE = "before"
+OTHERS = {
+    "series": "series, split as published, at 100 Hz; a touch usually lasts as long as the median of those learned",
+    "simulated": "simulated sensors that nothing was tuned on",
+}
 
 
 def robustness(
@@ -80,10 +84,10 @@ def robustness(
                 found[side][name] = rows
             tested[name] = ", ".join(map(str, chosen))
             records += [{"dataset": name} | record for record in own]
-        if series is not None:
-            study = Series(series, sides, None if run is None else run / "series")
+        others = _others(series, sides, run, seed, quick=quick, few=materials < 20)
+        for kind, study in others.items():
             for record in study.run(progress):
-                rows = found[record["side"]].setdefault("series", {})
+                rows = found[record["side"]].setdefault(kind, {})
                 rows[record["name"]] = {figure: record[figure] for figure in FIGURES if figure in record}
                 records.append(record)
     for side in sides:
@@ -92,8 +96,8 @@ def robustness(
             found[side]["series"]["mean"] = {"accuracy": float(np.mean(shares))}
     for name, numbers in tested.items():
         _show(name, numbers, {side: rows[name] for side, rows in found.items()})
-    if series is not None:
-        _show_series({side: rows["series"] for side, rows in found.items()})
+    for kind in others:
+        _show_others({side: rows[kind] for side, rows in found.items()}, OTHERS[kind])
     if json is not None:
         options: dict[str, Any] = {"data": "DATA", "sets": sets, "folds": folds or "all", "series": series}
         options |= {
@@ -104,6 +108,20 @@ def robustness(
         }
         made = origin(command_line("robustness", **options)) | {"seed": seed, "folds": tested}
         write_result(json, made | found | {"records": records})
+
+
+def _others(
+    series: Path | None, sides: Mapping[str, Answering], run: Path | None, seed: int, *, quick: bool, few: bool
+) -> dict[str, Series | Simulated]:
+    """What is measured on other sensors: series where they are given, and simulated ones."""
+    folder = {kind: None if run is None else run / kind for kind in OTHERS}
+    others: dict[str, Series | Simulated] = {}
+    if series is not None:
+        others["series"] = Series(series, sides, folder["series"])
+    if not quick:
+        touches = (2, 1) if few else (12, 10)
+        others["simulated"] = Simulated(seed, sides, folder["simulated"], *touches)
+    return others
 
 
 def _show(name: str, folds: str, sides: Mapping[str, Mapping[str, Any]]) -> None:
@@ -122,9 +140,16 @@ def _show(name: str, folds: str, sides: Mapping[str, Mapping[str, Any]]) -> None
     console().print(table)
 
 
-def _show_series(sides: Mapping[str, Mapping[str, Any]]) -> None:
-    table = Table("series, split as published", *sides)
+def _show_others(sides: Mapping[str, Mapping[str, Any]], heading: str) -> None:
+    heads = [f"{figure}{f', {side}' * (side != NOW)}" for side in sides for figure in ("right", "ECE", "known")]
+    table = Table(heading, *heads)
     for name in sides[NOW]:
-        table.add_row(name, *(percent(rows[name]["accuracy"]) for rows in sides.values()))
+        cells: list[str] = []
+        for rows in sides.values():
+            figures = rows[name]
+            cells.append(percent(figures["accuracy"]))
+            cells += (
+                [f"{figures['calibration_error']:.3f}", percent(figures["known"])] if "known" in figures else ["", ""]
+            )
+        table.add_row(name, *cells)
     console().print(table)
-    say("series come without a rate: 100 Hz is taken, and the median training length as the usual duration")

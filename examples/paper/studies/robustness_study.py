@@ -18,6 +18,7 @@ from examples.paper.runs.cells import over_folds, require_data, require_folds
 from examples.paper.studies.default_learner import Answering, Answers, answers
 from examples.paper.studies.replay import novelty_area, rotations
 from scroll_tactile.datasets import Recordings
+from scroll_tactile.datasets.simulator import EVENT_SKIN, LIGHT_PAD, Response, Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled, hold_out
@@ -27,7 +28,7 @@ from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["FIGURES", "NOVELTY", "NOW", "PERTURBED", "SESSION", "Robustness", "Series", "summary"]
+__all__ = ["FIGURES", "NOVELTY", "NOW", "PERTURBED", "SESSION", "Robustness", "Series", "Simulated", "summary"]
 
 PERTURBED: dict[str, Callable[[Stream, int], Stream]] = {
     "clean": lambda stream, seed: stream,
@@ -50,6 +51,8 @@ NOW = "now"
 FIGURES = ("accuracy", "calibration_error", "known", "wrong_known", "novelty_auroc")
 """Of a cell: shares of right answers, of touches called known, and of these that are taken for another material, of all
 touches; expected calibration error; of novelty its AUROC."""
+
+SIMULATED: dict[Response, Sensor] = {"events": EVENT_SKIN, "light": LIGHT_PAD}
 
 RATE = 100.0  # readings a second of series that come without one
 
@@ -217,11 +220,58 @@ class Series:
 
         Raises InputError for a folder of another run.
         """
-        notes = RunFile(None if self.folder is None else self.folder / "robustness.json", {"run": "robustness, series"})
-        for name, fit in self.fits().items():
-            for side, answering in self.sides.items():
-                found = _measure(notes, side, answering, fit, name, _below(progress, f"{name}, {side}"))
-                yield {"side": side, "name": name} | found["clean"]
+        fits = {name: [fit] for name, fit in self.fits().items()}
+        yield from _each(fits, self.sides, self.folder, {"run": "robustness, series"}, progress)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Two simulated sensors that nothing was tuned on: a skin of events, and a pad that is hardly pressed.
+
+    seed: of the scene. Twelve touches of each of its twenty materials are learned, and ten others tested; for novelty
+    every fourth material is never touched.
+    """
+
+    seed: int = 0
+    sides: Mapping[str, Answering] = field(default_factory=lambda: {NOW: answers})
+    folder: Path | None = None
+    learned: int = 12
+    tested: int = 10
+
+    def fits(self) -> dict[str, list[Fit]]:
+        """Name → what is learned and tested: all materials, and all but every fourth."""
+        return {name: self._fits(Scene(sensor, self.seed, response=name)) for name, sensor in SIMULATED.items()}
+
+    def _fits(self, scene: Scene) -> list[Fit]:
+        names, later = scene.materials, range(1000, 1000 + self.tested)
+        train = [(name, scene.touch(name, i)) for i in range(self.learned) for name in names]
+        test = [(name, scene.touch(name, i)) for i in later for name in names]
+        known = [touch for touch in train if touch[0] not in names[::4]]
+        return [Fit(scene.sensor, train, {"clean": test}), Fit(scene.sensor, known, {NOVELTY: test})]
+
+    def run(self, progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+        """The record of each side and sensor in turn, as of `Series`, with the AUROC of novelty."""
+        plan = {"run": "robustness, simulated", "seed": self.seed, "touches": [self.learned, self.tested]}
+        yield from _each(self.fits(), self.sides, self.folder, plan, progress)
+
+
+def _each(
+    fits: Mapping[str, Sequence[Fit]],
+    sides: Mapping[str, Answering],
+    folder: Path | None,
+    plan: dict[str, Any],
+    progress: Progress,
+) -> Iterator[dict[str, Any]]:
+    """The record of each side and set in turn; a set's fits are of one row each."""
+    notes = RunFile(None if folder is None else folder / "robustness.json", plan)
+    for name, own in fits.items():
+        for side, answering in sides.items():
+            found: dict[str, Any] = {"side": side, "name": name}
+            for fit in own:
+                rows = _measure(notes, side, answering, fit, name, _below(progress, f"{name}, {side}"))
+                for figures in rows.values():
+                    found = figures | found
+            yield found
 
 
 _PARTS = ("readings", "lengths", "label", "test", "range")

@@ -9,7 +9,15 @@ from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 
 from examples.paper.studies.default_learner import Checkout, answers
-from examples.paper.studies.robustness_study import NOVELTY, PERTURBED, SESSION, Robustness, Series, summary
+from examples.paper.studies.robustness_study import (
+    NOVELTY,
+    PERTURBED,
+    SESSION,
+    Robustness,
+    Series,
+    Simulated,
+    summary,
+)
 from scroll_tactile.datasets import Recordings
 from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import InputError
@@ -78,6 +86,22 @@ def test_another_checkout_answers_the_same_touches():
         list(Checkout(HERE)(sets.sensor, [("", train[0][1])], tests, lambda *progress: None))
 
 
+def test_simulated_sensors_are_measured_and_read_back(tmp_path):
+    study = Simulated(folder=tmp_path / "run", learned=2, tested=1)
+    records = list(study.run())
+    assert [(record["side"], record["name"]) for record in records] == [("now", "events"), ("now", "light")]
+    for record in records:
+        assert {"accuracy", "calibration_error", "known", "wrong_known", "novelty_auroc"} < set(record)
+        assert record["tested"] == 20
+    asked = []
+    assert list(study.run(lambda what, done, of: asked.append(what))) == records
+    assert not asked
+    learned = [{material for material, _ in fit.train} for fit in study.fits()["events"]]
+    assert len(learned[0]) == 20 and len(learned[1]) == 15
+    with pytest.raises(InputError, match="another run"):
+        list(Simulated(1, folder=tmp_path / "run", learned=2, tested=1).run())
+
+
 def made_up_series(path: Path) -> Path:
     rng = np.random.default_rng(0)
     lengths = rng.integers(20, 40, 24)
@@ -106,7 +130,7 @@ def test_series_have_the_split_and_range_that_they_come_with(tmp_path):
 def test_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr("examples.paper.commands.robustness_command.read", lambda dataset, data, seed: few())
     words = ("robustness", "--data", tmp_path, "--set", "roboskin-20", "--folds", "0", "--run", tmp_path / "run")
-    words = (*words, "--series", made_up_series(tmp_path / "series.npz"))
+    words = (*words, "--series", made_up_series(tmp_path / "series.npz"), "--materials", 5)
     result = run(*words, "--before", HERE, "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.output
     assert "folds 0" in result.output and "AUROC" in result.output and "Waves" in result.output
@@ -115,6 +139,7 @@ def test_the_command(tmp_path, monkeypatch):
     assert kept["now"] == kept["before"]  # it is this checkout
     assert list(kept["now"]["roboskin-20"]) == ROWS
     assert kept["now"]["series"]["mean"]["accuracy"] == kept["now"]["series"]["Waves"]["accuracy"]
+    assert list(kept["now"]["simulated"]) == ["events", "light"]
     assert run(*words).exit_code == 0
     assert "out of [0, 1, 2, 3, 4]" in refused(*words[:6], "7")
     assert "came 'biotac-50'" in refused(*words[:4], "biotac-50")

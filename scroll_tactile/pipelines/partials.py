@@ -8,9 +8,10 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,11 @@ class Contained:
         """All that were read."""
         return tuple(address for address, _ in self.read)
 
+    @cached_property
+    def numbers(self) -> dict[tuple[str, bytes], int]:
+        """The number of each touch, from 1."""
+        return {touch: number for number, touch in enumerate(self.touches, start=1)}
+
     @classmethod
     def of(cls, path: Path, making: Making, address: str | None = None, *, thorough: bool = False) -> Contained:
         """The partial in a file. address: of a memory; None for one that a job made of recordings.
@@ -201,7 +207,7 @@ class Contained:
                 rows, whole = packed.has_rows and adds_up, ((address, len(touches)),)
                 return cls(str(path), (address,), whole, touches, (), True, adds_up, rows, described)
             try:
-                learned, read, again = _noted(packed.note, len(touches))
+                learned, read, again = _noted(packed.note, touches)
             except (KeyError, TypeError, ValueError) as error:
                 raise MismatchError(f"{path} is a partial, but none of a fleet's run: {error!r:.200}") from error
             if not adds_up or packed.has_rows != bool(touches):
@@ -210,9 +216,9 @@ class Contained:
 
 
 def _noted(
-    note: Mapping[str, Any], touches: int
+    note: Mapping[str, Any], touches: Sequence[tuple[str, bytes]]
 ) -> tuple[tuple[str, ...], tuple[tuple[str, int], ...], tuple[Again, ...]]:
-    """What a job of recordings noted, of so many touches. Raises KeyError, TypeError or ValueError for another note."""
+    """What a job of recordings noted, of these touches. Raises KeyError, TypeError or ValueError for another note."""
     read = tuple((address, int(count)) for address, count in note["read"])
     learned = tuple(note["sources"])
     again = tuple(Again(address, said, name, bytes.fromhex(key)) for address, said, name, key in note["again"])
@@ -222,8 +228,10 @@ def _noted(
         raise TypeError("a source's name that is no text")
     counts = [count for _, count in read]
     known = {*learned, *(each.address for each in again)} <= set(places) and len(set(places)) == len(places)
-    if not known or min(counts, default=0) < 0 or sum(counts) != touches:
+    if not known or min(counts, default=0) < 0 or sum(counts) != len(touches):
         raise ValueError("touches of other sources than it names")
+    if not {(each.material, each.key) for each in again} <= set(touches):
+        raise ValueError("a touch that came again, and not before")
     return learned, read, again
 
 

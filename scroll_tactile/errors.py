@@ -170,7 +170,7 @@ class CapacityError(ScrollTactileError, OverflowError):
 
 
 class RangeWarning(UserWarning):
-    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it; said once a learner."""
+    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it; said once a learner, or a fleet's run."""
 
     def __str__(self) -> str:
         return printable(super().__str__(), keep="\n")

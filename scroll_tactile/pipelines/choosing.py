@@ -59,7 +59,7 @@ def choose(parts: Sequence[tuple[Contained, Partial]], order: Mapping[str, int],
         held, partial = parts[place]
         taken = set()
         for number, touch, said in _touches(held, partial, address, first, last):
-            why = refusal(there.names(touch[1]), touch[0])
+            why = refusal(there.names(touch[1]), touch[0], number in held.clipped)
             if why is not None:
                 chosen.refused.append((address, said, why))
                 chosen.not_taken.add(touch)

@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import usual_embedding
 from scroll_tactile.memory.merge import Choice
@@ -96,7 +97,8 @@ def learn(
     sources done, sources in all).
 
     A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
-    the report, and so are those whose workers die again and again; all others are learned.
+    the report, and so are those whose workers die again and again; all others are learned. Warns at the end, by a
+    RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
     for a destination of another sensor; CapacityError beyond what exact sums hold; LockedError while another fleet is
@@ -134,6 +136,8 @@ def learn(
         held.close()
         run.end()
     report.seconds = time.perf_counter() - begun
+    if report.range_problem is not None:
+        warnings.warn(report.range_problem, RangeWarning, stacklevel=2)
     return report
 
 

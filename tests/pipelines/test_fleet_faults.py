@@ -283,7 +283,11 @@ def test_what_a_partial_notes_of_itself_is_looked_at(tmp_path, sources):
     good = Contained.of(path, making, thorough=True)
     assert good.touches and good.sources
     empty = {"sources": [], "again": []}
-    for note in ({}, {"read": 5}, {"read": [[1, 2]]} | empty, {"read": []} | empty):
+    with Partial(path) as packed:
+        noted = dict(packed.note)
+    strange = [noted | {"clipped": 5}, noted | {"range_problem": 5}, noted | {"again": [["x", "x", "x", "00"]]}]
+    strange.append(noted | {"again": [[good.sources[0], "x", "of no row", "00" * 32]]})
+    for note in ({}, {"read": 5}, {"read": [[1, 2]]} | empty, {"read": []} | empty, *strange):
         with pytest.MonkeyPatch.context() as patch:
             read = Partial._read
 

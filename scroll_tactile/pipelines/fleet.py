@@ -91,9 +91,9 @@ def learn(
     or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
     the destination, where partials lie meanwhile.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
-    destination comes first, then the sources in their order. patience: seconds that a job, or listing an address, may
-    take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none to
-    any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
+    destination comes first, then the sources in their order. patience: seconds that a job, or a look at an address,
+    may take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none
+    to any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
     sources done, sources in all).
 
     A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
@@ -211,10 +211,15 @@ class _Run:
         self.report.sources = len(learned & set(found))
         self._total = len(found)
         left = [source for source in found if source not in learned]
-        memories = [source for source in left if is_memory(source)]
-        one_by_one = set(memories)
-        self._left = [source for source in left if source not in one_by_one]
-        self._waiting.extend((self._job((source,), memory=True), 0) for source in memories)
+        self._left = []
+        for source in left:
+            try:
+                if is_memory(source, self.making.patience):
+                    self._waiting.append((self._job((source,), memory=True), 0))
+                else:
+                    self._left.append(source)
+            except TimeoutError as error:
+                self.report.refused.append(Refused(source, f"it cannot be looked at: {error!s:.300}"))
 
     def _job(self, sources: Sequence[str], *, memory: bool = False) -> LearnJob:
         return LearnJob(self.making, tuple(sources), str(self.folder), memory)

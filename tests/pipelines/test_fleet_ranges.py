@@ -1,4 +1,4 @@
-"""Readings that do not fit their sensor's range: a fleet says so as one process does, also of what clipping made one."""
+"""Readings that do not fit their sensor's range: a fleet says what one process says."""
 
 import json
 import warnings

@@ -130,7 +130,7 @@ class FieldError(RecordingError):
 
 
 class MissingLibraryError(InputError, ImportError):
-    """A library that comes with an extra is not installed; the message has the line that installs it."""
+    """A library that comes with an extra is not installed, and the message has the line that does it; or is broken."""
 
 
 class MismatchError(ScrollTactileError):
@@ -170,7 +170,10 @@ class CapacityError(ScrollTactileError, OverflowError):
 
 
 class RangeWarning(UserWarning):
-    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it; said once a learner."""
+    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it.
+
+    Said once a learner, and once a fleet's run.
+    """
 
     def __str__(self) -> str:
         return printable(super().__str__(), keep="\n")

@@ -28,20 +28,39 @@ def optional(library: str, extra: str, what: str, otherwise: str = "") -> Iterat
     try:
         yield
     except ImportError as error:
-        raise missing(library, extra, what, otherwise) from error
+        raise missing(library, extra, what, otherwise, error) from error
 
 
-def missing(library: str, extra: str, what: str, otherwise: str = "") -> MissingLibraryError:
-    """The error of a library that is not installed, with the line that installs it.
+def missing(
+    library: str, extra: str, what: str, otherwise: str = "", cause: ImportError | None = None
+) -> MissingLibraryError:
+    """The error of a library that is not installed, with the line that installs it; or of a broken one, with the cause.
 
     library: its name on the index. extra: of pyproject.toml, that it comes with. what: needs it. otherwise: what can be
-    done without it.
+    done without it. cause: what importing it raised.
     """
-    line = install_line(library, extra)
     instead = f", or {otherwise}" if otherwise else ""
-    error = MissingLibraryError(f"{what} needs {library}, which is not installed: {line}{instead}")
+    if cause is None or _is_absent(library, cause):
+        why = f"which is not installed: {install_line(library, extra)}"
+    else:
+        why = f"which cannot be imported ({cause!s:.300}): mend or reinstall it"
+    error = MissingLibraryError(f"{what} needs {library}, {why}{instead}")
     error.name = library
     return error
+
+
+def _is_absent(library: str, cause: ImportError) -> bool:
+    """Whether an import failed because this library is not installed, and not one that it imports itself."""
+    if not isinstance(cause, ModuleNotFoundError):
+        return False
+    names = library.rstrip("]").split("[")
+    if (cause.name or "").partition(".")[0] in names:
+        return True
+    try:
+        importlib.metadata.distribution(names[0])
+    except importlib.metadata.PackageNotFoundError:
+        return True
+    return False
 
 
 def install_line(library: str, extra: str) -> str:

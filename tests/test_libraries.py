@@ -78,6 +78,43 @@ def test_it_is_caught_as_input_error_and_as_import_error():
     assert str(missing("torch", "torch", "it", "leave it out")).endswith(", or leave it out")
 
 
+@pytest.mark.parametrize(
+    ("library", "there", "error", "said"),
+    [
+        ("torch", True, ImportError("libcudnn.so.9: cannot open shared object file"), "libcudnn.so.9: cannot open"),
+        ("torch", True, ModuleNotFoundError("No module named 'sympy'", name="sympy"), "No module named 'sympy'"),
+        ("numpy", True, ImportError("cannot import name 'x' from 'numpy'", name="numpy"), "cannot import name 'x'"),
+        ("torch", True, ModuleNotFoundError("No module named 'torch.nn'", name="torch.nn"), None),
+        ("torch", False, ModuleNotFoundError("No module named 'torch'", name="torch"), None),
+        ("scikit-learn", False, ModuleNotFoundError("No module named 'sklearn'", name="sklearn"), None),
+        ("dask[distributed]", True, ModuleNotFoundError("No module named 'distributed'", name="distributed"), None),
+    ],
+)
+def test_one_that_is_installed_and_broken_is_not_called_absent(monkeypatch, library, there, error, said):
+    asked = []
+
+    def distribution(name: str) -> Installed:
+        asked.append(name)
+        if name != "scroll-tactile" and not there:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return Installed(None)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", distribution)
+    with (
+        pytest.raises(MissingLibraryError) as raised,
+        optional(library, "torch", "a thing", "leave it out"),
+    ):
+        raise error
+    assert raised.value.__cause__ is error and raised.value.name == library
+    assert str(raised.value).endswith(", or leave it out")
+    if said is None:
+        assert f"needs {library}, which is not installed: {sys.executable}" in str(raised.value)
+    else:
+        assert f"needs {library}, which cannot be imported ({said}" in str(raised.value)
+        assert "not installed" not in str(raised.value)
+    assert not any("[" in name for name in asked)
+
+
 def test_every_extra_that_is_named_is_there():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = set()

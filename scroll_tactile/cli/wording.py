@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import warnings
 from collections.abc import Iterable
 from contextvars import ContextVar
 from typing import Any
@@ -16,7 +17,9 @@ _ARGUMENTS = (
     *("material", "by", "intervals", "cut", "sensor", "add", "source", "scene", "risk"),
 )
 _RENAMED = {"material": "label", "by": "label_by", "intervals": "labels", "labels": "label_topic"}
-_NAMED = re.compile(rf"(?<![^\s(])({'|'.join(_ARGUMENTS)})=('[^']*'|\"[^\"]*\"|True)?")
+_TEXT = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""  # as repr writes one
+_NAMED = re.compile(rf"(?<![^\s(])({'|'.join(_ARGUMENTS)})=({_TEXT}|True|(?!['\"]))")
+_UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)  # what parsing and evaluating any text raises
 
 _options: ContextVar[dict[str, str]] = ContextVar("_options")
 
@@ -45,8 +48,11 @@ def in_options(text: str) -> str:
         return flag if value in (None, True) else f"{flag} {shlex.quote(str(value))}"
 
     def replaced(match: re.Match[str]) -> str:
-        name, value = match.groups()
-        found = option(name, None if value is None else ast.literal_eval(value))
+        name, written = match.groups()
+        try:
+            found = option(name, ast.literal_eval(_parsed(written)) if written else None)
+        except _UNREADABLE:  # of what only looks like an argument, such as in a path
+            return match[0]
         if found is None:
             absent[name] = None
         return found or match[0]
@@ -68,8 +74,15 @@ def _call(line: str) -> dict[str, object]:
     if not line.startswith("read("):
         return {}
     try:
-        call = ast.parse(line, mode="eval").body
+        call = _parsed(line).body
         named = call.keywords if isinstance(call, ast.Call) else []
         return {str(each.arg): ast.literal_eval(each.value) for each in named}
-    except (SyntaxError, ValueError):
+    except _UNREADABLE:
         return {}
+
+
+def _parsed(text: str) -> ast.Expression:
+    """An expression of Python's. Raises _UNREADABLE for anything else, also for escapes that Python warns of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return ast.parse(text, mode="eval")

@@ -8,13 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from scroll_tactile.signals.ranges import CURE
+
 __all__ = ["Contents", "refusal"]
 
 
-def refusal(names: Sequence[str], material: str) -> str | None:
-    """Why a touch that is there under these names cannot be learned as a material; None where it can."""
+def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
+    """Why a touch that is there under these names cannot be learned as a material; None where it can.
+
+    clipped: whether all its values lay outside the sensor's range, so that clipping may have made it this touch.
+    """
     if not names or material in names:
         return None
+    if clipped:
+        return (
+            f"all its values lie outside the sensor's range, and the memory has what clipping leaves of them already, "
+            f"as {names[0]!r} and not as {material!r}: {CURE}"
+        )
     return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
+from typing import TypeVar
 
 from scroll_tactile.pipelines.sources import Refused, find_sources
 from scroll_tactile.recordings.locations import file_system, is_remote
@@ -20,12 +21,20 @@ PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual n
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 JOURNAL = "journal.sqlite"
 
+T = TypeVar("T")
 
-def is_memory(address: str) -> bool:
-    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none."""
+
+def is_memory(address: str, patience: float | None = None) -> bool:
+    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none.
+
+    patience: seconds in which a remote one must answer; raises TimeoutError where it does not.
+    """
+    remote = is_remote(address)
     try:
-        return _is_remote_memory(address) if is_remote(address) else _is_local_memory(Path(address))
-    except Exception:  # each file system has errors of its own; reading it tells what is wrong
+        return _answered(partial(_is_remote_memory, address), patience) if remote else _is_local_memory(Path(address))
+    except Exception as error:  # each file system has errors of its own; reading it tells what is wrong
+        if remote and isinstance(error, TimeoutError):
+            raise
         return False
 
 
@@ -74,9 +83,9 @@ def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[st
     return list(found), refused
 
 
-def _answered(ask: Callable[[], list[str]], patience: float | None) -> list[str]:
+def _answered(ask: Callable[[], T], patience: float | None) -> T:
     """The answer of a call. Raises what it raises, and TimeoutError where it takes longer; it is left alone then."""
-    answers: Queue[list[str] | Exception] = Queue()
+    answers: Queue[T | Exception] = Queue()
 
     def call() -> None:
         try:

@@ -59,7 +59,7 @@ def choose(parts: Sequence[tuple[Contained, Partial]], order: Mapping[str, int],
         held, partial = parts[place]
         taken = set()
         for number, touch, said in _touches(held, partial, address, first, last):
-            why = refusal(there.names(touch[1]), touch[0])
+            why = refusal(there.names(touch[1]), touch[0], number in held.clipped)
             if why is not None:
                 chosen.refused.append((address, said, why))
                 chosen.not_taken.add(touch)
@@ -88,10 +88,11 @@ def _stretches(parts: Sequence[tuple[Contained, Partial]], order: Mapping[str, i
 def _touches(
     held: Contained, partial: Partial, address: str, first: int, last: int
 ) -> Iterator[tuple[int, Touch, str]]:
-    """Number in the partial, touch, and where it came from; then those that came again, which have no number."""
+    """Number in the partial, touch, and where it came from; then those that came again, whose row is the first's."""
     for number in range(first, last):
         said = partial.named[number].attributes.get(SOURCE, address)
         yield number + 1, held.touches[number], str(said)
     for each in held.again:
         if each.address == address:
-            yield 0, (each.material, each.key), each.said
+            touch = each.material, each.key
+            yield held.numbers[touch], touch, each.said

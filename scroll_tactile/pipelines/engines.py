@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -96,11 +95,6 @@ class Processes(Engine):
             for process in processes:
                 process.kill()
 
-    @property
-    def name(self) -> str:
-        """What runs the jobs."""
-        return f"{self.workers} processes"
-
     def _drop(self, pool: ProcessPoolExecutor) -> None:
         self._all.discard(pool)
         pool.shutdown(wait=False)
@@ -117,9 +111,9 @@ class Processes(Engine):
         else:
             self._free.append(pool)
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
         for pool in list(self._all):
-            pool.shutdown(wait=sys.exc_info()[0] is None, cancel_futures=True)
+            pool.shutdown(wait=kind is None, cancel_futures=True)
 
 
 def _end_with_parent() -> None:

@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import usual_embedding
 from scroll_tactile.memory.merge import Choice
@@ -90,13 +91,14 @@ def learn(
     or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
     the destination, where partials lie meanwhile.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
-    destination comes first, then the sources in their order. patience: seconds that a job, or listing an address, may
-    take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none to
-    any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
+    destination comes first, then the sources in their order. patience: seconds that a job, or a look at an address,
+    may take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none
+    to any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
     sources done, sources in all).
 
     A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
-    the report, and so are those whose workers die again and again; all others are learned.
+    the report, and so are those whose workers die again and again; all others are learned. Warns at the end, by a
+    RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
     for a destination of another sensor; CapacityError beyond what exact sums hold; LockedError while another fleet is
@@ -134,6 +136,8 @@ def learn(
         held.close()
         run.end()
     report.seconds = time.perf_counter() - begun
+    if report.range_problem is not None:
+        warnings.warn(report.range_problem, RangeWarning, stacklevel=2)
     return report
 
 
@@ -207,10 +211,15 @@ class _Run:
         self.report.sources = len(learned & set(found))
         self._total = len(found)
         left = [source for source in found if source not in learned]
-        memories = [source for source in left if is_memory(source)]
-        one_by_one = set(memories)
-        self._left = [source for source in left if source not in one_by_one]
-        self._waiting.extend((self._job((source,), memory=True), 0) for source in memories)
+        self._left = []
+        for source in left:
+            try:
+                if is_memory(source, self.making.patience):
+                    self._waiting.append((self._job((source,), memory=True), 0))
+                else:
+                    self._left.append(source)
+            except TimeoutError as error:
+                self.report.refused.append(Refused(source, f"it cannot be looked at: {error!s:.300}"))
 
     def _job(self, sources: Sequence[str], *, memory: bool = False) -> LearnJob:
         return LearnJob(self.making, tuple(sources), str(self.folder), memory)

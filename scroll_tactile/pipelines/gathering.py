@@ -32,6 +32,7 @@ class FleetReport:
     came under two names the first counts, of the destination and then of the sources in their order. deaths: jobs whose
     worker ended before them, or did not answer. seconds: of all, and of the merge at the end. processor: seconds of the
     workers' and of this process, of learning, of sums and of the merge. held, digest: of the memory that came out.
+    range_problem: where touches do not fit the sensor's range, what is wrong with the first, and what to do.
     """
 
     sources: int = 0
@@ -43,6 +44,7 @@ class FleetReport:
     merging: float = 0.0
     held: int = 0
     digest: str = ""
+    range_problem: str | None = None
     processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "sums": 0.0, "merge": 0.0})
 
 
@@ -97,6 +99,7 @@ class Gathering:
         with ExitStack() as stack:
             inside = sorted(parts, key=lambda part: min(map(self.order.__getitem__, part.sources), default=0))
             opened = [(part, stack.enter_context(Partial(Path(part.path)))) for part in inside]
+            self.report.range_problem = next((part.range_problem for part in inside if part.range_problem), None)
             chosen = choose(opened, self.order, there)
             self.report.repeated += chosen.repeated
             for address, said, why in chosen.refused:

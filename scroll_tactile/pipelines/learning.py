@@ -15,6 +15,7 @@ from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
 from scroll_tactile.results import Prediction
+from scroll_tactile.signals.ranges import all_clipped
 
 __all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn"]
 
@@ -93,7 +94,7 @@ class _Batch:
                 if material in names:
                     done.skipped += 1
                     continue
-                if (why := refusal(names, material)) is not None:
+                if (why := refusal(names, material, all_clipped(touch.stream))) is not None:
                     done.refused.append(Refused(touch.source, why))
                     continue
                 try:

@@ -8,9 +8,10 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.recordings.locations import is_remote, local
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.ranges import all_clipped, range_problem
 from scroll_tactile.signals.stream import Stream
 from store import Head, StoreError, StoreFullError
 
@@ -161,7 +163,8 @@ class Contained:
     path: its file. learned: the sources that it has all touches of. read: all of its sources, in order, each with how
     many touches it has of it, which follow each other. touches: material and key of each. again: others that came.
     memory: whether its source is one. adds_up: whether it is of the run's making; has_rows: and has a row for each
-    touch. described: whether it describes materials.
+    touch. described: whether it describes materials. clipped: the numbers of touches all of whose values lay outside
+    the sensor's range. range_problem: of the first touch that does not fit it, as `ranges.range_problem` says it.
     """
 
     path: str
@@ -173,11 +176,18 @@ class Contained:
     adds_up: bool = True
     has_rows: bool = True
     described: bool = False
+    clipped: frozenset[int] = frozenset()
+    range_problem: str | None = None
 
     @property
     def sources(self) -> tuple[str, ...]:
         """All that were read."""
         return tuple(address for address, _ in self.read)
+
+    @cached_property
+    def numbers(self) -> dict[tuple[str, bytes], int]:
+        """The number of each touch, from 1."""
+        return {touch: number for number, touch in enumerate(self.touches, start=1)}
 
     @classmethod
     def of(cls, path: Path, making: Making, address: str | None = None, *, thorough: bool = False) -> Contained:
@@ -201,18 +211,20 @@ class Contained:
                 rows, whole = packed.has_rows and adds_up, ((address, len(touches)),)
                 return cls(str(path), (address,), whole, touches, (), True, adds_up, rows, described)
             try:
-                learned, read, again = _noted(packed.note, len(touches))
+                learned, read, again = _noted(packed.note, touches)
+                clipped, problem = _noted_of_range(packed.note)
             except (KeyError, TypeError, ValueError) as error:
                 raise MismatchError(f"{path} is a partial, but none of a fleet's run: {error!r:.200}") from error
             if not adds_up or packed.has_rows != bool(touches):
                 raise MismatchError(f"{path} is a partial of another run")
-            return cls(str(path), learned, read, touches, again, described=described)
+            ranged: dict[str, Any] = {"clipped": clipped, "range_problem": problem}
+            return cls(str(path), learned, read, touches, again, described=described, **ranged)
 
 
 def _noted(
-    note: Mapping[str, Any], touches: int
+    note: Mapping[str, Any], touches: Sequence[tuple[str, bytes]]
 ) -> tuple[tuple[str, ...], tuple[tuple[str, int], ...], tuple[Again, ...]]:
-    """What a job of recordings noted, of so many touches. Raises KeyError, TypeError or ValueError for another note."""
+    """What a job of recordings noted, of these touches. Raises KeyError, TypeError or ValueError for another note."""
     read = tuple((address, int(count)) for address, count in note["read"])
     learned = tuple(note["sources"])
     again = tuple(Again(address, said, name, bytes.fromhex(key)) for address, said, name, key in note["again"])
@@ -222,9 +234,19 @@ def _noted(
         raise TypeError("a source's name that is no text")
     counts = [count for _, count in read]
     known = {*learned, *(each.address for each in again)} <= set(places) and len(set(places)) == len(places)
-    if not known or min(counts, default=0) < 0 or sum(counts) != touches:
+    if not known or min(counts, default=0) < 0 or sum(counts) != len(touches):
         raise ValueError("touches of other sources than it names")
+    if not {(each.material, each.key) for each in again} <= set(touches):
+        raise ValueError("a touch that came again, and not before")
     return learned, read, again
+
+
+def _noted_of_range(note: Mapping[str, Any]) -> tuple[frozenset[int], str | None]:
+    """The touches that were clipped throughout, and what does not fit the sensor's range; raises as `_noted` does."""
+    problem = note["range_problem"]
+    if not isinstance(problem, str | None):
+        raise TypeError("a problem of the range that is no text")
+    return frozenset(int(number) for number in note["clipped"]), problem
 
 
 @contextmanager
@@ -262,6 +284,8 @@ def _learn(job: LearnJob) -> Made:
     seen: set[tuple[str, bytes]] = set()
     read: list[tuple[str, int]] = []
     again: list[tuple[str, str, str, str]] = []
+    clipped: list[int] = []
+    problem: str | None = None
     with write_partial(job.target) as written:
         for address in job.sources:
             before = len(seen)
@@ -275,6 +299,8 @@ def _learn(job: LearnJob) -> Made:
                     again.append((address, touch.source, material, key.hex()))
                     continue
                 seen.add((material, key))
+                problem = problem or range_problem(touch.stream)
+                clipped += [len(seen)] if all_clipped(touch.stream) else []
                 image = extractor.image(touch.stream)
                 codes, columns = extractor.codes(image, key), image.shape[1]
                 memory.add(material, key, columns, codes, len(seen), None, touch.stream.readings)
@@ -285,7 +311,8 @@ def _learn(job: LearnJob) -> Made:
                 written.touch(Head(len(seen), OBSERVE, material, key, time.time(), said, 0), arrays)
             read.append((address, len(seen) - before))
         learned = [source for source in job.sources if source not in failed]
-        written.finish(identity.to_json(), memory, None, note={"sources": learned, "read": read, "again": again})
+        note = {"sources": learned, "read": read, "again": again, "clipped": clipped, "range_problem": problem}
+        written.finish(identity.to_json(), memory, None, note=note)
     return Made(str(job.target), refused=refused)
 
 

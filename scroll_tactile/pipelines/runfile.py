@@ -16,6 +16,7 @@ from store.lock import flock
 __all__ = ["RunFile", "alone_in"]
 
 _FORMAT = 1
+TRIES = 100  # to lock a folder that others remove as they end
 
 
 class RunFile:
@@ -99,29 +100,43 @@ def alone_in(folder: Path, destination: Path) -> Iterator[None]:
 
     An empty folder is removed again. Raises LockedError where another run is in it, for this destination.
     """
-    descriptor = None
+    descriptor = _locked(folder, destination)
     try:
-        with suppress(OSError):  # what is wrong with it is said where notes are written
-            folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(folder, os.O_RDONLY)
-        if descriptor is not None and flock is not None:
-            import fcntl
-
-            try:
-                flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise LockedError(
-                    f"another run is at work for {destination}, in {folder}: wait until it has ended, or take another "
-                    "destination"
-                ) from error
-            except OSError:
-                pass
         yield
     finally:
         if descriptor is not None:
             with suppress(OSError):
                 folder.rmdir()
             os.close(descriptor)
+
+
+def _locked(folder: Path, destination: Path) -> int | None:
+    """The folder, made and locked; None where that cannot be. Raises LockedError."""
+    descriptor = None
+    for _ in range(TRIES):
+        with suppress(OSError):  # what is wrong with it is said where notes are written
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(folder, os.O_RDONLY)
+        if descriptor is None or flock is None:
+            break
+        import fcntl
+
+        try:
+            flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(descriptor)
+            raise LockedError(
+                f"another run is at work for {destination}, in {folder}: wait until it has ended, or take another "
+                "destination"
+            ) from error
+        except OSError:
+            break
+        with suppress(OSError):  # where it is not there, another run ended meanwhile, and removed it
+            if os.path.samestat(os.fstat(descriptor), folder.stat()):
+                break
+        os.close(descriptor)
+        descriptor = None
+    return descriptor
 
 
 def _draft(path: Path) -> Path:

@@ -174,7 +174,7 @@ class Hdf5(_Arrays):
         try:
             import h5py
         except ImportError as error:
-            raise missing("h5py", "hdf5", "an HDF5 file") from error
+            raise missing("h5py", "hdf5", "an HDF5 file", cause=error) from error
         self.budget = Budget(self.address, stored_bytes(self.path))
         return h5py.File(self.path, "r")
 

@@ -104,7 +104,7 @@ def _decompressor(kind: str) -> Any:
         try:
             from lz4.frame import LZ4FrameDecompressor  # comes with rosbags
         except ImportError as error:
-            raise missing("lz4", "ros", "a file compressed by lz4") from error
+            raise missing("lz4", "ros", "a file compressed by lz4", cause=error) from error
         return LZ4FrameDecompressor()
     if kind == "zstd":
         return zstd().ZstdDecompressor()
@@ -119,7 +119,7 @@ def zstd() -> Any:
         try:
             from backports import zstd
         except ImportError as error:
-            raise missing("backports.zstd", "ros", "a file compressed by zstd") from error
+            raise missing("backports.zstd", "ros", "a file compressed by zstd", cause=error) from error
     return zstd
 
 

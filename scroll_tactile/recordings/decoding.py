@@ -86,7 +86,7 @@ def _reader(channel: Channel, given: str) -> _Reader:
     try:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise missing("rosbags", "ros", "a ROS recording") from error
+        raise missing("rosbags", "ros", "a ROS recording", cause=error) from error
     store = get_typestore(Stores.EMPTY)
     text = given or channel.definition
     try:

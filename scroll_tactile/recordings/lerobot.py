@@ -39,7 +39,7 @@ class LeRobot(Source):
         try:
             from pyarrow import parquet
         except ImportError as error:
-            raise missing("pyarrow", "lerobot", "a LeRobot data set") from error
+            raise missing("pyarrow", "lerobot", "a LeRobot data set", cause=error) from error
         self.parquet: Any = parquet
         super().__init__(path, address, request)
         self.info = json.loads(read_text(path, path / "meta" / "info.json", _LONGEST))

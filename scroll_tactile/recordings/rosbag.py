@@ -226,7 +226,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
     try:
         from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
     except ImportError as error:
-        raise missing("rosbags", "ros", "a ROS recording") from error
+        raise missing("rosbags", "ros", "a ROS recording", cause=error) from error
     text = read_text(path, listed, _LONGEST)
     parts = [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
     # The whole text takes as long as a hundred messages do.
@@ -315,7 +315,7 @@ def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
     try:
         from PIL import Image
     except ImportError as error:
-        raise missing("Pillow", "gelsight", "a topic of compressed pictures") from error
+        raise missing("Pillow", "gelsight", "a topic of compressed pictures", cause=error) from error
     # Of what sensors send; other formats start other programs, or are decoded by what was not made for strangers.
     with Image.open(BytesIO(data), formats=("JPEG", "PNG")) as picture:
         if picture.width * picture.height > _PIXELS:

@@ -16,6 +16,7 @@ from scroll_tactile.memory.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Prediction
+from scroll_tactile.signals.ranges import all_clipped
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
@@ -109,7 +110,7 @@ class Bridge:
         touch = self.session.touch
         if touch is None:
             raise InputError("expected a touch to learn; none has ended yet")
-        if (why := refusal(self.learner.names_of(touch), material)) is not None:
+        if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
         if receipt.repeated:

@@ -6,9 +6,10 @@ import numpy as np
 
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["range_problem"]
+__all__ = ["CURE", "all_clipped", "range_problem"]
 
 CLIPPED = 0.25  # of the values; a blow or a glitch clips fewer
+CURE = "make a new memory with a Sensor whose low and high are the least and the most that it sends, in its unit"
 NARROW = 0.004  # of the range: readings from 0 to 1 of a sensor that is said to send a byte
 
 
@@ -26,12 +27,16 @@ new memory with a Sensor whose low and high are the least and the most that it s
     low, high = sensor.limits
     limits = f"{low:g} to {high:g} {sensor.unit}" if low.ndim == high.ndim == 0 else "each channel by its own"
     where = f"the range of sensor {sensor.name!r} ({limits})"
-    cure = "make a new memory with a Sensor whose low and high are the least and the most that it sends, in its unit"
     share = stream.clipped / stream.readings.size
     if share > CLIPPED:
-        return f"{100 * share:.0f} % of the values lie outside {where} and were clipped to its ends: {cure}"
+        return f"{100 * share:.0f} % of the values lie outside {where} and were clipped to its ends: {CURE}"
     least, most = stream.readings.min(axis=0), stream.readings.max(axis=0)
     span = float(np.max((most - low) / (high - low)) - np.min((least - low) / (high - low)))
     if not 0 < span <= NARROW:
         return None
-    return f"all readings lie in {100 * span:.2g} % of {where} and can hardly be told apart: {cure}"
+    return f"all readings lie in {100 * span:.2g} % of {where} and can hardly be told apart: {CURE}"
+
+
+def all_clipped(stream: Stream) -> bool:
+    """Whether all values lay outside the range: streams that differed may be the same now."""
+    return stream.clipped >= stream.readings.size - stream.missing

@@ -1,10 +1,15 @@
 """Errors speak of the options of the command that was typed, and not of Python's arguments."""
 
+import contextvars
 import json
+import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from commands import refused, run
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from scroll_tactile import sensors
 from scroll_tactile.cli.application import app
@@ -74,6 +79,55 @@ def test_so_does_what_is_refused(folder, monkeypatch, options, said):
     result = run("learn", "new", "rec", "--preset", "biotac", *options)
     assert result.exit_code == 1 and said in result.stderr and result.stderr.count("refused:") == 2
     assert not (folder / "new").exists()
+
+
+@pytest.fixture
+def words():
+    """As if a command with these options had been typed."""
+    context = contextvars.copy_context()
+    names = ("topic", "columns", "field", "sensor")
+    context.run(typed, [SimpleNamespace(name=name, opts=[f"--{name}"]) for name in names])
+    return lambda text: context.run(in_options, text)
+
+
+PIECES = st.sampled_from(
+    ["topic=", "field=", "read(", "'", '"', "\\", "\\x", "\\N{", "\0", "\n", " ", "(", ")", "[", "-", "x", "é", "True"]
+)
+TEXT = st.text() | st.lists(PIECES).map("".join)
+BY_EXAMPLE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+
+
+@BY_EXAMPLE
+@given(TEXT)
+@example('it\'s "x"')
+@example("a\\")
+@example("\\x")
+def test_any_text_as_a_value_is_the_option_with_that_text(words, text):
+    for name in ("topic", "field"):
+        said = words(f"there is no {name}={text!r}: give another (sensor=)")
+        assert said == f"there is no --{name} {shlex.quote(text)}: give another (--sensor)"
+
+
+@BY_EXAMPLE
+@given(TEXT)
+@example("/tmp/a topic='\\x'.npy")
+@example("/tmp/a topic='\\d'.npy")
+@example("read(x, topic='\\d')")
+@example("read(" + "-" * 50_000 + "1)")
+def test_any_text_as_a_path_can_be_said(words, text):
+    assert words(f"{text} is not there").endswith(" is not there")
+    if "='" not in text and '="' not in text and "\n" not in text and "read(" not in text:
+        assert words(f"{text}: give topic='it'").endswith(": give --topic it")
+
+
+def test_a_path_that_looks_like_a_value_and_is_none_stays_as_it_is(words):
+    for text in ("/tmp/a topic='\\x'.npy is not there", "/tmp/a topic='\\d' is not there", "a topic='a\\'"):
+        assert words(text) == text
+
+
+def test_a_file_of_such_a_name_is_an_error_as_any_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert r"topic='\x'.npy" in refused("observe", "m", "oak", r"a topic='\x'.npy", "--sensor", "biotac")
 
 
 def test_readmes_line_learns_wide_arrays_with_columns(folder, tmp_path, monkeypatch):

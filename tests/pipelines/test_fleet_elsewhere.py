@@ -4,6 +4,7 @@ import importlib.util
 import logging
 import os
 import socket
+import threading
 
 import numpy as np
 import pytest
@@ -67,6 +68,29 @@ class TestBucket:
         assert [each.source for each in done.refused] == ["s3://touches/day"]
         assert "no answer in 0.5 s" in done.refused[0].why
         assert done.digest == expected().digest()
+
+
+def test_a_server_that_falls_silent_after_it_listed_its_files_is_given_up(tmp_path, monkeypatch):
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    touch_files(tmp_path / "in", TOUCHES)
+    files = MemoryFileSystem()
+    files.pipe("/silent/a.part", b"any")
+    ended = threading.Event()
+
+    def silent(*_, **__):
+        ended.wait(20)
+        raise OSError("the test is over")
+
+    monkeypatch.setattr(MemoryFileSystem, "open", silent)
+    try:
+        done = run(tmp_path / "m", [tmp_path / "in", "memory://silent"], patience=2)
+    finally:
+        ended.set()
+        files.rm("/silent", recursive=True)
+    (silence,) = done.refused
+    assert silence.source.endswith("silent/a.part") and "no answer in 2 s" in silence.why
+    assert done.digest == expected().digest()
 
 
 @CLUSTER

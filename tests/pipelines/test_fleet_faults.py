@@ -19,7 +19,7 @@ from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.memory.partial import Partial, write_partial
-from scroll_tactile.pipelines import engines, fleet, partials
+from scroll_tactile.pipelines import engines, fleet, partials, runfile
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.partials import Contained, Made, Making
 from store import DamageError, LockedError, StoreFullError
@@ -246,6 +246,42 @@ class TestNotes:
         assert run(tmp_path / "m", sources, client=Second()).observations == 12
         assert run(tmp_path / "m", sources).observations == 0
 
+    def test_one_that_began_as_another_removed_its_folder_is_alone_all_the_same(self, tmp_path, monkeypatch):
+        folder, lock, removed = tmp_path / "m.fleet", runfile.flock, []
+
+        def late(*words):
+            if not removed:  # the other, which had it locked until now, is through
+                folder.rmdir()
+                removed.append(folder)
+            return lock(*words)
+
+        monkeypatch.setattr(runfile, "flock", late)
+        with (
+            runfile.alone_in(folder, tmp_path / "m"),
+            pytest.raises(LockedError),
+            runfile.alone_in(folder, tmp_path / "m"),
+        ):
+            pass
+        assert removed and not folder.exists()
+
+
+@pytest.mark.parametrize("error", [None, KeyError()])
+def test_processes_are_waited_for_unless_an_error_ends_the_block_whatever_the_caller_handles(error):
+    waits = []
+
+    class Pool:
+        def shutdown(self, *, wait, cancel_futures):
+            waits.append(wait)
+
+    try:
+        raise ValueError("the caller's own")
+    except ValueError:
+        with suppress(KeyError), engines.Processes(1) as processes:
+            processes._all.add(Pool())
+            if error is not None:
+                raise error from None
+    assert waits == [error is None]
+
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork server")
 def test_a_fork_server_that_is_killed_is_begun_again(tmp_path, sources, monkeypatch):
@@ -283,7 +319,11 @@ def test_what_a_partial_notes_of_itself_is_looked_at(tmp_path, sources):
     good = Contained.of(path, making, thorough=True)
     assert good.touches and good.sources
     empty = {"sources": [], "again": []}
-    for note in ({}, {"read": 5}, {"read": [[1, 2]]} | empty, {"read": []} | empty):
+    with Partial(path) as packed:
+        noted = dict(packed.note)
+    strange = [noted | {"clipped": 5}, noted | {"range_problem": 5}, noted | {"again": [["x", "x", "x", "00"]]}]
+    strange.append(noted | {"again": [[good.sources[0], "x", "of no row", "00" * 32]]})
+    for note in ({}, {"read": 5}, {"read": [[1, 2]]} | empty, {"read": []} | empty, *strange):
         with pytest.MonkeyPatch.context() as patch:
             read = Partial._read
 

@@ -121,6 +121,25 @@ def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(
         assert seen(learner) == rows
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_that_was_cut_short_goes_on_with_its_sources_in_another_order(tmp_path, seed, monkeypatch):
+    # Each of the two jobs has both copies of a touch; the one that its partial has no row of may come first now.
+    x, y, z = TOUCHES[:3]
+    paths = touch_files(tmp_path / "in", [x, y, x, z, ("d", x[1]), TOUCHES[3], x, TOUCHES[3]])
+    monkeypatch.setattr(fleet, "MOST_SOURCES", 4)
+    monkeypatch.setattr(fleet, "JOBS_A_WORKER", 1)
+    merge = TactileLearner.merge
+    monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+    with pytest.raises(StoreFullError):
+        run(tmp_path / "m", paths, workers=1)
+    monkeypatch.setattr(TactileLearner, "merge", merge)
+    order = paths[::-1] if seed == 0 else random.Random(seed).sample(paths, len(paths))
+    done = run(tmp_path / "m", order, workers=1)
+    _, digest, skipped, refused = by_one_process(tmp_path / "one", order)
+    assert (done.digest, done.held + done.repeated + len(done.refused), done.repeated) == (digest, 8, skipped)
+    assert [(each.source, each.why) for each in done.refused] == refused
+
+
 def test_memories_are_refused_touch_by_touch_where_they_have_rows_and_whole_where_not(tmp_path):
     touch_files(tmp_path / "in", TOUCHES[:4])
     for name, rows in (("rows", True), ("sums", False)):

@@ -17,11 +17,12 @@ from scroll_tactile.libraries import missing
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.keys import matched
+from scroll_tactile.recordings.parquetpages import LONGEST_LIST, require_bounded_pages
 from scroll_tactile.recordings.paths import select
 
 __all__ = ["LeRobot", "is_lerobot"]
 
-_LONGEST = 1 << 24  # bytes of info.json
+_LONGEST = 1 << 24  # bytes of info.json, and of a text in a footer
 _PLACEHOLDER = re.compile(r"\{(?:episode_)?(?:chunk|file)_index(?::0?\d?d)?\}")
 _TABLE_ROW = 100  # steps of work
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -37,10 +38,11 @@ class LeRobot(Source):
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         try:
-            from pyarrow import parquet
+            from pyarrow import parquet, types
         except ImportError as error:
             raise missing("pyarrow", "lerobot", "a LeRobot data set", cause=error) from error
         self.parquet: Any = parquet
+        self.types: Any = types
         super().__init__(path, address, request)
         self.info = json.loads(read_text(path, path / "meta" / "info.json", _LONGEST))
         version = str(self.info.get("codebase_version", ""))
@@ -76,29 +78,46 @@ class LeRobot(Source):
                 f"{self.address} claims readings of shape {shape!r:.60} in {key!r}, and may be damaged"
             )
         for path in self._files():
-            with self._opened(path) as file:
+            with self._opened(path, columns) as file:
                 there = [name for name in columns if name in file.schema_arrow.names]
                 for name in (key, clock):
                     if name not in there:
                         raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
+                for name in there:
+                    self._require_numbers(file.schema_arrow.field(name).type, name)
                 for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
-                    self.budget.take(batch.nbytes)
                     if batch.num_rows:
                         yield self._block(batch, key, rest, clock, tasks)
 
-    def _opened(self, path: Path) -> Any:
-        """A parquet file, whose bytes the budget counts; raises RecordingError for one that lies elsewhere."""
+    def _opened(self, path: Path, columns: list[str] | None) -> Any:
+        """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
+
+        The budget is charged for what their pages claim, before pyarrow is asked. pyarrow itself is not asked for what
+        the footer says of columns: where that is damaged, its answer is to end the process.
+        """
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))
-        # Its footer is not asked for columns: where one is damaged, pyarrow's answer is to end the process.
-        return self.parquet.ParquetFile(path)
+        require_bounded_pages(path, columns, self.budget)
+        limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": LONGEST_LIST}
+        return self.parquet.ParquetFile(path, pre_buffer=False, **limits)
 
-    def _table(self, path: Path, columns: list[str] | None = None) -> dict[str, list[Any]]:
-        """A small parquet table, or some columns of one, whole."""
-        with self._opened(path) as file:
-            self.budget.work(_TABLE_ROW * max(file.metadata.num_rows, 0))
-            table: dict[str, list[Any]] = file.read(columns=columns).to_pydict()
-            return table
+    def _table(self, file: Any, numbers: list[str], text: str | None = None) -> dict[str, list[Any]]:
+        """Some columns of a small parquet table, whole: of numbers, and one of texts."""
+        columns = numbers if text is None else [*numbers, text]
+        for name in numbers:
+            self._require_numbers(file.schema_arrow.field(name).type, name)
+        if text is not None and self.types.is_nested(file.schema_arrow.field(text).type):
+            raise FieldError(f"column {text!r} of {self.address} holds lists; expected texts")
+        table: dict[str, list[Any]] = {name: [] for name in columns}
+        # A long text that stands in the file once may be every row's.
+        rows = rows_of(8 * len(numbers)) if text is None else 1
+        for batch in file.iter_batches(batch_size=rows, columns=columns):
+            self.budget.work(_TABLE_ROW * batch.num_rows)
+            if text is not None:
+                self.budget.take(batch.nbytes)
+            for name, values in batch.to_pydict().items():
+                table[name] += values
+        return table
 
     def _block(self, batch: Any, key: str, rest: str, clock: str, tasks: dict[int, str]) -> Block:
         values = select(floats(self._rows(batch.column(key), key)), rest, self.field())
@@ -138,10 +157,15 @@ class LeRobot(Source):
             elif len(array) and len(inner) % len(array):
                 self._ragged(name)
             array = inner
-        values = array.to_numpy(zero_copy_only=False)
-        if values.dtype.kind not in "biuf":
-            raise FieldError(f"column {name!r} of {self.address} holds {array.type}; expected numbers")
-        return np.ascontiguousarray(values).reshape(count, -1)
+        return np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).reshape(count, -1)
+
+    def _require_numbers(self, kind: Any, name: str) -> None:
+        """Raises FieldError for a column of anything else, before it is read: a text may stand for every row of it."""
+        kind = getattr(kind, "storage_type", kind)
+        while self.types.is_nested(kind) and hasattr(kind, "value_type"):
+            kind = kind.value_type
+        if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):
+            raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected numbers")
 
     def _ragged(self, name: str) -> None:
         raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
@@ -149,8 +173,10 @@ class LeRobot(Source):
     def _files(self) -> list[Path]:
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
+        columns = ["data/chunk_index", "data/file_index"]
         for path in sorted((self.path / "meta" / "episodes").glob("**/*.parquet")):
-            table = self._table(path, ["data/chunk_index", "data/file_index"])
+            with self._opened(path, columns) as file:
+                table = self._table(file, columns)
             listed |= dict.fromkeys(zip(table["data/chunk_index"], table["data/file_index"], strict=True))
         pattern = str(self.info["data_path"])
         if re.search(r"[{}\\]", _PLACEHOLDER.sub("", pattern)):
@@ -173,8 +199,9 @@ class LeRobot(Source):
         if not path.is_file():
             self.notes.append("the tasks are missing, meta/tasks.parquet: episodes have no name")
             return {}
-        table = self._table(path)
-        indices = table.pop("task_index")
-        # pandas writes an index without a name under one of its own
-        texts: list[Any] = next(iter(table.values()), [])
+        with self._opened(path, None) as file:
+            # pandas writes an index without a name under one of its own
+            name = next((name for name in file.schema_arrow.names if name != "task_index"), None)
+            table = self._table(file, ["task_index"], name)
+        indices, texts = table["task_index"], table.get(name or "", [])
         return {int(i): str(text) for i, text in zip(indices, texts, strict=False)}

@@ -189,4 +189,8 @@ def _made_parquet(rng: random.Random, folder: Path) -> tuple[Path, dict[str, Any
     table = table.set_column(table.schema.get_field_index(name), name, column)
     table = pa.concat_tables([table] * rng.choice((1, 1, 1, 1000)))
     pq.write_table(table, file, compression=rng.choice(("zstd", "snappy", "gzip", "lz4", "none")))
-    return path, {"field": "tip"}, f"{name} is {column.type} in {file.name}"
+    how = "whole"
+    if rng.random() < 0.5:
+        how, raw = mutated_bytes(rng, file.read_bytes(), ())
+        file.write_bytes(raw)
+    return path, {"field": "tip"}, f"{name} is {column.type} in {file.name}, {how}"

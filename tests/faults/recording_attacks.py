@@ -25,6 +25,7 @@ from made import TIP, buffer, lerobot
 from numcodecs import Blosc
 
 from faults.bag_attacks import BAGS, Attack
+from faults.parquet_attacks import PARQUETS
 
 FIELD = {"field": "data/tactile"}
 SECRET = 0xA5  # what files are full of that nobody may read
@@ -325,6 +326,16 @@ def equal_rows(path: Path, about: Any, *, dictionary: bool) -> None:
     pq.write_table(table, file, compression="zstd", row_group_size=count, use_dictionary=dictionary)
 
 
+def parquet_file(name: str, write: Callable[[Path], Any]) -> Attack:
+    """Another parquet file in place of one, with a number a row."""
+
+    def change(path: Path, about: Any, watched: Path) -> None:
+        about["features"]["observation.tactile.tip"]["shape"] = [1]
+        write(path / name)
+
+    return robot_set(change)
+
+
 def parquet_link(path: Path, about: Any, watched: Path) -> None:
     """A parquet file that is elsewhere."""
     file = path / "data/chunk-000/file-000.parquet"
@@ -373,6 +384,7 @@ ATTACKS: dict[str, Attack] = (
         "R7 lerobot: long pages": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=False)),
         "R7 lerobot: a link": robot_set(parquet_link),
     }
+    | {f"R7 lerobot: {name}": parquet_file(*file) for name, file in PARQUETS.items()}
     | {
         f"R7 {kind}: {name}": alone(name, kind)
         for name in ("x.npy", "x.csv", "x.h5", "x.mcap", "x.bag", "x.db3", "x.zarr.zip")

@@ -41,6 +41,10 @@ SAID = {
     "R7 yaml: aliases": "has aliases, which no recorder writes",
     "R7 bag: a part elsewhere": "leads out of its recording",
     "R7 lerobot: names by width": "expected chunk_index and file_index",
+    "R7 lerobot: a page behind its column": "ends at 4072, its column at 92",
+    "R7 lerobot: a page of too few": "a column of 1 values has 0 in its pages",
+    "R7 lerobot: many row groups": "a list of 1000000 values of kind 12",
+    "R7 lerobot: texts for numbers": "holds string; expected numbers",
 }
 
 

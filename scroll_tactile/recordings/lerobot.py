@@ -56,6 +56,8 @@ class LeRobot(Source):
     def contents(self) -> Contents:
         """The columns that hold numbers, touch first."""
         fps, count = self.info.get("fps"), self.info.get("total_frames")
+        if isinstance(fps, bool) or not isinstance(fps, int | float):
+            fps = None
         entries = [
             Entry(None, name, tuple(about["shape"]), count, fps, about["dtype"])
             for name, about in self.features.items()

@@ -12,7 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 from faults.parquet_attacks import BINARY, I32, I64, LIST, PARQUETS, STRUCT, parquet, struct, value
 from faults.recording_attacks import ATTACKS
+from made import lerobot
 
+from scroll_tactile.recordings import describe
 from scroll_tactile.recordings.bounds import SPARE, Budget
 from scroll_tactile.recordings.parquetpages import require_bounded_pages
 
@@ -126,3 +128,11 @@ def test_what_is_cut_off_anywhere_is_refused(tmp_path):
         path.write_bytes(begin + footer[:length] + length.to_bytes(4, "little") + b"PAR1")
         with pytest.raises((IndexError, KeyError, ValueError)):
             require_bounded_pages(path, None, Budget("a"))
+
+
+def test_a_rate_that_is_no_number_is_none(tmp_path):
+    path = lerobot(tmp_path / "set")
+    about = json.loads((path / "meta/info.json").read_text())
+    for rate in ("ü", [5], True):
+        (path / "meta/info.json").write_text(json.dumps(about | {"fps": rate}))
+        assert "Hz" not in str(describe(path))

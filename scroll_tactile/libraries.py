@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import json
 import os
 import shlex
@@ -17,7 +18,7 @@ from urllib.request import url2pathname
 
 from scroll_tactile.errors import MissingLibraryError
 
-__all__ = ["install_line", "missing", "optional"]
+__all__ = ["install_line", "missing", "optional", "require"]
 
 PROJECT = "scroll-tactile"
 
@@ -29,6 +30,12 @@ def optional(library: str, extra: str, what: str, otherwise: str = "") -> Iterat
         yield
     except ImportError as error:
         raise missing(library, extra, what, otherwise, error) from error
+
+
+def require(library: str, extra: str, what: str) -> None:
+    """Raise `missing(…)` where a library is not there; it is not imported, which may take seconds, before it is used."""
+    if importlib.util.find_spec(library) is None:
+        raise missing(library, extra, what)
 
 
 def missing(

@@ -24,7 +24,7 @@ from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.registry import picture_to_json
 from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.errors import InputError
-from scroll_tactile.libraries import optional
+from scroll_tactile.libraries import require
 from scroll_tactile.signals.contact import Rest
 
 if TYPE_CHECKING:
@@ -100,8 +100,7 @@ class Frames:
             )
         if weights is None and runtime != "torch":
             raise InputError(f"expected a runtime with weights, which it is to run; came {runtime!r} without")
-        with optional("torch", "torch", "the embedding Frames"):
-            import torch  # noqa: F401
+        require("torch", "torch", "the embedding Frames")
         self.rest: Rest = _checked(rest)
         self.capabilities = Capabilities(reads_frames=True, rest=self.rest)
         self.cosines = cosines

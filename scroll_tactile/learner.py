@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
 from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
+from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import open_store
@@ -76,7 +77,8 @@ class TactileLearner:
 
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
     any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
-    that moment; its repr names the memory that it was taken of.
+    that moment; its repr names the memory that it was taken of. One of a learner that was closed may not know which
+    touches it has: `names_of` then raises StoreClosedError, and so does `observe` without again=True.
 
     Raises InputError for unknown settings, and for values that do not fit.
     """
@@ -96,7 +98,7 @@ class TactileLearner:
         exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
         recall = usual_recall(sensor, chosen) if given.recall is None else given.recall
         self._set_up(sensor, chosen, augmentation, given, exemplars, recall)
-        self._ledger = Ledger(self._empty_memory)
+        self._ledger = Ledger(self._empty_memory, contents=Contents())
 
     def _set_up(
         self,
@@ -199,7 +201,7 @@ class TactileLearner:
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
             held = arrays, attributes, ledger.memory.sequence
             state = {"made_with": made_with, "unverified": self._unverified, "held": held, "of": name}
-            return state | {"contents": ledger.contents().copy()}
+            return state | {"contents": ledger.copied_contents()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
@@ -294,7 +296,7 @@ class TactileLearner:
     def names_of(self, stream: Readings) -> list[str]:
         """The materials of which the memory has these very readings: none for a touch that it never learned.
 
-        stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream.
+        stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream; StoreError.
         """
         touch = self._extractor.stream(stream)
         with self._locked() as ledger:

@@ -19,16 +19,16 @@ class Receipt:
     material: its label. key: hash of the stream's content, 32 bytes.
     seconds: the stream's length; of a camera's, that of the frames in contact. clipped: values outside the sensor's
     range. durable: whether it is on disk; False in a memory without a path, and in a batch, which is durable at its
-    end. repeated: whether the memory had this touch already: then nothing was learned, and the receipt is that of the
-    first time.
+    end. repeated: whether the memory had this touch already: then nothing was learned, and the receipt equals that of
+    the first time. What is said of one call, clipped, durable and repeated, is not compared.
     """
 
     sequence: int
     material: str
     key: bytes
     seconds: float
-    clipped: int
-    durable: bool
+    clipped: int = field(compare=False)
+    durable: bool = field(compare=False)
     repeated: bool = field(default=False, compare=False)
 
 

@@ -6,11 +6,11 @@ refused where many are learned from files, in one process or by a fleet; `observ
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from scroll_tactile.signals.ranges import CURE
 
-__all__ = ["Contents", "refusal"]
+__all__ = ["Contents", "KnownContents", "refusal"]
 
 
 def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
@@ -61,3 +61,35 @@ class Contents:
     def find(self, material: str, key: bytes) -> int | None:
         """The first row that has a content under this name; None where there is none."""
         return min((sequence for name, sequence in self._rows.get(key, ()) if name == material), default=None)
+
+
+class KnownContents:
+    """The contents of a memory: read when they are first asked for, and changed with it from then on.
+
+    read: reads them. contents: where they are known already.
+    """
+
+    def __init__(self, read: Callable[[], Contents], contents: Contents | None = None) -> None:
+        self._read, self._contents = read, contents
+
+    def get(self) -> Contents:
+        """The contents."""
+        if self._contents is None:
+            self._contents = self._read()
+        return self._contents
+
+    def added(self, rows: Iterable[tuple[str, bytes, int]]) -> None:
+        """Touches were added, as the rows of `Contents`; they are not gone through before anybody asked."""
+        if self._contents is not None:
+            for row in rows:
+                self._contents.add(*row)
+
+    def removed(self, rows: Iterable[tuple[str, bytes, int]]) -> None:
+        """Touches were taken out, as `added`."""
+        if self._contents is not None:
+            for row in rows:
+                self._contents.remove(*row)
+
+    def unknown(self) -> None:
+        """The memory is another, or changed in a way that only reading tells."""
+        self._contents = None

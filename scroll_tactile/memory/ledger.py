@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import threading
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.changes import apply_appended, relabel
-from scroll_tactile.memory.contents import Contents
+from scroll_tactile.memory.contents import Contents, KnownContents
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
@@ -62,8 +63,8 @@ class Ledger:
     """The memory of one learner and the store that keeps it.
 
     load: reads the memory from the store, or makes an empty one without a store. bare: whether rows of observations
-    hold readings alone, to be embedded again when they are read. contents: of a memory without a store that is not
-    empty.
+    hold readings alone, to be embedded again when they are read. contents: which touches a memory without a store has;
+    None where nothing says.
 
     lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
     described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
@@ -78,8 +79,7 @@ class Ledger:
         contents: Contents | None = None,
     ) -> None:
         self.store = store
-        # Of a store they are read from its heads when they are first asked for: 20 us each.
-        self._contents = contents or (Contents() if store is None else None)
+        self._contents = KnownContents(self._read_contents, contents)
         self._bare = bare
         self.lock = threading.RLock()
         self.version = 0
@@ -101,21 +101,39 @@ class Ledger:
             if self._undo is not None:
                 self._undo()
             else:
-                self._memory, self._contents = self._load(), None
+                self._memory = self._load()
+                self._contents.unknown()
             self._whole = True
             self._changed()
         return self._memory
 
     def contents(self) -> Contents:
-        """Which touches the memory has, by their content; whoever calls holds the lock."""
-        memory = self.memory
-        if self._contents is None:
-            assert self.store is not None
-            gone = memory.retracted | memory.excluded
-            found = (head for head in _sound(self.store) if head.kind in (OBSERVE, MEMBER))
-            stand = (head for head in found if head.sequence not in gone and head.sequence <= memory.sequence)
-            self._contents = Contents((head.label, head.key, head.sequence) for head in stand)
-        return self._contents
+        """Which touches the memory has, by their content; whoever calls holds the lock.
+
+        Raises StoreClosedError where the memory was closed before anybody asked, and for a snapshot of such a one.
+        """
+        _ = self.memory  # where a change was cut short, both are read again
+        return self._contents.get()
+
+    def _read_contents(self) -> Contents:
+        """The contents by the heads of the journal: 13 us a row, for each is verified."""
+        memory, store = self._memory, self.store
+        if store is None:
+            raise StoreClosedError(
+                "this is a snapshot of a memory that was closed, which does not say what touches it has: make it "
+                "before the memory is closed, or observe with again=True"
+            )
+        gone = memory.gone(_sound(store, RETRACT), memory.sequence)
+        heads = itertools.takewhile(lambda head: head.sequence <= memory.sequence, _sound(store))
+        stand = (head for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence not in gone)
+        return Contents(map(_touch, stand))
+
+    def copied_contents(self) -> Contents | None:
+        """A copy of `contents`; None where it raises StoreClosedError."""
+        try:
+            return self.contents().copy()
+        except StoreClosedError:
+            return None
 
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
         durable = self.store is not None and not self._batching
@@ -204,8 +222,7 @@ class Ledger:
             undo = self._undo_of(material, stream.key, columns) if self.store is None else None
             with self._mutation(_nothing, undo):
                 sequence = self._append(material, stream, columns, codes, source)
-                if self._contents is not None:
-                    self._contents.add(material, stream.key, sequence)
+                self._contents.added([(material, stream.key, sequence)])
                 self._changed([(material, codes, 1)])
             self._snapshot_if_due()
             return self._receipt(sequence, material, stream)
@@ -216,14 +233,9 @@ class Ledger:
 
         def undo() -> None:
             memory()
-            self._contents_without(material, key, sequence)
+            self._contents.removed([(material, key, sequence)])
 
         return undo
-
-    def _contents_without(self, material: str, key: bytes, sequence: int) -> None:
-        """Take a touch out of the contents, if they were read."""
-        if self._contents is not None:
-            self._contents.remove(material, key, sequence)
 
     def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
         memory = self._memory
@@ -292,16 +304,11 @@ class Ledger:
             memory.sample, memory.kept, memory.exemplars, memory.tuned = before
 
         with self._mutation(revert):
-            # Read again where this is cut short: what is believed to be there would not be learned.
-            contents, self._contents = self._contents, None
             retracted = [memory.retract(record) for record in records]
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
-            if contents is not None:
-                for record in records:
-                    contents.remove(record.label, record.key, record.sequence)
-            self._contents = contents
+            self._contents.removed(map(_touch, records))
             self._changed(retracted)
         self._snapshot_if_due()
 
@@ -311,11 +318,14 @@ class Ledger:
             store = self.require_store("relabel anything")
             self._require_no_batch("a relabelling")
             record = observation_of(store, self.memory, receipt)
-            self._contents = None
-            with self._mutation(), store.batch():
-                self._changed(relabel(self._memory, store, record, material))
+            with self._mutation():
+                with store.batch():
+                    self._changed(relabel(self._memory, store, record, material))
+                sequence = self._memory.sequence
+                self._contents.removed([_touch(record)])
+                self._contents.added([(material, record.key, sequence)])
             self._snapshot_if_due()
-            return self._memory.sequence
+            return sequence
 
     def _require_no_batch(self, what: str) -> None:
         if self._batching:
@@ -360,9 +370,11 @@ class Ledger:
             with _opened(other) as source:
                 source.read_with(memory.plan, thorough=True)
                 incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
-                self._contents = None
+                before = memory.sequence
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
+                    came = (head for head in store.heads(before) if head.kind in (OBSERVE, MEMBER))
+                    self._contents.added(map(_touch, came))
             self._changed()
             self._snapshot_if_due()
         return Merged(added, incoming.shared, len(incoming.descriptions))
@@ -388,6 +400,7 @@ class Ledger:
                 with self._mutation():
                     store.compact(arrays, upto=upto, attributes=attributes)
                     memory.base = upto
+                    memory.excluded |= {sequence for sequence in memory.retracted if sequence <= upto}
                     memory.retracted = {sequence for sequence in memory.retracted if sequence > upto}
                 give_back_scratch()
             return Compacted(memory.base, before, sum(store.size().values()))
@@ -404,13 +417,14 @@ class Ledger:
             try:
                 if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
-                    self._contents = None
+                    self._contents.unknown()
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
                     return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
-            self._memory, self._contents, self._whole = self._load(), None, True
+            self._contents.unknown()
+            self._memory, self._whole = self._load(), True
             self._changed()
             return True
 
@@ -485,12 +499,17 @@ def _nothing() -> None:
     """Nothing to revert: the journal refused the row before the memory was changed."""
 
 
-def _sound(store: Store) -> Iterator[Head]:
-    """The heads of a journal, without those that are damaged: of them nobody can say what they hold."""
+def _touch(row: Head | Record) -> tuple[str, bytes, int]:
+    """The touch of a row, as `Contents` takes it."""
+    return row.label, row.key, row.sequence
+
+
+def _sound(store: Store, kind: str | None = None) -> Iterator[Head]:
+    """The heads of a journal, of one kind or all, but for those that are damaged: nobody can say what they hold."""
     after = 0
     while True:
         try:
-            for head in store.heads(after):
+            for head in store.heads(after, kind=kind):
                 yield head
                 after = head.sequence
             return

@@ -13,7 +13,7 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.partial import Joint, Partial, sums_without
-from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, RETRACT, SOURCE, unspanned
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, retracted_by
 from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Generation, Head, Record, Store
@@ -109,7 +109,7 @@ def is_from(said: str | None, source: str) -> bool:
 def observations(store: Store) -> list[Observation]:
     """All observations of a journal, in order, and what became of them."""
     heads, compacted = list(store.heads()), store.compacted
-    retracted = _retracted_in(heads)
+    retracted = retracted_by(heads)
 
     def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
         if head.sequence in retracted:
@@ -252,15 +252,10 @@ class Incoming:
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
 
 
-def _retracted_in(heads: Iterable[Head]) -> set[int]:
-    """All sequences that these rows retracted."""
-    return {row for head in heads if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
-
-
 def standing(rows: Iterable[Head]) -> list[Head]:
     """The rows that something was learned from, compacted ones too, without the retracted ones."""
     heads = list(rows)
-    retracted = _retracted_in(heads)
+    retracted = retracted_by(heads)
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
 
 

@@ -12,6 +12,7 @@ from scroll_tactile.errors import MismatchError, StreamError
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import EARLIER, Scale, WindowPlan
 from scroll_tactile.statistics.sample import stage_rows
+from store import Head
 
 __all__ = [
     "DESCRIBE",
@@ -31,6 +32,7 @@ __all__ = [
     "pack_codes",
     "pack_readings",
     "require_row",
+    "retracted_by",
     "row_codes",
     "spans",
     "unpack_codes",
@@ -170,6 +172,11 @@ def _scales(arrays: Arrays, prefix: str) -> list[tuple[str, Scale]]:
     """The names of the arrays with this prefix, each with its scale; not those of scales that are gone."""
     numbers = {name: int(name.removeprefix(prefix)) for name in arrays if name.startswith(prefix)}
     return [(name, Scale.numbered(number)) for name, number in numbers.items() if number not in EARLIER]
+
+
+def retracted_by(rows: Iterable[Head]) -> set[int]:
+    """The observations that these rows of a journal retracted."""
+    return {row for head in rows if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:

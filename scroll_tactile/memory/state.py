@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, cast
 
@@ -30,6 +30,7 @@ from scroll_tactile.memory.rows import (
     Encode,
     Readings,
     only_readings,
+    retracted_by,
     row_codes,
     unpack_readings,
     unspanned,
@@ -287,6 +288,7 @@ class Memory:
     def _base_samples(self, store: Store) -> Memory:
         """A memory with what the base holds; an empty one without a base."""
         fresh = self.of_nothing()
+        fresh.base = self.base
         self.require_base(store)
         try:
             base = store.base()
@@ -314,12 +316,22 @@ class Memory:
 
     def _counted(self, store: Store, upto: int) -> Counter[tuple[str, bytes]]:
         """How often each stream was observed, by material and key, up to a row and without what was retracted."""
-        gone = self.retracted | self.excluded
+        gone = self.gone(store.heads(kind=RETRACT), upto)
         return Counter(
             (head.label, head.key)
             for head in store.heads()
             if head.sequence <= upto and head.kind in (OBSERVE, MEMBER) and head.sequence not in gone
         )
+
+    def gone(self, retractions: Iterable[Head], upto: int) -> set[int]:
+        """The observations that count no more at a row, by the journal: a base of version 0.6 may not know all of them.
+
+        What the memory itself knows counts, too: a retraction may have been lost to damage since.
+        """
+        found = list(retractions)
+        # The base was made without whatever any row retracts of it: `compact` may keep the row that does.
+        of_base = {row for row in retracted_by(found) if row <= self.base}
+        return retracted_by(head for head in found if head.sequence <= upto) | of_base | self.retracted | self.excluded
 
     def _take_from(self, generation: Generation, store: Store) -> None:
         """Take in a generation of a store; what an earlier version wrote does not say how often a touch is there."""
@@ -396,7 +408,8 @@ class Memory:
             arrays |= levels
         # The rows after a base are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if base_at is None else ())
-        excluded = sorted(row for row in self.retracted | self.excluded if base_at is not None and row <= base_at)
+        base = self.base if base_at is None else base_at
+        excluded = sorted(row for row in self.retracted | self.excluded if row <= base)
         arrays["withdrawn"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         if self.exemplars is not None:
             own, attributes["exemplars"] = (

@@ -1,6 +1,6 @@
 """What a memory must hold: a list of touches that cannot go wrong, and the operations that change it.
 
-An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
+An operation is a tuple: ("observe", material, touch, again), ("batch", operations), ("retract", sequence),
 ("forget", material), ("relabel", sequence, material), ("describe", material, constituents or None),
 ("merge", name, shared), ("compact", keep), ("fine_tune",), ("backup",), ("pack", name, rows), ("reembed", embedding),
 ("fleet", pairs). `after` says what it makes of a `State` and what the call returns, `perform` does it to a learner (and
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import shutil
 import time
 from collections import Counter
@@ -31,10 +32,14 @@ from store import check_store
 MATERIALS = ("a", "b", "c", "ü")
 LENGTHS = (2, 16, 25, 40, 60, 90, 120)  # the widest scale needs 37, a fine-tune some of two materials
 
+# Few touches, so that the same stream is observed again, by this memory and by those merged into it.
+SEEDS = 6
+
 # By the names that a `State` has for them: that which memories are made with, and one to embed them again with.
 EMBEDDINGS = {"own": SMALL, "other": Kernels(seed=3, dimension=SMALL.dimension)}
 
 Touch = tuple[int, int]
+DRAWN: tuple[Touch, ...] = tuple(itertools.product(range(SEEDS), LENGTHS))
 Constituents = tuple[tuple[str, float | bool | None], ...]
 Operation = tuple[Any, ...]
 
@@ -158,7 +163,10 @@ def after(state: State, operation: Operation, others: dict[str, Other]) -> tuple
     return _AFTER[kind](state, others, *rest)
 
 
-def _observe(state: State, _: Any, material: str, touch: Touch) -> tuple[State, Any]:
+def _observe(state: State, _: Any, material: str, touch: Touch, again: bool = True) -> tuple[State, Any]:
+    there = [one.sequence for one in state.observed if one.pair == (material, touch)]
+    if there and not again:
+        return state, min(there)
     then = state.with_one(material, touch)
     return then, then.last
 
@@ -293,8 +301,8 @@ def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
         return type(error).__name__
 
 
-def _do_observe(learner: TactileLearner, _: Path, material: str, touch: Touch) -> int:
-    return learner.observe(material, stream(touch), again=True).sequence
+def _do_observe(learner: TactileLearner, _: Path, material: str, touch: Touch, again: bool = True) -> int:
+    return learner.observe(material, stream(touch), again=again).sequence
 
 
 def _do_batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...]) -> list[Any]:
@@ -353,6 +361,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
     memory, store = learner._ledger.memory, learner._ledger.store
     return {
         "materials": learner.materials,
+        "names": {str(touch): names for touch in DRAWN if (names := learner.names_of(stream(touch)))},
         "digest": learner.digest(),
         "descriptions": learner.descriptions,
         "exemplars": {name: [key.hex() for key in keys] for name, keys in learner.exemplars.items()},
@@ -385,8 +394,12 @@ def expected(state: State) -> dict[str, Any]:
     counted = dict(sorted(Counter(one.material for one in state.observed).items()))
     tuned = None if state.tuned is None else tuned_digest(state.tuned, state.embedding)
     said = {material: dict(constituents) for material, constituents in state.said}
+    names: dict[str, list[str]] = {}
+    for one in sorted(state.observed, key=lambda one: one.sequence):
+        if one.touch in DRAWN and one.material not in names.setdefault(str(one.touch), []):
+            names[str(one.touch)].append(one.material)
     told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
-    return _observed(state.pairs, state.embedding) | told
+    return _observed(state.pairs, state.embedding) | told | {"names": names}
 
 
 def settle(found: dict[str, Any], states: Sequence[State]) -> tuple[State | None, list[list[str]]]:

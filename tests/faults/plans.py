@@ -8,16 +8,13 @@ from pathlib import Path
 
 from touches import stream
 
-from faults.model import EMBEDDINGS, LENGTHS, MATERIALS, Operation, Other, State, Touch, after, opened
+from faults.model import EMBEDDINGS, LENGTHS, MATERIALS, SEEDS, Operation, Other, State, Touch, after, opened
 
 KINDS = (
     *("observe", "batch", "retract", "forget", "relabel", "describe", "merge", "compact", "fine_tune", "backup"),
     "pack",
 )
 MOST_TWICE = 16  # observations: a memory that is merged into itself would soon be all that a history does
-
-# Few touches, so that the same stream is observed again, by this memory and by those merged into it.
-SEEDS = 6
 
 SAID = (None, (("silk", 1.0),), (("silk", 0.25), ("wool", 0.75)), (("soft", True), ("wool", None)))
 
@@ -51,7 +48,7 @@ def prepare(home: Path) -> dict[str, Other]:
 def draw(rng: random.Random, state: State, others: dict[str, Other], kind: str) -> Operation:
     """A random operation of a kind; now and then one that is refused."""
     drawn: dict[str, Callable[[], Operation]] = {
-        "observe": lambda: (rng.choice(MATERIALS), touch(rng)),
+        "observe": lambda: (rng.choice(MATERIALS), touch(rng), rng.random() < 0.5),
         "batch": lambda: (_together(rng, state, others),),
         "describe": lambda: (rng.choice(MATERIALS), rng.choice(SAID)),
         "retract": lambda: (_to_retract(rng, state, kind),),

@@ -2,8 +2,10 @@
 
 import copy
 import pickle
+import sqlite3
 import threading
 
+import numpy as np
 import pytest
 from touches import SETTINGS, SmallSample, contents, fed, filled, require_same, stream
 
@@ -12,7 +14,7 @@ from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.state import Memory
-from store import StoreError
+from store import StoreClosedError, StoreError
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
 MANY = [*OBSERVED, *OBSERVED, *OBSERVED[::2], *OBSERVED[1::3]]
@@ -64,6 +66,34 @@ class TestOneContent:
             else:
                 break
 
+    @pytest.mark.parametrize("asked", [True, False])
+    def test_a_snapshot_of_a_closed_memory_knows_what_is_there_or_says_that_it_does_not(self, tmp_path, asked):
+        filled(tmp_path / "m", OBSERVED, exemplars=0)[0].close()
+        learner = TactileLearner.open(tmp_path / "m")
+        if asked:
+            learner.names_of(stream((0, 60)))
+        learner.close()
+        for other in (pickle.loads(pickle.dumps(learner)), copy.deepcopy(copy.deepcopy(learner))):
+            assert other.digest() == learner.digest()
+            if asked:
+                assert other.observe("a", stream((0, 60))).repeated
+                continue
+            for call in ((other.names_of,), (other.observe, "a")):
+                with pytest.raises(StoreClosedError, match="snapshot of a memory that was closed"):
+                    call[0](*call[1:], stream((0, 60)))
+            other.observe("a", stream((50, 60)), again=True)
+            assert other.digest() == fed([*OBSERVED, ("a", (50, 60))]).digest()
+
+    def test_a_repeated_receipt_equals_the_first(self, learner):
+        readings = stream((90, 60))  # some are outside the range
+        with learner.batch():
+            first = learner.observe("a", readings)
+        for same in (readings, readings.clip(0, 1)):
+            again = learner.observe("a", same)
+            assert again.repeated and again == first and hash(again) == hash(first)
+        assert (first.clipped > 0, again.clipped) == (True, 0)
+        assert learner.observe("a", readings, again=True) != first
+
     def test_of_threads_that_learn_the_same_one_does(self, learner):
         receipts = []
 
@@ -111,6 +141,86 @@ class TestChanges:
             assert told == [i != 3 for i in range(len(OBSERVED))]
             assert opened.digest() == fed(OBSERVED).digest()
 
+    @pytest.mark.parametrize("again", ["retracted", "relabelled", "forgotten"])
+    def test_what_was_taken_back_and_compacted_is_learned_again(self, tmp_path, again):
+        learner, receipts = filled(tmp_path / "m", OBSERVED)
+        assert learner.names_of(stream((1, 60))) == ["b"]  # from here on what is there changes with the memory
+        gone = [1, 4, 7, 10] if again == "forgotten" else [1]
+        if again == "retracted":
+            learner.retract(receipts[1])
+        elif again == "forgotten":
+            learner.forget("b")
+        else:
+            learner.relabel(receipts[1], "z")
+        learner.compact(keep=2)
+        learner.observe("a", stream((50, 60)))
+        for mode in ("write", "read"):  # as it is now, and as `close` leaves it
+            assert [learner.names_of(stream(OBSERVED[i][1])) for i in gone] == (
+                [["z"]] if again == "relabelled" else [[]] * len(gone)
+            )
+            learner.compact()
+            learner.close()
+            learner = TactileLearner.open(tmp_path / "m", mode=mode)
+        learner.close()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            for times in range(2):
+                told = [learner.observe(*_given(OBSERVED[i])).repeated for i in gone]
+                assert told == [times == 1] * len(gone)
+            extra = [("z", (1, 60))] if again == "relabelled" else []
+            require_same(learner, [*OBSERVED, ("a", (50, 60)), *extra])
+
+    def test_a_process_that_compacts_before_it_asks_is_told_what_is_there(self, tmp_path):
+        filled(tmp_path / "m", OBSERVED)[0].close()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            learner.retract(2)
+            learner.compact()
+            assert learner.names_of(stream((1, 60))) == []
+            assert not learner.observe(*_given(OBSERVED[1])).repeated
+            require_same(learner, OBSERVED)
+
+    def test_a_memory_that_version_0_6_compacted_twice_knows_what_was_taken_back(self, tmp_path, monkeypatch):
+        to_arrays = Memory.to_arrays
+
+        def before(self, *words):
+            arrays, attributes = to_arrays(self, *words)
+            attributes = {name: value for name, value in attributes.items() if name != "copies"}
+            return arrays | {"excluded": np.zeros(0, np.int64)}, attributes
+
+        monkeypatch.setattr(Memory, "to_arrays", before)
+        learner, receipts = filled(tmp_path / "m", [*OBSERVED, *OBSERVED], again=True)
+        learner.retract(receipts[0])
+        learner.compact(keep=3)
+        learner.observe("a", stream((50, 60)))
+        learner.close()
+        monkeypatch.undo()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.observe(*_given(OBSERVED[0])).sequence == len(OBSERVED) + 1
+            assert _sample(learner) == _sample(many([*OBSERVED, *OBSERVED[1:], ("a", (50, 60))]))
+
+    def test_what_a_damaged_retraction_took_back_is_learned_again(self, tmp_path):
+        learner, receipts = filled(tmp_path / "m", OBSERVED)
+        learner.retract(receipts[1])
+        learner.compact()
+        learner.observe("a", stream((50, 60)))
+        learner.close()
+        spoil_row(tmp_path / "m", len(OBSERVED) + 1, "kind")
+        with TactileLearner.open(tmp_path / "m") as learner:
+            assert learner.names_of(stream((1, 60))) == []
+            assert not learner.observe(*_given(OBSERVED[1])).repeated
+
+    def test_relabelled_and_merged_touches_are_not_looked_up_in_the_whole_journal(self, tmp_path, monkeypatch):
+        filled(tmp_path / "o", OBSERVED[6:])[0].close()
+        learner, receipts = filled(tmp_path / "m", OBSERVED[:6])
+        with learner:
+            assert learner.names_of(stream((0, 60))) == ["a"]
+            monkeypatch.setattr(learner._ledger._contents, "_read", None)
+            for receipt in receipts[:3]:
+                learner.relabel(receipt, "z")
+                assert learner.observe("z", stream((receipt.sequence - 1, 60))).repeated
+            learner.merge(tmp_path / "o", shared="once")
+            assert all(learner.observe(*_given(touch)).repeated for touch in OBSERVED[3:])
+            assert [learner.names_of(stream((i, 60))) for i in range(4)] == [["z"], ["z"], ["z"], ["a"]]
+
     def test_a_batch_that_is_lost_has_nothing_there(self, tmp_path):
         learner, _ = filled(tmp_path / "m", OBSERVED[:4])
         with learner:
@@ -129,12 +239,8 @@ class TestChanges:
             require_same(learner, OBSERVED)
 
     def test_damaged_rows_keep_nothing_from_being_learned(self, tmp_path):
-        import sqlite3
-
         filled(tmp_path / "m", OBSERVED)[0].close()
-        with sqlite3.connect(tmp_path / "m" / "journal.sqlite") as journal:
-            journal.execute("UPDATE record SET label = 'x' WHERE sequence = 4")
-        journal.close()
+        spoil_row(tmp_path / "m", 4, "label")
         with TactileLearner.open(tmp_path / "m") as learner:
             assert not learner.observe("d", stream((70, 60))).repeated
             assert learner.observe(*_given(OBSERVED[4])).repeated
@@ -248,6 +354,13 @@ def test_a_row_that_is_not_there_is_no_error():
     held.remove("a", b"1", 2)
     held.remove("b", b"2", 1)
     assert held.names(b"1") == ["a"] and held.find("a", b"1") == 1 and held.find("a", b"3") is None
+
+
+def spoil_row(path, sequence, column):
+    """Damage a row of a journal, whose checksum then fails."""
+    with sqlite3.connect(path / "journal.sqlite") as journal:
+        journal.execute(f"UPDATE record SET {column} = 'x' WHERE sequence = ?", (sequence,))
+    journal.close()
 
 
 def _given(pair):

@@ -26,6 +26,16 @@ SETTINGS: dict[str, Any] = {"sensor": SKIN, "embedding": Kernels(seed=0, dimensi
 LENGTH = 20  # readings of a touch
 
 
+Learned = dict[int, dict[str, tuple[int, bytes]]]
+"""Scale → material → its rows, and their sum."""
+
+
+def learned_of(names: Sequence[str], counts: Array, sums: Array) -> dict[str, tuple[int, bytes]]:
+    """What is learned at one scale: of rows that were solved for the sum is an integer, to rounding."""
+    whole = np.rint(sums).astype(np.int64)
+    return {name: (int(count), total.tobytes()) for name, count, total in zip(names, counts, whole, strict=True)}
+
+
 @dataclass(frozen=True)
 class State:
     """What a memory holds after a row. touches: material and key of each. described: material → constituents."""
@@ -49,7 +59,7 @@ class Truth:
         self.rows, self._readings = rows, readings
         self._learner = TactileLearner(**SETTINGS)
         self._within = {row for first, last in groups for row in range(first, last)}
-        self._digests: dict[tuple[tuple[str, bytes], ...], str] = {}
+        self._sums: dict[tuple[tuple[str, bytes], ...], tuple[str, Learned]] = {}
         self._conformal: dict[int, Conformal] = {}
         self._codes: dict[bytes, Any] = {}
         held: dict[int, tuple[str, bytes]] = {}
@@ -65,8 +75,6 @@ class Truth:
                 described = {name: of for name, of in described.items() if name != row.label}
                 described |= {} if said is None else {row.label: dict(said)}
             self.states.append(State(tuple(sorted(held.values())), described))
-        scale_rows = self.codes(next(key for _, key in self.states[-1].touches))
-        self.rows_a_touch = {int(scale): len(codes) for scale, codes in scale_rows.items()}
 
     def stream(self, key: bytes) -> Stream:
         """A touch that was observed."""
@@ -87,13 +95,28 @@ class Truth:
 
     def digest(self, row: int) -> str:
         """The digest after a row."""
+        return self._summed(row)[0]
+
+    def learned(self, row: int) -> Learned:
+        """What readouts are of after a row."""
+        return self._summed(row)[1]
+
+    def _summed(self, row: int) -> tuple[str, Learned]:
         touches = self.states[row].touches
-        if touches not in self._digests:
+        if touches not in self._sums:
             sums = self._learner._empty_memory().statistics
             for material, key in touches:
                 sums.add(material, self.codes(key), LENGTH)
-            self._digests[touches] = sums.digest()
-        return self._digests[touches]
+            self._sums[touches] = (
+                sums.digest(),
+                {
+                    int(scale): learned_of(
+                        names := sums.names(scale), sums.counts(scale, names), sums.sums(scale, names)
+                    )
+                    for scale in sums.scales
+                },
+            )
+        return self._sums[touches]
 
     def typical(self, row: int, names: Sequence[str], streams: Sequence[Stream]) -> tuple[float, ...]:
         """How typical touches of one thing are of some materials."""
@@ -115,7 +138,7 @@ class Told:
     """What a call said. since, until: rows of the memory before the call and after its return.
 
     of: "digest", "materials" and so on, or "prediction": then streams are those that it is of, where they are known,
-    and counts the rows of each material at each scale that the readouts are of.
+    and learned is what the readouts are of.
     """
 
     of: str
@@ -124,7 +147,7 @@ class Told:
     what: Any
     inside: bool = False
     streams: Sequence[Stream] = ()
-    counts: Any = None
+    learned: Learned | None = None
 
     def is_of(self, truth: Truth, row: int) -> bool:
         """Whether it is what the memory says after a row."""
@@ -150,12 +173,15 @@ class Told:
         materials, names = truth.states[row].materials, [name for name, _ in said.ranking]
         if sorted(names) != list(materials):
             return f"materials {sorted(names)} of {materials}"
-        counted = {
-            scale: {name: touches * of for name, touches in materials.items()}
-            for scale, of in truth.rows_a_touch.items()
-        }
-        if self.counts is not None and self.counts != counted:
-            return f"readouts of {self.counts}, and not {counted}"
+        learned = truth.learned(row)
+        if self.learned is not None and self.learned != learned:
+            differ = {
+                (scale, name): (of, learned[scale].get(name, (0, b""))[0])
+                for scale, found in self.learned.items()
+                for name, (of, total) in found.items()
+                if learned[scale].get(name) != (of, total)
+            }
+            return f"readouts of other rows, of some as many as in (these, those): {differ}"
         if self.streams and said.typicality != truth.typical(row, names, self.streams):
             return f"typicality {said.typicality}, and not {truth.typical(row, names, self.streams)}"
         return None

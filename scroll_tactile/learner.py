@@ -550,7 +550,6 @@ class TactileLearner:
                 yield
                 return
             with ledger.lock:
-                current.take_in(ledger)  # the model then keeps what has changed as it was
                 yield
 
         def answered(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
@@ -664,7 +663,9 @@ class TactileLearner:
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in it."""
         with self._locked() as ledger, enough_memory():
-            return Draft.of(ledger.memory, self._settings.readout).fit()
+            model = Draft.of(ledger.memory, self._settings.readout).fit()
+            model.freeze(ledger.memory.statistics)
+            return model
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""

@@ -61,6 +61,7 @@ class CurrentModel:
         model = self.present(ledger)
         lent = self._holder(model)
         if lent is None:
+            model.freeze(ledger.memory.statistics)
             lent = FrozenModel(model)
             self._lent = [*(one for one in self._lent if one() is not None), ref(lent)]
         return lent
@@ -129,7 +130,8 @@ class CurrentModel:
             self._process, self._worker, self._coming = os.getpid(), None, None
         if ledger.version == self._version:
             return
-        self._keep_lent(ledger.added or [])
+        if self._model is not None and self._holder(self._model) is None:
+            self._model.read(ledger.memory.statistics)  # lets a snapshot go, which would keep all that changes
         added = ledger.added if self._model is not None else None
         # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
         (behind, coming), (self._behind, self._coming) = (self._behind, self._coming), (None, None)
@@ -138,13 +140,6 @@ class CurrentModel:
         if added is not None:
             coming = coming if coming is not None and _with(self._since, added) is not None else None
             self._behind, self._coming = _with(behind, added), coming
-
-    def _keep_lent(self, added: Sequence[Added]) -> None:
-        """Have models that are held, and read the memory, keep what changed there as it was before."""
-        for one in self._lent:
-            if (lent := one()) is not None and lent.model.reads_memory:
-                with suppress(MemoryError):  # who asks for what changed is told
-                    lent.model.hold_before(added)
 
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""

@@ -37,16 +37,18 @@ class Measurement(Generic[M]):
 
     def _serving(self) -> Measurement[M] | None:
         """The one whose result serves, or will when it is there; None where none was asked for."""
+        earlier = self._earlier  # first: it is let go once there is a result
         if self._found is not None or self._lock.locked():
             return self
-        return self._earlier
+        return earlier
 
     @property
     def found(self) -> Beginnings | None:
         """How beginnings are judged, once that was measured."""
-        if self._found is not None or self._earlier is None:
+        earlier = self._earlier  # first: it is let go once there is a result
+        if self._found is not None or earlier is None:
             return self._found
-        return self._earlier._found
+        return earlier._found
 
     @property
     def asked_for(self) -> bool:
@@ -62,10 +64,15 @@ class Measurement(Generic[M]):
     def of(self, model: M, touches: int, measures: Callable[[M], Early | None]) -> Early | None:
         """How the model judges beginnings, which was fitted to so many touches: found, or measured now."""
         with self._lock:
+            earlier = self._earlier
+            if self._found is None and earlier is not None:
+                with earlier._lock:  # it may be under way in another thread: to measure beside it would take longer
+                    pass
             found = self.found
             if found is None:
                 found = Beginnings(measures(model), touches)
             if self._found is None:
-                # From here on it stays: an earlier one that comes later makes no difference.
+                # From here on it stays: an earlier one that comes later makes no difference, and would hold its own.
                 self._measures, self._found = measures, found
+                self._earlier = None
         return found.early

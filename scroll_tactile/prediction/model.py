@@ -33,6 +33,7 @@ from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
+from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
 __all__ = ["Draft", "Judgement", "Measures", "Model", "enough_memory"]
 
@@ -231,18 +232,22 @@ class Model:
         other.beginnings = Measurement(self.beginnings)
         return other
 
-    def hold_before(self, added: Sequence[Added]) -> None:
-        """Hold the materials of touches that came and went in the memory as they were before."""
-        with one_thread():
-            for scale, readout in self.readouts.items():
-                readout.hold_before(_changes(scale, added))
-                readout.lasting = True
+    def read(self, statistics: Statistics | Snapshot) -> None:
+        """Read there the materials that are asked for: in statistics that agree with it, or will where it follows."""
+        for readout in self.readouts.values():
+            readout.statistics = statistics
+
+    def freeze(self, statistics: Statistics) -> None:
+        """Stay the model of these statistics as they are now, until it follows what came since."""
+        if self.reads_memory:
+            self.read(statistics.snapshot())
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
 
         The readouts are then those of all that was observed; calibration, and how far the scatter is shrunk, stay.
         """
+        self.read(memory.statistics)
         for scale in memory.statistics.scales:
             changes = _changes(scale, added)
             if not changes or (scale in memory.plan.views and scale not in self.views):

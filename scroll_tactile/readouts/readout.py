@@ -36,7 +36,7 @@ from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread, within_scatter
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
 __all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task"]
 
@@ -108,19 +108,19 @@ class Readout:
     Any number of threads may ask one of at most EAGER materials at once, and one thread one of more. It follows where
     nobody asks: otherwise a copy does.
 
-    Some materials are held, with all that scores need: the reference first.
+    Some materials are held, with all that scores need: the reference first. The others are read from `statistics`.
 
     Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """
 
-    def __init__(self, task: Task, statistics: Statistics) -> None:
+    def __init__(self, task: Task, statistics: Statistics | Snapshot) -> None:
         self.scale = task.scale
         self.names = list(task.names)
         self.places = {name: place for place, name in enumerate(self.names)}
         self.reference = task.reference
         self.origin = task.origin
         self.counts = task.counts.astype(np.float64)
-        self._statistics = statistics
+        self.statistics = statistics
         matrix = task.scatter
         trace, dimension = float(np.trace(matrix)), len(matrix)
         self.share = shrinkage(matrix, task.touches, task.times) if trace > 0 else 0.0
@@ -133,7 +133,6 @@ class Readout:
         matrix[np.diag_indices(dimension)] += self.penalty
         self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix)
         self._held: dict[int, int] = {}  # place → row of these
-        self.lasting = False  # whether none is let go: the memory has others by now
         self._room = np.empty((0, 2, dimension))
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
         self._sizes = np.empty(0)  # mᵀ K⁻¹ m
@@ -189,11 +188,11 @@ class Readout:
         """Where the materials at some places are held; those that were not are from now on."""
         absent = [int(place) for place in places if int(place) not in self._held]
         if absent:
-            if len(self._held) + len(absent) > MOST_HELD and not self.lasting:
+            if len(self._held) + len(absent) > MOST_HELD:
                 self._let_go()
                 absent = [int(place) for place in places if int(place) not in self._held]
             names = [self.names[place] for place in absent]
-            counts, sums = self._statistics.counts(self.scale, names), self._statistics.sums(self.scale, names)
+            counts, sums = self.statistics.counts(self.scale, names), self.statistics.sums(self.scale, names)
             with one_thread():
                 self._hold(absent, _class_means(counts, sums, self.origin))
         return np.array([self._held[int(place)] for place in places], dtype=np.intp)
@@ -217,7 +216,7 @@ class Readout:
             if sign > 0:
                 come.setdefault(material, []).append(rows - self.origin)
         with one_thread():
-            self.hold_before(changes)
+            self._hold_before(changes)
             self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
             for material, rows, sign in changes:
                 if sign < 0:
@@ -230,7 +229,7 @@ class Readout:
     def copy(self) -> Readout:
         """Another readout of the same: what comes to it does not come to this one."""
         other = self._branch()
-        other.names, other.places, other.lasting = [*self.names], dict(self.places), False
+        other.names, other.places = [*self.names], dict(self.places)
         other._derived, other._coarse = self._derived, None if self._coarse is None else self._coarse.copy()
         return other
 
@@ -254,7 +253,7 @@ class Readout:
         other._derived = other._compared = other._coarse = None
         return other
 
-    def hold_before(self, changes: Sequence[Change]) -> None:
+    def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
         absent: dict[str, list[Change]] = {}
         for change in changes:
@@ -263,7 +262,7 @@ class Readout:
                 absent.setdefault(change[0], []).append(change)
         for name, pending in absent.items():
             later = sum((sign * rows.sum(axis=0, dtype=np.int64) for _, rows, sign in pending), np.int64(0))
-            total, place = self._statistics.sums(self.scale, [name]) - later, self.places[name]
+            total, place = self.statistics.sums(self.scale, [name]) - later, self.places[name]
             self._hold([place], _class_means(self.counts[[place]], total, self.origin))
 
     def _follow(self, changed: Mapping[str, FloatArray], sign: int) -> None:
@@ -408,7 +407,7 @@ class Readout:
         for first in range(0, len(absent), EAGER):
             places = absent[first : first + EAGER]
             block = [self.names[place] for place in places]
-            counts, sums = self._statistics.counts(self.scale, block), self._statistics.sums(self.scale, block)
+            counts, sums = self.statistics.counts(self.scale, block), self.statistics.sums(self.scale, block)
             own = _class_means(counts, sums, self.origin)
             means[places], sizes[places] = own, np.einsum("hd,hd->h", own, self.system.solve(own))
         return Coarse(means, sizes)

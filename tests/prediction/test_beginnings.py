@@ -1,6 +1,8 @@
 """Touches left out, and what is said of their beginnings: as if they had never been observed."""
 
 import copy
+import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -101,3 +103,39 @@ def test_touches_with_gaps_are_left_out_too():
     early = early_answers(learner.model(), extractor)
     assert np.isfinite(early.fitted.chances).all()
     assert learner.predict(TOUCHES[0][1].readings[:12]).material in NAMES
+
+
+def test_measurements_of_copies_let_the_earlier_ones_go():
+    """A model that is followed while it is held is copied each time, for as long as a memory lasts."""
+    first = newest = Measurement()
+    early = first.of(None, 4, lambda _: None)
+    gone = weakref.ref(first)
+    for _ in range(3):
+        newest = Measurement(newest)
+        assert newest.found == Beginnings(early, 4)
+        assert newest.of(None, 5, lambda _: pytest.fail("measured again")) is early
+    del first
+    assert gone() is None
+    assert newest.found == Beginnings(early, 4)
+
+
+def test_a_measurement_that_is_under_way_is_waited_for():
+    first, under_way, go_on, said = Measurement(), threading.Event(), threading.Event(), []
+
+    def measures(_):
+        under_way.set()
+        assert go_on.wait(60)
+
+    asking = threading.Thread(target=lambda: said.append(first.of(None, 4, measures)))
+    asking.start()
+    assert under_way.wait(60)
+    second, again = Measurement(first), []
+    other = threading.Thread(target=lambda: said.append(second.of(None, 5, again.append)))
+    other.start()
+    other.join(0.2)  # enough for it to measure, if it did
+    go_on.set()
+    for thread in (asking, other):
+        thread.join(60)
+    assert said == [None, None]
+    assert not again
+    assert second.found == Beginnings(None, 4)

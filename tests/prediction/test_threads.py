@@ -147,37 +147,118 @@ class SampleOfTwo(TouchSample):
         super().__init__(capacity)
 
 
-def test_of_many_materials_too_a_live_touch_is_answered_as_it_was_when_it_began(monkeypatch):
+MANY = "pqrstu"
+
+
+def of_many(name, seed):
+    return 0.15 * MANY.index(name) + 0.1 * touch("n", seed)
+
+
+@pytest.fixture
+def many(monkeypatch, tmp_path):
     """Beyond a thousand, materials are read from the memory when they are asked for; here beyond two."""
     for module in ("prediction.model", "readouts.readout"):
         monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 2)
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SampleOfTwo)
-    learner, others = TactileLearner(sensor=PAD, embedding=SMALL), "pqrstu"
+    with TactileLearner.open(tmp_path / "many", sensor=PAD, embedding=SMALL) as learner:
+        for seed in range(3):
+            for name in MANY:
+                learner.observe(name, of_many(name, seed), source=f"{name}.csv")
+        learner.settle()
+        yield learner
 
-    def other(name, seed):
-        return 0.15 * others.index(name) + 0.1 * touch("n", seed)
 
-    for seed in range(3):
-        for name in others:
-            learner.observe(name, other(name, seed))
-    learner.settle()
-    before = copy.deepcopy(learner)
-    with learner.live(contact="manual", risk=1e-12) as live:
-        live.begin()
-        readout = min(live._under_way.frozen.model.readouts.items())[1]
-        changed = [name for place, name in enumerate(readout.names) if place not in readout._held]
-        assert changed
-        for name in changed:
-            for seed in range(4):
-                learner.observe(name, touch("n", 10 + seed))
-        learner.predict(other("p", 90))
-        learner.observe(changed[0], other("p", 91))
-        live.push(other(changed[0], 9)[:30])
-        prediction = live.end().prediction
-    expected = before.predict(live.touch)
+def read_later(model):
+    """The materials that a model has yet to read."""
+    readout = min(model.readouts.items())[1]
+    return [name for place, name in enumerate(readout.names) if place not in readout._held]
+
+
+def require_alike(prediction, expected):
     assert dict(prediction.ranking) == pytest.approx(dict(expected.ranking), rel=1e-9)  # solved for in another order
     assert prediction.novelty == pytest.approx(expected.novelty, rel=1e-9)
     assert prediction.typicality == expected.typicality
+
+
+def observing(learner, names, tmp_path):
+    for name in names:
+        for seed in range(4):
+            learner.observe(name, touch("n", 10 + seed))
+    learner.predict(of_many("p", 90))
+    learner.observe(names[0], of_many("p", 91))
+
+
+def merging(learner, names, tmp_path, compacted=False):
+    with TactileLearner.open(tmp_path / "other", sensor=PAD, embedding=SMALL) as other:
+        for name in names:
+            for seed in range(4):
+                other.observe(name, touch("n", 10 + seed))
+        if compacted:
+            other.compact(keep=0)
+    learner.merge(tmp_path / "other", shared="twice")
+
+
+def forgetting(learner, names, tmp_path):
+    for name in names:
+        learner.forget(name)
+
+
+def retracting(learner, names, tmp_path):
+    for one in learner.observations():
+        if one.material in names and one.sequence > len(MANY):
+            learner.retract(one.sequence)
+
+
+def relabelling(learner, names, tmp_path):
+    for one in learner.observations():
+        if one.material in names and one.sequence > len(MANY):
+            learner.relabel(one.sequence, "p")
+
+
+@pytest.mark.parametrize(
+    ("change", "most_added"),
+    [(observing, 1024), (merging, 1024), (forgetting, 2), (retracting, 2), (relabelling, 2)],
+)
+def test_of_many_materials_too_a_live_touch_is_answered_as_it_was_when_it_began(
+    many, monkeypatch, tmp_path, change, most_added
+):
+    monkeypatch.setattr("scroll_tactile.memory.ledger.MOST_ADDED", most_added)
+    before = copy.deepcopy(many)
+    with many.live(contact="manual", risk=1e-12) as live:
+        live.begin()
+        changed = read_later(live._under_way.frozen.model)
+        assert len(changed) > 1
+        change(many, changed, tmp_path)
+        live.push(of_many(changed[0], 9)[:30])
+        prediction = live.end().prediction
+    require_alike(prediction, before.predict(live.touch))
+
+
+def test_of_many_materials_a_reader_answers_a_live_touch_as_it_was_when_it_began(many, tmp_path):
+    with TactileLearner.open(many.path, mode="read") as reader:
+        before = copy.deepcopy(reader)
+        with reader.live(contact="manual", risk=1e-12) as live:
+            live.begin()
+            changed = read_later(live._under_way.frozen.model)
+            observing(many, changed, tmp_path)
+            merging(many, changed, tmp_path, compacted=True)  # one row, in which a whole memory came
+            assert reader.refresh()
+            live.push(of_many(changed[0], 9)[:30])
+            prediction = live.end().prediction
+        require_alike(prediction, before.predict(live.touch))
+
+
+def test_a_model_of_many_materials_has_no_later_touches(many, tmp_path):
+    model = many.model()
+    expected, changed = many.model(), read_later(model)
+    asked = {
+        scale: expected.readouts[scale].linear([*changed], "lda")[0].tobytes() for scale in sorted(expected.readouts)
+    }
+    observing(many, changed, tmp_path)
+    forgetting(many, changed[:1], tmp_path)
+    assert asked == {
+        scale: model.readouts[scale].linear([*changed], "lda")[0].tobytes() for scale in sorted(model.readouts)
+    }
 
 
 @pytest.mark.parametrize("readings", [50, 12])

@@ -231,11 +231,12 @@ class LogReader:
                     self.place = Place.behind(self._last)
                 else:
                     return
-                yield batch
+                if batch or damage is None:
+                    yield batch
             raise damage
 
     def _next_batch(self) -> tuple[list[Frame], DamageError | None]:
-        """Return the next batch with its commit frame, nothing where the log ends; or what is before damage, and that."""
+        """Return the next batch with its commit frame, nothing where the log ends; or what is before damage, and it."""
         damage: DamageError | None = None
         for attempt in range(ATTEMPTS):
             batch, torn = self._scan()

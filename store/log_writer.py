@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from store.exceptions import FULL, RecordError, StoreError, reported
+from store.exceptions import FULL, RecordError, StoreClosedError, StoreError, reported
 from store.files import CAREFULLY, remove_tree, sync_file, sync_folder, sync_open
 from store.framing import (
     COMMIT,
@@ -38,8 +38,9 @@ NO_ROOM = FULL | {errno.EFBIG}
 
 
 class LogWriter(LogReader):
-    """The one writer of a log: whoever makes it holds the writer's lock. Methods may be called from any thread.
+    """The one writer of a log: whoever makes it holds the writer's lock.
 
+    Methods may be called from any thread, but a batch is one thread's at a time; and not in a forked child.
     place: as of a reader. What is behind the last commit, left by a power cut or a kill, is removed, and what is
     before it is made durable. Raises as LogReader does, DamageError also for damage behind `place`.
     """
@@ -48,7 +49,7 @@ class LogWriter(LogReader):
 
     def __init__(self, path: Path, *, place: Place | None = None) -> None:
         super().__init__(path, place=place)
-        self._writing = threading.RLock()
+        self._writing, self._process = threading.RLock(), os.getpid()
         try:
             for _ in self.refresh():
                 pass
@@ -71,7 +72,8 @@ class LogWriter(LogReader):
 
     def _has_tail(self) -> bool:
         """Whether anything but zeros is behind the last commit."""
-        return any(any(self._file.read(at, PART)) for at in range(self.place.offset, self._allocated, PART))
+        parts = (self._file.read(at, PART) for at in range(self.place.offset, self._allocated, PART))
+        return any(part.count(0) < len(part) for part in parts)
 
     def _settle(self) -> None:
         """Cut off what is behind the last commit, where something may be; raises OSError."""
@@ -89,6 +91,8 @@ class LogWriter(LogReader):
         if not COMMIT < kind < 2**32 or len(payload) > LARGEST_PAYLOAD:
             raise RecordError(f"a frame of kind {kind} and {len(payload)} bytes cannot be kept")
         with self._writing, reported(self.path, "appending to the log"):
+            if os.getpid() != self._process:
+                raise StoreClosedError(f"{self.path} was opened by process {self._process}, of which this is a fork")
             if self._next == self.place:
                 self._settle()  # a batch that could not be taken back
             try:
@@ -173,10 +177,10 @@ class LogWriter(LogReader):
 
     def close(self) -> None:
         """Forget what is staged, give the room ahead back and close the file; a second call does nothing."""
-        with self._writing, suppress(StoreError):
-            if self._next != self.place:
-                self.rollback()
-            with suppress(OSError):
+        with self._writing, suppress(StoreError, OSError):
+            # A fork knows nothing of what its parent has written since.
+            if os.getpid() == self._process:
+                self._begin_batch()
                 os.ftruncate(self._file.descriptor, self.place.offset)
         super().close()
 

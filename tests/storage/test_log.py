@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from logs import BATCHES, HEADER, KIND, append, build, ends, names, payload, read, rest
 
+import store.log
+import store.log_writer
 from store import DamageError, RecordError, StoreClosedError, StoreError, VersionError
 from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
-from store.log import LogReader, Place
+from store.log import PART, LogReader, Place
 from store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
 from store.records import payload_digest
 
@@ -29,7 +31,7 @@ def before(frames, index):
     """What can be kept where the frame of this index is damaged: the batches before it, and of its own what it has."""
     batch = frames[index][0]
     within = sum(number == batch for number, _, _ in frames[:index])
-    return [*BATCHES[:batch], *([BATCHES[batch][:within]] if batch < len(BATCHES) else [])]
+    return [*BATCHES[:batch], *([BATCHES[batch][:within]] if within else [])]
 
 
 def batches_and_damage(path):
@@ -128,7 +130,7 @@ def test_a_frame_taken_out_doubled_or_swapped_with_the_next_is_damage(whole, tmp
         path.write_bytes(ahead + frame + frame + behind)
         found, damage = batches_and_damage(path)
         # Of the last, all is there: only what is behind it should not be.
-        assert found == [*BATCHES, []] if is_last else found == before(frames, index + 1)
+        assert found == (BATCHES if is_last else before(frames, index + 1))
         assert (damage.frame, damage.offset) == (index + 2, end)
         if not is_last:
             following = data[end : frames[index + 1][2]]
@@ -151,8 +153,60 @@ def test_two_logs_spliced_do_not_hold(whole, tmp_path):
         path.write_bytes(mine[:first] + theirs[first:end] + mine[end:])
         found, damage = batches_and_damage(path)
         assert found == before(frames, frames.index((batch, first, end))) and damage.offset == first
+        with LogReader(path) as log, pytest.raises(DamageError, match="holds no frame"):
+            log.read(first, end - first - FRAME_BYTES)
     path.write_bytes(theirs[:begin] + mine[begin:])
     assert batches_and_damage(path) == ([], None)
+
+
+def test_two_histories_of_one_log_spliced_are_damage(whole, tmp_path):
+    """A copy was gone on with: its frames have the same identity, numbers, batches and sizes."""
+    paths = [Path(shutil.copy(whole, tmp_path / name)) for name in ("mine", "theirs")]
+    for path, byte in zip(paths, (b"m", b"t"), strict=True):
+        with LogWriter(path) as log:
+            for _ in range(3):
+                log.append(KIND, byte * 50)
+    mine, theirs = (path.read_bytes() for path in paths)
+    _, frames, commits = ends(paths[0])
+    path = tmp_path / "spliced"
+    for commit in commits[len(BATCHES) : -1]:
+        path.write_bytes(mine[:commit] + theirs[commit:])
+        found, damage = batches_and_damage(path)
+        number = 1 + sum(end <= commit for _, _, end in frames)
+        assert found == read(paths[0])[: commits.index(commit) + 1]
+        assert (damage.offset, damage.frame) == (commit, number)
+
+
+def test_damage_is_proven_by_a_frame_wherever_it_begins(tmp_path):
+    """The search reads in parts: a frame may begin in one and end in the next."""
+    path = tmp_path / "log"
+    for beside in range(-100, 20, 7):
+        size = PART - len(HEADER) - 2 * FRAME_BYTES + beside
+        build(path, [[bytes(size)], [b"x"]])
+        data = bytearray(path.read_bytes()[: -FRAME_BYTES - 1])  # of the second batch its first 88 bytes are left
+        data[FRAME_BYTES + len(HEADER) + 60] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(DamageError, match="frame 1 is not"):
+            read(path)
+
+
+def test_a_new_log_is_synced_before_its_name_and_its_name_before_it_counts(tmp_path, monkeypatch):
+    calls = []
+    replace = Path.replace
+    for name in ("sync_file", "sync_folder"):
+        monkeypatch.setattr(store.log_writer, name, lambda path, name=name: calls.append((name, path.name)))
+    monkeypatch.setattr(Path, "replace", lambda path, to: calls.append(("rename", to.name)) or replace(path, to))
+    create_log(tmp_path / "log", b"")
+    assert calls == [("sync_file", "log.new"), ("rename", "log"), ("sync_folder", tmp_path.name)]
+
+
+def test_what_an_opening_finds_is_durable_before_anything_follows_it(copy, monkeypatch):
+    calls, sync = [], os.fsync
+    copy.write_bytes(copy.read_bytes() + b"torn")
+    size = copy.stat().st_size
+    monkeypatch.setattr(os, "fsync", lambda file: calls.append(os.fstat(file).st_size) or sync(file))
+    with LogWriter(copy):
+        assert calls == [size - 4, size - 4]  # the cut, and what was there before
 
 
 def test_reading_goes_on_behind_damage_where_it_is_told_to(copy):
@@ -174,6 +228,38 @@ def test_reading_goes_on_behind_damage_where_it_is_told_to(copy):
                 log.resume()
     assert named == [1, 4, 10]
     assert found == [payload(index) for index in (1, 3, 4, 5, 7)]
+
+
+@pytest.mark.parametrize(("frame", "lost"), [(0, 0), (2, 1), (7, 4), (8, 5), (9, 6)])
+@pytest.mark.parametrize("inserted", [False, True])
+def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
+    _, frames, _ = ends(copy)
+    begin, data = frames[frame][1], copy.read_bytes()
+    # Something put in takes nothing away; a flipped bit takes its row.
+    between = b"?" * 200 if inserted else bytes([data[begin] ^ 1])
+    copy.write_bytes(data[:begin] + between + data[begin + (not inserted) :])
+    found = []
+    with LogReader(copy) as log:
+        with pytest.raises(DamageError):
+            for batch in log.refresh():
+                found += [log.read(each.offset, each.size)[1] for each in batch]
+        log.resume()
+        found += [each for batch in rest(log) for each in batch]
+    assert found == [payload(index) for index in range(8) if inserted or index != lost]
+
+
+def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy):
+    with LogWriter(copy) as writer, LogReader(copy) as log:
+        frames = log._frames
+
+        def later(offset):
+            if writer.place.number == 14:
+                append(writer, [b"1"])
+                append(writer, [b"2"])
+            return frames(offset)
+
+        log._frames = later
+        assert rest(log) == [*BATCHES, [b"1"], [b"2"]]
 
 
 def test_a_batch_without_its_commit_is_not_there_and_the_next_writer_removes_it(copy):
@@ -383,8 +469,6 @@ def test_marks_without_end_are_read_once(whole, tmp_path, monkeypatch):
         assert mark.endswith(log.identity)
     path.write_bytes(whole.read_bytes() + mark * 40_000)
     calls = []
-    import store.log
-
     monkeypatch.setattr(store.log, "read_frame", lambda *given: calls.append(1))
     with LogReader.__new__(LogReader) as log:
         log.path, log._file = path, store.log.LogFile(path, write=False)

@@ -12,7 +12,7 @@ import threading
 import pytest
 from logs import BATCHES, KIND, append, build, names, read, rest
 
-from store import StoreError, StoreFullError
+from store import StoreClosedError, StoreError, StoreFullError
 from store.log import LogReader
 from store.log_writer import AHEAD, LogWriter, create_log
 
@@ -127,6 +127,25 @@ def test_a_reader_learns_that_what_it_read_was_taken_back(tmp_path, monkeypatch)
             rest(beside)
         with LogReader(path) as anew:
             assert rest(anew) == [*BATCHES, [b"in its place"]]
+
+
+def test_a_fork_cannot_write_and_cuts_nothing_off(tmp_path):
+    path = build(tmp_path / "log", [])
+    with LogWriter(path) as log:
+        command_in, command_out = os.pipe()
+        if (child := os.fork()) == 0:
+            os.read(command_in, 1)  # the parent has gone on
+            try:
+                log.append(KIND, b"of the child")
+            except StoreClosedError:
+                log.close()
+                os._exit(0)
+            os._exit(1)
+        log.append(KIND, b"of the parent")
+        os.write(command_out, b".")
+        assert os.waitpid(child, 0)[1] == 0
+        log.append(KIND, b"later")
+    assert read(path) == [[b"of the parent"], [b"later"]]
 
 
 def test_short_writes_are_gone_on_with(tmp_path, monkeypatch):

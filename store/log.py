@@ -18,7 +18,7 @@ from store.encoding import RATIO, SPARE
 from store.exceptions import DamageError, StoreClosedError, StoreError, VersionError, reported
 from store.files import open_regular
 from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
-from store.records import payload_digest
+from store.records import LARGEST_NUMBER, payload_digest
 
 __all__ = ["LogFile", "LogReader", "Place"]
 
@@ -200,7 +200,8 @@ class LogReader:
         offset = place.offset - FRAME_BYTES
         is_inside = 0 < offset < self._file.size()
         frame = read_frame(self._file.read(offset, FRAME_BYTES), offset) if is_inside else None
-        if frame is None or not self._is_ours(frame) or frame.kind != COMMIT or Place.behind(frame) != place:
+        ours = frame is not None and self._is_ours(frame) and frame.kind == COMMIT and frame.number < LARGEST_NUMBER
+        if frame is None or not ours or Place.behind(frame) != place:
             raise self._damage(f"holds no batch that ends with frame {place.number - 1} there", offset, place.number)
         return frame
 

@@ -455,6 +455,14 @@ def test_a_forged_number_is_damage(whole, tmp_path, frame):
     assert damage is not None
 
 
+def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_path):
+    path = tmp_path / "log"
+    path.write_bytes(forged(whole, (2**64 - 1, 2**64 - 1, COMMIT, 0, b"")))
+    place = Place(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
+    with pytest.raises(DamageError, match="holds no batch"):
+        LogWriter(path, place=place)
+
+
 @pytest.mark.parametrize("frame", [(14, 14, 0, 1, b"x"), (14, 14, COMMIT, 1, b"x")])
 def test_a_second_header_and_a_commit_with_a_payload_hold_nothing(whole, tmp_path, frame):
     path = tmp_path / "log"

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from shutil import disk_usage
 
 from store.exceptions import FULL, RecordError, StoreClosedError, StoreError, reported
 from store.files import CAREFULLY, remove_tree, sync_file, sync_folder, sync_open
@@ -30,8 +31,10 @@ __all__ = ["LogWriter", "create_log"]
 logger = logging.getLogger(__name__)
 
 # Zeros are written ahead: to write over them changes nothing but bytes, and fdatasync has no file system's journal to
-# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.)
+# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.) Of a disk that is nearly
+# full the rest is for others.
 AHEAD = 2**20
+SPARE_ROOM = 16 * AHEAD
 LARGEST_STAGED = 2**22  # bytes that wait in memory for their commit
 TOGETHER = 4096  # frames of a batch in a log that replaces another
 NO_ROOM = FULL | {errno.EFBIG}
@@ -115,7 +118,11 @@ class LogWriter(LogReader):
         """Write what is staged, with one call, and zeros behind it where the file ends."""
         begin, end = self._written, self._written + len(self._staged)
         self._settled = False  # until it is committed
-        ahead = -(-end // AHEAD) * AHEAD if end > self._allocated else end
+        ahead = end
+        # Asked of the open file, whose folder may have been moved; Windows takes a path alone.
+        where = self.path.parent if os.name == "nt" else self._file.descriptor
+        if end > self._allocated and disk_usage(where).free > SPARE_ROOM:
+            ahead = -(-end // AHEAD) * AHEAD
         try:
             self._file.write(begin, self._staged + bytes(ahead - end))
         except OSError as error:

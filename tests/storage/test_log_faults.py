@@ -177,6 +177,14 @@ def test_a_disk_that_fills_keeps_what_was_acknowledged_and_goes_on_when_there_is
     assert read(path) == found and names(small_disk) == ["log"]
 
 
+def test_what_is_left_of_a_nearly_full_disk_is_for_others(small_disk):
+    path = build(small_disk / "log", [])
+    with LogWriter(path) as log:
+        log.append(KIND, b"x" * 100)
+        assert path.stat().st_size < 1000
+        (small_disk / "other").write_bytes(bytes(500_000))
+
+
 def test_every_size_at_which_a_file_may_end(tmp_path):
     """The system refuses the bytes behind a limit, after it has taken those before it."""
     path = build(tmp_path / "log")

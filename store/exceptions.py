@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "FULL",
     "SQLITE_ERRORS",
     "CompactedError",
     "DamageError",
@@ -72,14 +73,25 @@ class DamageError(StoreError):
     """Bytes on the disk are not those that were written.
 
     `path` is the damaged file or array folder. `sequence` is the damaged row of the journal, if it is one:
-    `records(after=sequence)` continues behind it. `check_store` names all that is damaged, and
-    `repair_store` keeps what verifies.
+    `records(after=sequence)` continues behind it. `offset` and `frame` are the byte and the number of the first
+    damaged frame of a log, if it is one. `check_store` names all that is damaged, and `repair_store` keeps what
+    verifies.
     """
 
-    def __init__(self, message: str, *, path: Path, sequence: int | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: Path,
+        sequence: int | None = None,
+        offset: int | None = None,
+        frame: int | None = None,
+    ) -> None:
         super().__init__(message)
         self.path = path
         self.sequence = sequence
+        self.offset = offset
+        self.frame = frame
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A worker's error reaches whoever waits for it."""

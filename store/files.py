@@ -25,6 +25,7 @@ __all__ = [
     "file_size",
     "is_real_folder",
     "is_there",
+    "open_regular",
     "read_regular",
     "remove_tree",
     "require_room",
@@ -32,6 +33,7 @@ __all__ = [
     "store_folder",
     "sync_file",
     "sync_folder",
+    "sync_open",
     "sync_tree",
     "tree_size",
 ]
@@ -56,14 +58,20 @@ def sync_folder(path: Path) -> None:
 def _sync(path: Path, flags: int) -> None:
     descriptor = os.open(path, flags)
     try:
-        # On a Mac fsync stops at the drive's cache; some file systems there refuse the stronger call.
-        if FULL_SYNC is not None:
-            with suppress(OSError):
-                fcntl.fcntl(descriptor, FULL_SYNC)
-                return
-        os.fsync(descriptor)
+        sync_open(descriptor)
     finally:
         os.close(descriptor)
+
+
+def sync_open(descriptor: int, *, data_only: bool = False) -> None:
+    """Return when an open file's bytes are on the disk, and where not `data_only` its times, too; raises OSError."""
+    # On a Mac fsync stops at the drive's cache; some file systems there refuse the stronger call.
+    if FULL_SYNC is not None:
+        with suppress(OSError):
+            fcntl.fcntl(descriptor, FULL_SYNC)
+            return
+    # Windows has no fdatasync.
+    (getattr(os, "fdatasync", os.fsync) if data_only else os.fsync)(descriptor)
 
 
 def sync_tree(path: Path) -> None:
@@ -135,15 +143,23 @@ def copy_regular(path: Path, target: Path, limit: int) -> None:
 
 @contextmanager
 def _regular(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
+    with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise DamageError(f"{path} has {size} bytes; at most {limit} are read there", path=path)
+        yield file, size
+
+
+def open_regular(path: Path, flags: int) -> int:
+    """Return the descriptor of a regular file. Raises DamageError for a link and for anything else, and OSError."""
     # Before it is opened: to open a device can already do something.
     if not stat.S_ISREG(path.lstat().st_mode):
         raise DamageError(f"{path} is no regular file", path=path)
-    descriptor = os.open(path, os.O_RDONLY | CAREFULLY)
-    with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_size > limit:
-            raise DamageError(f"{path} has {found.st_size} bytes; at most {limit} are read there", path=path)
-        yield file, found.st_size
+    descriptor = os.open(path, flags | CAREFULLY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise DamageError(f"{path} is no regular file", path=path)
+    return descriptor
 
 
 def require_room(folder: Path, *files: Path) -> None:

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
+from examples.benchmarks.appending import run_appending, show_appending
 from examples.benchmarks.buffers import run_buffers
 from examples.benchmarks.fleet import run_fleet
 from examples.benchmarks.interleaved import run_interleaved
@@ -212,6 +214,22 @@ def interleaved(
             note=lambda what: progress(what, 0, 1),
         )
     show_interleaved(result)
+    _written(context, json, result)
+
+
+@app.command()
+def log(
+    context: typer.Context,
+    rounds: Annotated[int, typer.Option(min=1, help="Of 240 rows, each way in its turn.")] = 40,
+    folder: Annotated[Path | None, typer.Option(help="On the disk to measure; the system's temporary one.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the rows.")] = 0,
+    json: Json = None,
+) -> None:
+    """Time a durable row of 4.3 kB, and count the bytes it makes the disk write: the log beside SQLite's journal."""
+    require_folders(json)
+    with progress_bar() as progress, TemporaryDirectory(dir=folder) as scratch:
+        result = run_appending(Path(scratch), rounds=rounds, seed=seed, note=lambda what: progress(what, 0, 1))
+    show_appending(result)
     _written(context, json, result)
 
 

@@ -1,0 +1,121 @@
+"""What an acknowledged row costs: the append-only log beside SQLite's journal, in turns on one disk.
+
+Beside them stands the least that a durable row can cost: its bytes written to the end of a file, and fdatasync. Bytes
+are those that the disk counts, the file system's own journal among them, so other programs must leave the disk alone:
+the median over rounds passes over what they do now and then.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from examples.benchmarks.timing import Timing, circumstances, timed
+from scroll_tactile.cli.terminal import console
+from store.journal import Journal
+from store.log_writer import LogWriter, create_log
+from store.row_encoding import ROW, encode_row
+from store.schema import JOURNAL_FILE, create_journal
+
+__all__ = ["run_appending", "show_appending"]
+
+ROW_BYTES = 4300  # of a touch with its readings, BioTac
+ROWS = 240  # in a round: about one MiB, so that each round has one write of zeros ahead
+BLOCK = 512  # bytes, of the disk's counters
+WRITTEN = 6  # the place of blocks written among them
+
+Append = Callable[[int, bytes], object]
+
+
+def run_appending(folder: Path, *, rounds: int, seed: int, note: Callable[[str], None]) -> dict[str, Any]:
+    """Append rows in rounds, each way in its turn, every other round in the other order."""
+    rng = np.random.default_rng(seed)
+    result: dict[str, Any] = {"bench": "log", **circumstances(seed), "row_bytes": ROW_BYTES, "rows": rounds * ROWS}
+    with ExitStack() as opened:
+        ways = _ways(folder, opened)
+        seconds: dict[str, list[float]] = {name: [] for name in ways}
+        written: dict[str, list[float]] = {name: [] for name in ways}
+        sequence = 0
+        for number in range(rounds):
+            note(f"round {number + 1} of {rounds}")
+            payloads = [rng.bytes(ROW_BYTES) for _ in range(ROWS)]
+            for name in list(ways) if number % 2 else reversed(list(ways)):
+                before = _bytes_written(folder)
+                for index, payload in enumerate(payloads, sequence + 1):
+                    seconds[name].append(_seconds(ways[name], index, payload))
+                after = _bytes_written(folder)
+                if before is not None and after is not None:
+                    written[name].append((after - before) / ROWS)
+            sequence += ROWS
+    return result | {"records": _records(seconds, written)}
+
+
+def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
+    create_journal(folder, "{}")
+    journal = Journal(folder / JOURNAL_FILE, write=True)
+    opened.callback(journal.close)
+    create_log(folder / "log", b"{}")
+    log = opened.enter_context(LogWriter(folder / "log"))
+    bare = os.open(folder / "bare", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    opened.callback(os.close, bare)
+    about = ("add", "material", bytes(32), time.time(), "{}")
+
+    def to_bare(_: int, payload: bytes) -> None:
+        os.write(bare, payload)
+        os.fdatasync(bare)
+
+    return {
+        "SQLite, WAL, synchronous=FULL": lambda _, payload: journal.insert(*about, payload),
+        "the log": lambda sequence, payload: log.append(
+            ROW, encode_row(sequence, *about, payload=payload, size=len(payload))
+        ),
+        "a bare file that grows, fdatasync": to_bare,
+    }
+
+
+def _seconds(append: Append, sequence: int, payload: bytes) -> float:
+    return timed(lambda: append(sequence, payload))
+
+
+def _bytes_written(folder: Path) -> int | None:
+    """The bytes that the folder's disk has written so far; None where the system does not count them."""
+    device = folder.stat().st_dev
+    counters = Path(f"/sys/dev/block/{os.major(device)}:{os.minor(device)}/stat")
+    try:
+        return int(counters.read_text(encoding="ascii").split()[WRITTEN]) * BLOCK
+    except OSError:
+        return None
+
+
+def _records(seconds: dict[str, list[float]], written: dict[str, list[float]]) -> list[dict[str, Any]]:
+    timings = {name: Timing.of(taken) for name, taken in seconds.items()}
+    first = next(iter(timings.values()))
+    return [
+        {
+            "case": name,
+            **timing.record(),
+            "times_sqlite": timing.median / first.median,
+            "p99_times_sqlite": timing.p99 / first.p99,
+            "written_bytes": statistics.median(written[name]) if written[name] else None,
+        }
+        for name, timing in timings.items()
+    ]
+
+
+def show_appending(result: dict[str, Any]) -> None:
+    """Print what a row costs each way."""
+    table = Table("a row of 4.3 kB", "ms, median / p99", "times SQLite's", "p99, times", "written, kB")
+    for record in result["records"]:
+        times = f"{record['median_milliseconds']:.2f} / {record['p99_milliseconds']:.2f}"
+        kilobytes = "" if record["written_bytes"] is None else f"{record['written_bytes'] / 1e3:.1f}"
+        ratios = f"{record['times_sqlite']:.2f}", f"{record['p99_times_sqlite']:.2f}"
+        table.add_row(record["case"], times, *ratios, kilobytes)
+    console().print(table)

@@ -1,0 +1,349 @@
+"""The log read: whole batches of frames in order, and single frames by where they are; nothing is ever written.
+
+A batch is written once the one before it is durable. So behind a frame that does not verify there may be, after a power
+cut, others of its own batch and nothing else; any other frame of the log there proves that a durable one was damaged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from store.encoding import RATIO, SPARE
+from store.exceptions import DamageError, StoreClosedError, StoreError, VersionError, reported
+from store.files import open_regular
+from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
+from store.records import LARGEST_NUMBER, payload_digest
+
+__all__ = ["LogFile", "LogReader", "Place"]
+
+PART = 2**18  # bytes that are read at once
+# A window older than the file, what a writer is just writing, and damage look alike the first time, and not the third.
+ATTEMPTS = 3
+BLOCK = 512  # bytes, of st_blocks
+
+
+class Place(NamedTuple):
+    """Where a log's next frame belongs: its offset and number, its batch's first number, the checksum before it."""
+
+    offset: int
+    number: int
+    batch: int
+    previous: bytes
+
+    @classmethod
+    def behind(cls, frame: Frame) -> Place:
+        """Return the place of the frame behind this one, in a batch of its own where this one ends a batch."""
+        number = frame.number + 1
+        batch = number if frame.kind in (HEADER, COMMIT) else frame.batch
+        return cls(frame.end, number, batch, frame.checksum)
+
+    def holds(self, frame: Frame) -> bool:
+        """Return whether the frame is the one that belongs here."""
+        belongs = (frame.offset, frame.number, frame.batch, frame.previous) == self
+        largest = 0 if frame.kind == COMMIT else LARGEST_PAYLOAD
+        return belongs and frame.kind != HEADER and frame.size <= largest
+
+    def is_before(self, frame: Frame) -> bool:
+        """Return whether reading can go on with the frame, where none belongs here."""
+        return frame.number > self.number or (frame.number == self.number and frame.offset > self.offset)
+
+    def can_be_torn_before(self, frame: Frame) -> bool:
+        """Return whether a power cut while the batch of this place was written can have left the frame."""
+        if frame.number <= self.number:
+            return (frame.offset, frame.number, frame.batch, frame.previous) == self
+        return frame.batch == self.batch and frame.offset - self.offset >= FRAME_BYTES * (frame.number - self.number)
+
+
+class LogFile:
+    """A regular file, read and written at offsets from any thread; raises OSError, DamageError for anything else."""
+
+    def __init__(self, path: Path, *, write: bool) -> None:
+        self.path = path
+        self._guard = threading.Lock()
+        self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
+
+    @property
+    def descriptor(self) -> int:
+        """The open file's number. Raises StoreClosedError."""
+        if self._descriptor < 0:
+            raise StoreClosedError(f"the log {self.path} is closed")
+        return self._descriptor
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return so many bytes at an offset, fewer where the file ends."""
+        with self._guard:
+            os.lseek(self.descriptor, offset, os.SEEK_SET)
+            data = part = os.read(self.descriptor, size)
+            while part and len(data) < size:
+                part = os.read(self.descriptor, size - len(data))
+                data += part
+            return data
+
+    def write(self, offset: int, data: bytes | bytearray) -> None:
+        """Write all bytes at an offset, in one call unless the system takes fewer."""
+        with self._guard, memoryview(data) as rest:
+            os.lseek(self.descriptor, offset, os.SEEK_SET)
+            done = 0
+            while done < len(rest):
+                done += os.write(self.descriptor, rest[done:])
+
+    def size(self) -> int:
+        """Return the size in bytes. Raises DamageError where next to nothing of it is on the disk."""
+        found = os.fstat(self.descriptor)
+        stored = getattr(found, "st_blocks", 0) * BLOCK  # 0 also where the file system does not tell
+        if stored and found.st_size > SPARE + RATIO * stored:
+            # No log is ever so: its end is filled with zeros that are written.
+            raise DamageError(
+                f"{self.path} says that it has {found.st_size} bytes, and {stored} are on the disk: nothing of it was "
+                "read. In a folder that comes from elsewhere trust nothing",
+                path=self.path,
+            )
+        return found.st_size
+
+    def is_at(self, path: Path) -> bool:
+        """Return whether `path` still names this file."""
+        try:
+            return os.path.samestat(path.lstat(), os.fstat(self.descriptor))
+        except FileNotFoundError:
+            return False
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        with self._guard:
+            descriptor, self._descriptor = self._descriptor, -1
+            if descriptor >= 0:
+                os.close(descriptor)
+
+
+class _Window:
+    """The part of a file that is being read, so that small frames need no call each."""
+
+    def __init__(self, file: LogFile) -> None:
+        self._file = file
+        self.drop()
+
+    def drop(self) -> None:
+        """Forget what was read: the file may have changed since."""
+        self._start, self._data = 0, b""
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return at most PART bytes at an offset, fewer where the file ends."""
+        begin = offset - self._start
+        if not 0 <= begin <= begin + size <= len(self._data):
+            self._start, begin = offset, 0
+            self._data = self._file.read(offset, PART)
+        return self._data[begin : begin + size]
+
+    def digest(self, offset: int, size: int) -> bytes:
+        """Return the digest of so many bytes at an offset, or of those up to the end of the file."""
+        digest = hashlib.blake2b(digest_size=16)
+        while size > 0 and (part := self.read(offset, min(size, PART))):
+            digest.update(part)
+            offset, size = offset + len(part), size - len(part)
+        return digest.digest()
+
+
+class LogReader:
+    """An open log. It needs no lock and leaves every byte as it is; a writer may be at work.
+
+    `header` is the payload of the log's first frame, the caller's. `place` is behind the last batch that was read:
+    kept elsewhere, and given again, it saves reading what is before it. A batch can be read an instant before it is
+    durable. One thread at a time may refresh; any may read.
+
+    Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
+    """
+
+    WRITES = False
+
+    def __init__(self, path: Path, *, place: Place | None = None) -> None:
+        self.path = path
+        with reported(path, "opening the log"):
+            self._file = LogFile(path, write=self.WRITES)
+            try:
+                self._window = _Window(self._file)
+                self._torn: Place | None = None
+                self._proved: Frame | None = None
+                self._last = self._first = self._read_header()
+                self.place = Place.behind(self._last)
+                if place is not None and place != self.place:
+                    self._last = self._commit_before(place)
+                    self.place = place
+            except BaseException:
+                self._file.close()
+                raise
+
+    def _read_header(self) -> Frame:
+        self._file.size()
+        frame = read_frame(self._window.read(0, FRAME_BYTES), 0)
+        if frame is None:
+            raise self._damage("does not begin as a log, or its first frame is not as it was written", 0, 0)
+        if frame.version > VERSION:
+            raise VersionError(
+                f"{self.path} is written in format {frame.version}; this release reads format {VERSION}: upgrade it; "
+                "nothing was changed"
+            )
+        expected = (VERSION, 0, 0, HEADER, NO_CHECKSUM)
+        if (frame.version, frame.number, frame.batch, frame.kind, frame.previous) != expected:
+            raise self._damage("does not begin with the first frame of a log", 0, 0)
+        self.identity = frame.identity
+        self._mark = MARK + frame.identity
+        self.header = self._payload(frame)
+        return frame
+
+    def _commit_before(self, place: Place) -> Frame:
+        offset = place.offset - FRAME_BYTES
+        is_inside = 0 < offset < self._file.size()
+        frame = read_frame(self._file.read(offset, FRAME_BYTES), offset) if is_inside else None
+        ours = frame is not None and self._is_ours(frame) and frame.kind == COMMIT and frame.number < LARGEST_NUMBER
+        if frame is None or not ours or Place.behind(frame) != place:
+            raise self._damage(f"holds no batch that ends with frame {place.number - 1} there", offset, place.number)
+        return frame
+
+    def _is_ours(self, frame: Frame) -> bool:
+        return frame.version == VERSION and frame.identity == self.identity
+
+    def _damage(self, what: str, offset: int, number: int) -> DamageError:
+        return DamageError(f"{self.path} {what} (byte {offset})", path=self.path, offset=offset, frame=number)
+
+    def refresh(self) -> Iterator[list[Frame]]:
+        """Yield what was committed since the last call: the frames of each batch, verified and in order.
+
+        A batch without its commit frame is not there yet. Raises DamageError at the first damaged frame: those before
+        it were yielded, its batch's too, and `resume` continues behind it. Raises StoreError where the writer took back
+        what was read here, because it could not be made durable: open the log anew.
+        """
+        with reported(self.path, "reading the log"):
+            last = self._last
+            if read_frame(self._file.read(last.offset, FRAME_BYTES), last.offset) != last:
+                raise StoreError(f"{self.path} no longer ends as it did, its writer took a batch back: open it anew")
+            damage = None
+            while damage is None:
+                batch, damage = self._next_batch()
+                if damage is not None and self._torn is not None:
+                    self._last, self.place = self._first, self._torn
+                elif batch:
+                    self._last = batch.pop()
+                    self.place = Place.behind(self._last)
+                else:
+                    return
+                if batch or damage is None:
+                    yield batch
+            raise damage
+
+    def _next_batch(self) -> tuple[list[Frame], DamageError | None]:
+        """Return the next batch with its commit frame, nothing where the log ends; or what is before damage, and it."""
+        damage: DamageError | None = None
+        for attempt in range(ATTEMPTS):
+            batch, torn = self._scan()
+            if torn is None:
+                return batch, None
+            self._window.drop()
+            if attempt:
+                if (proof := self._proof(torn)) is None:
+                    return [], None
+                self._torn = torn
+                damage = self._damage(
+                    f"is damaged: frame {torn.number} is not as it was written, and frame {proof.number} at byte "
+                    f"{proof.offset} proves that it was durable. What is before it verifies and can be kept",
+                    torn.offset,
+                    torn.number,
+                )
+        return batch, damage
+
+    def _scan(self) -> tuple[list[Frame], Place | None]:
+        """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
+        place, size = self.place, self._file.size()
+        batch: list[Frame] = []
+        while True:
+            frame = read_frame(self._window.read(place.offset, FRAME_BYTES), place.offset)
+            if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
+                return batch, place
+            if self._window.digest(frame.payload_offset, frame.size) != frame.digest:
+                return batch, place
+            batch.append(frame)
+            if frame.kind == COMMIT:
+                return batch, None
+            place = Place.behind(frame)
+
+    def _proof(self, torn: Place) -> Frame | None:
+        """Return a frame of this log that no power cut can have left behind a torn one; None where there is none."""
+        known = self._proved
+        if known is not None and known.offset > torn.offset and not torn.can_be_torn_before(known):
+            # Or each of many damaged frames would be a search of all that is behind it.
+            found = read_frame(self._file.read(known.offset, FRAME_BYTES), known.offset)
+            if found == known:
+                return known
+        proofs = (frame for frame in self._frames(torn.offset) if not torn.can_be_torn_before(frame))
+        self._proved = next(proofs, None)
+        return self._proved
+
+    def _frames(self, offset: int) -> Iterator[Frame]:
+        """Yield the frames of this log whose first bytes verify, found by their marks, wherever they begin."""
+        size = self._file.size()
+        while offset < size:
+            data = self._file.read(offset, PART + FRAME_BYTES - 1)
+            found = data.find(self._mark)
+            while 0 <= found < PART:
+                frame = read_frame(data[found : found + FRAME_BYTES], offset + found)
+                if frame is not None:
+                    yield frame
+                found = data.find(self._mark, found + 1)
+            offset += PART
+
+    def resume(self) -> None:
+        """Go on behind the damaged frame that `refresh` named, at the next that can be found; the rest is lost."""
+        if (torn := self._torn) is None:
+            return
+        with reported(self.path, "looking for a frame behind damage"):
+            behind = (frame for frame in self._frames(torn.offset) if torn.is_before(frame))
+            if (frame := next(behind, None)) is None:
+                raise self._damage("holds no frame behind the damage", torn.offset, torn.number)
+            self.place = Place(frame.offset, frame.number, frame.batch, frame.previous)
+            self._last, self._torn = self._first, None
+
+    def read(self, offset: int, size: int) -> tuple[Frame, bytes]:
+        """Return the frame at an offset, whose payload has `size` bytes, and that payload, both verified.
+
+        Raises DamageError where there is none.
+        """
+        with reported(self.path, "reading a frame"):
+            if not 0 <= offset <= offset + FRAME_BYTES + size <= self._file.size():
+                raise self._damage(f"ends before a frame of {size} bytes could", offset, 0)
+            frame = read_frame(self._file.read(offset, FRAME_BYTES), offset)
+            if frame is None or not self._is_ours(frame) or frame.size != size:
+                raise self._damage(f"holds no frame with a payload of {size} bytes there", offset, 0)
+            return frame, self._payload(frame)
+
+    def _payload(self, frame: Frame) -> bytes:
+        payload = b""
+        if frame.size <= LARGEST_PAYLOAD and frame.end <= self._file.size():
+            payload = self._file.read(frame.payload_offset, frame.size)
+        if payload_digest(payload) != frame.digest or len(payload) != frame.size:
+            raise self._damage(
+                f"is damaged: the payload of frame {frame.number} is not as it was written", frame.offset, frame.number
+            )
+        return payload
+
+    @property
+    def moved(self) -> bool:
+        """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
+        with reported(self.path, "looking for the log"):
+            return not self._file.is_at(self.path)
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,24 @@
+"""The costs of a durable row: a small run fills its table, and each way kept the rows."""
+
+import sqlite3
+from contextlib import closing
+
+from examples.benchmarks import appending
+from store.log import LogReader
+from store.row_encoding import decode_row
+
+
+def test_a_small_run_keeps_the_rows_each_way_and_fills_its_table(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(appending, "ROWS", 5)
+    result = appending.run_appending(tmp_path, rounds=3, seed=1, note=lambda _: None)
+    cases = [record["case"].split(",")[0] for record in result["records"]]
+    assert cases == ["SQLite", "the log", "a bare file that grows"]
+    assert result["rows"] == 15 and result["records"][0]["times_sqlite"] == 1.0
+    with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as journal:
+        kept = journal.execute("SELECT sequence, bytes FROM payload ORDER BY sequence").fetchall()
+    with LogReader(tmp_path / "log") as log:
+        rows = [decode_row(log.read(frame.offset, frame.size)[1]) for batch in log.refresh() for frame in batch]
+    assert kept == [(row.head.sequence, row.payload) for row in rows] and len(rows) == 15
+    assert (tmp_path / "bare").stat().st_size == 15 * appending.ROW_BYTES
+    appending.show_appending(result)
+    assert "the log" in capsys.readouterr().out

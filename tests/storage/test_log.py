@@ -1,0 +1,530 @@
+"""The log: what was committed comes back to the byte, a torn tail is passed over, and damage is named."""
+
+import os
+import shutil
+import struct
+from pathlib import Path
+
+import pytest
+from logs import BATCHES, HEADER, KIND, append, build, ends, names, payload, read, rest
+
+import store.log
+import store.log_writer
+from store import DamageError, RecordError, StoreClosedError, StoreError, VersionError
+from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
+from store.log import PART, LogReader, Place
+from store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
+from store.records import payload_digest
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("log") / "log")
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    return Path(shutil.copy(whole, tmp_path / "log"))
+
+
+def before(frames, index):
+    """What can be kept where the frame of this index is damaged: the batches before it, and of its own what it has."""
+    batch = frames[index][0]
+    within = sum(number == batch for number, _, _ in frames[:index])
+    return [*BATCHES[:batch], *([BATCHES[batch][:within]] if within else [])]
+
+
+def batches_and_damage(path):
+    """What a reader yields, and the error that ends it."""
+    found = []
+    with LogReader(path) as log:
+        try:
+            for batch in log.refresh():
+                found.append([log.read(frame.offset, frame.size)[1] for frame in batch])
+        except DamageError as damage:
+            return found, damage
+    return found, None
+
+
+def test_what_was_committed_comes_back_in_its_batches(whole):
+    assert read(whole) == BATCHES
+    with LogReader(whole) as log:
+        assert log.header == HEADER
+        assert [frame.kind for batch in log.refresh() for frame in batch] == [KIND] * 8
+
+
+def test_a_commit_is_one_write_and_one_sync_of_data(tmp_path, monkeypatch):
+    path, calls = build(tmp_path / "log"), []
+    write, sync = os.write, os.fdatasync
+    with LogWriter(path) as log:
+        monkeypatch.setattr(os, "write", lambda *given: calls.append("write") or write(*given))
+        monkeypatch.setattr(os, "fdatasync", lambda *given: calls.append("fdatasync") or sync(*given))
+        monkeypatch.setattr(os, "fsync", lambda *given: calls.append("fsync"))
+        log.append(KIND, payload(2))
+        append(log, BATCHES[3])
+        monkeypatch.undo()
+    assert calls == ["write", "fdatasync"] * 2
+
+
+def test_the_file_is_longer_than_the_log_while_it_is_written(tmp_path):
+    path = build(tmp_path / "log", [])
+    with LogWriter(path) as log:
+        log.append(KIND, b"a")
+        assert path.stat().st_size == AHEAD
+        assert path.stat().st_blocks * 512 >= AHEAD  # no holes, or each sync waits for the file system's own journal
+        log.append(KIND, bytes(AHEAD))
+        assert path.stat().st_size == 2 * AHEAD
+        assert read(path) == [[b"a"], [bytes(AHEAD)]]
+    assert path.stat().st_size == FRAME_BYTES * 5 + len(HEADER) + 1 + AHEAD
+
+
+def test_cut_at_every_byte_it_holds_the_batches_before(whole, tmp_path):
+    data, (_, _, commits) = whole.read_bytes(), ends(whole)
+    path = tmp_path / "log"
+    for cut in range(len(data)):
+        path.write_bytes(data[:cut])
+        if cut < FRAME_BYTES + len(HEADER):
+            with pytest.raises(DamageError, match=r"begin as a log|payload of frame 0"):
+                LogReader(path)
+            continue
+        expected = BATCHES[: sum(commit <= cut for commit in commits)]
+        assert read(path) == expected, cut
+        if cut % 97 == 0:
+            with LogWriter(path) as log:
+                log.append(KIND, b"after")
+            assert read(path) == [*expected, [b"after"]]
+
+
+def test_every_byte_flipped_is_damage_but_in_the_last_batch(whole, tmp_path):
+    data, (begin, frames, commits) = whole.read_bytes(), ends(whole)
+    path = tmp_path / "log"
+    for place in range(len(data)):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        if place < begin:
+            with pytest.raises(DamageError) as raised:
+                LogReader(path)
+            assert (raised.value.offset, raised.value.frame, raised.value.path) == (0, 0, path)
+            continue
+        index = next(index for index, (_, _, end) in enumerate(frames) if place < end)
+        found, damage = batches_and_damage(path)
+        if place >= commits[-2]:
+            assert (found, damage) == (BATCHES[:-1], None)  # as after a power cut
+        else:
+            assert found == before(frames, index), place
+            assert (damage.frame, damage.offset) == (index + 1, frames[index][1])
+
+
+def test_a_frame_taken_out_doubled_or_swapped_with_the_next_is_damage(whole, tmp_path):
+    data, (_, frames, _) = whole.read_bytes(), ends(whole)
+    path = tmp_path / "log"
+    for index, (_, begin, end) in enumerate(frames):
+        is_last = index + 1 == len(frames)
+        ahead, frame, behind = data[:begin], data[begin:end], data[end:]
+        path.write_bytes(ahead + behind)
+        found, damage = batches_and_damage(path)
+        # Without the last commit it is as after a power cut.
+        assert found == (BATCHES[:-1] if is_last else before(frames, index)), index
+        assert (damage is None) == is_last
+        path.write_bytes(ahead + frame + frame + behind)
+        found, damage = batches_and_damage(path)
+        # Of the last, all is there: only what is behind it should not be.
+        assert found == (BATCHES if is_last else before(frames, index + 1))
+        assert (damage.frame, damage.offset) == (index + 2, end)
+        if not is_last:
+            following = data[end : frames[index + 1][2]]
+            path.write_bytes(ahead + following + frame + data[frames[index + 1][2] :])
+            found, damage = batches_and_damage(path)
+            assert (found, damage.frame) == (before(frames, index), index + 1)
+
+
+def test_two_logs_spliced_do_not_hold(whole, tmp_path):
+    other = build(tmp_path / "other")  # the same rows, another identity
+    begin, frames, commits = ends(whole)
+    mine, theirs = whole.read_bytes(), other.read_bytes()
+    path = tmp_path / "log"
+    for commit in commits:
+        path.write_bytes(mine[:commit] + theirs[commit:])
+        found, damage = batches_and_damage(path)
+        # Of this log nothing follows: then its end may be no more than old bytes of the disk.
+        assert found == BATCHES[: commits.index(commit) + 1] and damage is None
+    for batch, first, end in frames[:-2]:
+        path.write_bytes(mine[:first] + theirs[first:end] + mine[end:])
+        found, damage = batches_and_damage(path)
+        assert found == before(frames, frames.index((batch, first, end))) and damage.offset == first
+        with LogReader(path) as log, pytest.raises(DamageError, match="holds no frame"):
+            log.read(first, end - first - FRAME_BYTES)
+    path.write_bytes(theirs[:begin] + mine[begin:])
+    assert batches_and_damage(path) == ([], None)
+
+
+def test_two_histories_of_one_log_spliced_are_damage(whole, tmp_path):
+    """A copy was gone on with: its frames have the same identity, numbers, batches and sizes."""
+    paths = [Path(shutil.copy(whole, tmp_path / name)) for name in ("mine", "theirs")]
+    for path, byte in zip(paths, (b"m", b"t"), strict=True):
+        with LogWriter(path) as log:
+            for _ in range(3):
+                log.append(KIND, byte * 50)
+    mine, theirs = (path.read_bytes() for path in paths)
+    _, frames, commits = ends(paths[0])
+    path = tmp_path / "spliced"
+    for commit in commits[len(BATCHES) : -1]:
+        path.write_bytes(mine[:commit] + theirs[commit:])
+        found, damage = batches_and_damage(path)
+        number = 1 + sum(end <= commit for _, _, end in frames)
+        assert found == read(paths[0])[: commits.index(commit) + 1]
+        assert (damage.offset, damage.frame) == (commit, number)
+
+
+def test_damage_is_proven_by_a_frame_wherever_it_begins(tmp_path):
+    """The search reads in parts: a frame may begin in one and end in the next."""
+    path = tmp_path / "log"
+    for beside in range(-100, 20, 7):
+        size = PART - len(HEADER) - 2 * FRAME_BYTES + beside
+        build(path, [[bytes(size)], [b"x"]])
+        data = bytearray(path.read_bytes()[: -FRAME_BYTES - 1])  # of the second batch its first 88 bytes are left
+        data[FRAME_BYTES + len(HEADER) + 60] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(DamageError, match="frame 1 is not"):
+            read(path)
+
+
+def test_a_new_log_is_synced_before_its_name_and_its_name_before_it_counts(tmp_path, monkeypatch):
+    calls = []
+    replace = Path.replace
+    for name in ("sync_file", "sync_folder"):
+        monkeypatch.setattr(store.log_writer, name, lambda path, name=name: calls.append((name, path.name)))
+    monkeypatch.setattr(Path, "replace", lambda path, to: calls.append(("rename", to.name)) or replace(path, to))
+    create_log(tmp_path / "log", b"")
+    assert calls == [("sync_file", "log.new"), ("rename", "log"), ("sync_folder", tmp_path.name)]
+
+
+def test_what_an_opening_finds_is_durable_before_anything_follows_it(copy, monkeypatch):
+    calls, sync = [], os.fsync
+    copy.write_bytes(copy.read_bytes() + b"torn")
+    size = copy.stat().st_size
+    monkeypatch.setattr(os, "fsync", lambda file: calls.append(os.fstat(file).st_size) or sync(file))
+    with LogWriter(copy):
+        assert calls == [size - 4, size - 4]  # the cut, and what was there before
+
+
+def test_reading_goes_on_behind_damage_where_it_is_told_to(copy):
+    _, frames, _ = ends(copy)
+    for batch, index in ((0, 0), (1, 1), (3, 2)):
+        begin = [frame for frame in frames if frame[0] == batch][index][1]
+        data = bytearray(copy.read_bytes())
+        data[begin + 60] ^= 1
+        copy.write_bytes(data)
+    found, named = [], []
+    with LogReader(copy) as log:
+        while True:
+            try:
+                for batch in log.refresh():
+                    found += [log.read(frame.offset, frame.size)[1] for frame in batch]
+                break
+            except DamageError as damage:
+                named.append(damage.frame)
+                log.resume()
+    assert named == [1, 4, 10]
+    assert found == [payload(index) for index in (1, 3, 4, 5, 7)]
+
+
+@pytest.mark.parametrize(("frame", "lost"), [(0, 0), (2, 1), (7, 4), (8, 5), (9, 6)])
+@pytest.mark.parametrize("inserted", [False, True])
+def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
+    _, frames, _ = ends(copy)
+    begin, data = frames[frame][1], copy.read_bytes()
+    # Something put in takes nothing away; a flipped bit takes its row.
+    between = b"?" * 200 if inserted else bytes([data[begin] ^ 1])
+    copy.write_bytes(data[:begin] + between + data[begin + (not inserted) :])
+    found = []
+    with LogReader(copy) as log:
+        with pytest.raises(DamageError):
+            for batch in log.refresh():
+                found += [log.read(each.offset, each.size)[1] for each in batch]
+        log.resume()
+        found += [each for batch in rest(log) for each in batch]
+    assert found == [payload(index) for index in range(8) if inserted or index != lost]
+
+
+def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy):
+    with LogWriter(copy) as writer, LogReader(copy) as log:
+        frames = log._frames
+
+        def later(offset):
+            if writer.place.number == 14:
+                append(writer, [b"1"])
+                append(writer, [b"2"])
+            return frames(offset)
+
+        log._frames = later
+        assert rest(log) == [*BATCHES, [b"1"], [b"2"]]
+
+
+def test_a_batch_without_its_commit_is_not_there_and_the_next_writer_removes_it(copy):
+    with LogWriter(copy) as log:
+        staged = log.stage(KIND, bytes(LARGEST_STAGED))  # so large that it is written before its commit
+        assert copy.stat().st_size > LARGEST_STAGED
+        waiting = log.stage(KIND, b"in memory")
+        assert log.read(staged.offset, staged.size)[1] == bytes(LARGEST_STAGED)
+        assert log.read(waiting.offset, waiting.size)[1] == b"in memory"
+        assert read(copy) == BATCHES
+        crashed = copy.read_bytes()
+    assert copy.stat().st_size < LARGEST_STAGED  # closing forgets it
+    copy.write_bytes(crashed)
+    assert read(copy) == BATCHES
+    with LogWriter(copy) as log:
+        assert copy.stat().st_size < LARGEST_STAGED
+        log.append(KIND, b"next")
+    assert read(copy) == [*BATCHES, [b"next"]]
+
+
+def test_a_torn_batch_whose_later_sectors_came_is_no_damage(copy):
+    size = copy.stat().st_size
+    with LogWriter(copy) as log:
+        append(log, [payload(2), payload(3), payload(4, 2000), payload(5)])
+        end = log.place.offset
+        data = copy.read_bytes()[:end]
+    for first in range(size // 512 * 512, end, 512):
+        torn = bytearray(data)
+        begin = max(first, size)  # the bytes beside a write stay
+        torn[begin : first + 512] = bytes(min(first + 512, end) - begin)
+        copy.write_bytes(torn)
+        assert read(copy) == BATCHES
+        with LogWriter(copy) as log:
+            log.append(KIND, b"")  # shorter: what is behind must be gone
+        assert read(copy) == [*BATCHES, [b""]]
+
+
+def test_a_writer_refuses_a_damaged_log_and_leaves_it_as_it_is(copy):
+    data = bytearray(copy.read_bytes())
+    data[200] ^= 1
+    copy.write_bytes(data)
+    with pytest.raises(DamageError, match="proves that it was durable"):
+        LogWriter(copy)
+    assert copy.read_bytes() == data
+
+
+def test_a_reader_keeps_its_place_beside_a_writer(tmp_path):
+    path = build(tmp_path / "log", [])
+    with LogWriter(path) as writer, LogReader(path) as log:
+        for batch in BATCHES:
+            assert rest(log) == []
+            append(writer, batch)
+            assert rest(log) == [batch]
+        kept, before = log.place, path.stat()
+    with LogReader(path, place=kept) as log, LogWriter(path, place=kept) as writer:
+        append(writer, [b"later"])
+        assert rest(log) == [[b"later"]]
+    assert before.st_ino == path.stat().st_ino
+
+
+def test_a_reader_changes_nothing(copy):
+    copy.chmod(0o444)
+    before = (copy.read_bytes(), copy.stat().st_mtime_ns, names(copy.parent))
+    assert read(copy) == BATCHES
+    assert (copy.read_bytes(), copy.stat().st_mtime_ns, names(copy.parent)) == before
+
+
+def test_a_place_that_is_not_behind_a_commit_of_this_log_is_refused(copy, tmp_path):
+    with LogReader(copy) as log:
+        places = [log.place] + [log.place for _ in log.refresh()]
+    for index, place in enumerate(places):
+        with LogReader(copy, place=place) as log:
+            assert rest(log) == BATCHES[index:]
+    other = build(tmp_path / "other")
+    place = places[2]
+    wrong = [place._replace(offset=offset) for offset in (-1, 0, 1, place.offset + 1, 2**40, 2**70)]
+    wrong += [place._replace(number=place.number + 1), place._replace(batch=1), place._replace(previous=bytes(16))]
+    for each in wrong:
+        with pytest.raises(DamageError, match="holds no batch"):
+            LogReader(copy, place=each)
+    with pytest.raises(DamageError, match="holds no batch"):
+        LogReader(other, place=place)
+    with pytest.raises(DamageError, match="holds no batch"):
+        LogWriter(other, place=place)
+
+
+def test_a_reader_stays_with_the_log_that_was_replaced(copy):
+    with LogReader(copy) as log:
+        assert not log.moved
+        create_log(copy, b"new", [(KIND, b"1"), (KIND, b"2")])
+        assert log.moved
+        assert rest(log) == BATCHES
+        assert rest(log) == []
+    with LogReader(copy) as log:
+        assert (log.header, rest(log)) == (b"new", [[b"1", b"2"]])
+    assert names(copy.parent) == ["log"]
+    copy.unlink()
+    with pytest.raises(StoreError):
+        LogReader(copy)
+
+
+def test_a_log_of_many_frames_replaces_another(tmp_path):
+    many = [(KIND, b"%d" % i) for i in range(10_000)]
+    path = tmp_path / "log"
+    create_log(path, b"", iter(many))
+    found = read(path)
+    assert [len(batch) for batch in found] == [4096, 4096, 1808]
+    assert [each for batch in found for each in batch] == [each for _, each in many]
+
+
+def test_a_frame_is_read_by_its_place_and_verified(copy):
+    with LogReader(copy) as log:
+        frames = [frame for batch in log.refresh() for frame in batch]
+        for frame, expected in zip(frames, [each for batch in BATCHES for each in batch], strict=True):
+            assert log.read(frame.offset, frame.size) == (frame, expected)
+        size = copy.stat().st_size
+        for offset, length in (
+            (-1, 5),
+            (0, 1),
+            (frames[1].offset, 29),
+            (frames[1].offset, 2**62),
+            (size, 0),
+            (2**70, 1),
+        ):
+            with pytest.raises(DamageError):
+                log.read(offset, length)
+        with copy.open("r+b") as file:
+            file.seek(frames[2].payload_offset + 3)
+            file.write(b"?")
+        with pytest.raises(DamageError, match=f"payload of frame {frames[2].number}") as raised:
+            log.read(frames[2].offset, frames[2].size)
+        assert (raised.value.offset, raised.value.frame) == (frames[2].offset, frames[2].number)
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2**32])
+def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind):
+    path = build(tmp_path / "log", [])
+    with LogWriter(path) as log:
+        log.stage(KIND, b"1")
+        with pytest.raises(RecordError):
+            log.stage(kind, b"")
+        log.commit()
+        log.commit()  # of nothing
+    assert read(path) == [[b"1"]]
+    with pytest.raises(StoreClosedError):
+        log.append(KIND, b"")
+
+
+# Forged: whoever makes frames makes right checksums.
+
+
+def forged(whole, *frames, at=None):
+    """A log that ends with these frames: (number, batch, kind, size that it says, payload)."""
+    data = whole.read_bytes()[:at]
+    with LogReader(whole) as log:
+        identity = log.identity
+        for _ in log.refresh():
+            pass
+        before = log.place.previous
+    for number, batch, kind, size, content in frames:
+        raw, frame = pack_frame(identity, 0, number, batch, kind, content, before)
+        head = bytearray(raw[:FRAME_BYTES])
+        head[36:40] = struct.pack("<I", size)
+        head[72:] = payload_digest(bytes(head[:72]))
+        data += bytes(head) + content
+        before = bytes(head[72:])
+        assert isinstance(frame, Frame)
+    return data
+
+
+@pytest.mark.parametrize("size", [11, LARGEST_PAYLOAD, LARGEST_PAYLOAD + 1, 2**32 - 1])
+def test_a_forged_size_is_no_frame(whole, tmp_path, size):
+    path = tmp_path / "log"
+    path.write_bytes(forged(whole, (14, 14, KIND, size, b"0123456789"), (15, 14, COMMIT, 0, b"")))
+    assert batches_and_damage(path) == (BATCHES, None)
+    with path.open("r+b") as file:
+        file.truncate(2**33)  # and all of it holes
+    with pytest.raises(DamageError, match="are on the disk"):
+        LogReader(path)
+    with pytest.raises(DamageError, match="are on the disk"):
+        LogWriter(path)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [(2**64 - 1, 14, KIND, 1, b"x"), (14, 2**64 - 1, KIND, 1, b"x"), (14, 13, KIND, 1, b"x"), (3, 3, COMMIT, 0, b"")],
+)
+def test_a_forged_number_is_damage(whole, tmp_path, frame):
+    path = tmp_path / "log"
+    path.write_bytes(forged(whole, frame))
+    found, damage = batches_and_damage(path)
+    assert [each for batch in found for each in batch] == [each for batch in BATCHES for each in batch]
+    assert damage is not None
+
+
+def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_path):
+    path = tmp_path / "log"
+    path.write_bytes(forged(whole, (2**64 - 1, 2**64 - 1, COMMIT, 0, b"")))
+    place = Place(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
+    with pytest.raises(DamageError, match="holds no batch"):
+        LogWriter(path, place=place)
+
+
+@pytest.mark.parametrize("frame", [(14, 14, 0, 1, b"x"), (14, 14, COMMIT, 1, b"x")])
+def test_a_second_header_and_a_commit_with_a_payload_hold_nothing(whole, tmp_path, frame):
+    path = tmp_path / "log"
+    path.write_bytes(forged(whole, frame, (15, 14, COMMIT, 0, b"")))
+    assert read(path) == BATCHES
+
+
+def test_marks_without_end_are_read_once(whole, tmp_path, monkeypatch):
+    path = tmp_path / "log"
+    with LogReader(whole) as log:
+        mark = whole.read_bytes()[:16]
+        assert mark.endswith(log.identity)
+    path.write_bytes(whole.read_bytes() + mark * 40_000)
+    calls = []
+    monkeypatch.setattr(store.log, "read_frame", lambda *given: calls.append(1))
+    with LogReader.__new__(LogReader) as log:
+        log.path, log._file = path, store.log.LogFile(path, write=False)
+        log._mark = mark
+        assert list(log._frames(0)) == []
+    assert 40_000 <= len(calls) <= 40_100
+
+
+def test_a_newer_version_is_named_and_a_flipped_one_is_damage(copy):
+    data = bytearray(copy.read_bytes())
+    data[6] = 2
+    copy.write_bytes(data)
+    with pytest.raises(DamageError, match="begin as a log"):
+        LogReader(copy)
+    data[72:88] = payload_digest(bytes(data[:72]))
+    copy.write_bytes(data)
+    with pytest.raises(VersionError, match="format 2"):
+        LogReader(copy)
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 500, bytes(500)])
+def test_what_is_no_log_is_named(tmp_path, content):
+    (tmp_path / "log").write_bytes(content)
+    for opening in (LogReader, LogWriter):
+        with pytest.raises(DamageError, match="begin as a log"):
+            opening(tmp_path / "log")
+    assert (tmp_path / "log").read_bytes() == content
+
+
+def test_links_pipes_and_folders_are_refused_and_nothing_is_touched_through_them(whole, tmp_path):
+    outside = Path(shutil.copy(whole, tmp_path / "outside"))
+    (tmp_path / "link").symlink_to(outside)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name in ("link", "pipe", "folder"):
+        for opening in (LogReader, LogWriter):
+            with pytest.raises(DamageError, match="no regular file"):
+                opening(tmp_path / name)
+    with pytest.raises(DamageError, match="no regular file"):
+        LogReader(Path("/dev/zero"))
+    # A draft that was planted leads nowhere either.
+    (tmp_path / "log.new").symlink_to(outside)
+    build(tmp_path / "log")
+    assert outside.read_bytes() == whole.read_bytes() and not (tmp_path / "log").is_symlink()
+
+
+def test_a_place_is_plain_numbers_and_bytes(whole):
+    with LogReader(whole) as log:
+        for _ in log.refresh():
+            pass
+        assert Place(*tuple(log.place)) == log.place

@@ -1,0 +1,145 @@
+"""A reader written from store/LOG.md alone finds the rows and the damage that the store's own finds."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import second_reader
+from logs import append, build
+
+from store import DamageError
+from store.encoding import decode_payload, encode_payload
+from store.log import LogReader
+from store.log_writer import LogWriter, create_log
+from store.row_encoding import ROW, Row, decode_row, encode_row
+
+ARRAYS = {"codes": np.arange(700, dtype=np.int16), "none": np.zeros((0, 3), np.float32)}
+PAYLOAD = encode_payload(ARRAYS)
+FIELDS = [
+    (1, "add", "wool", b"\1" * 32, 1.5, '{"a":[1,null]}', PAYLOAD),
+    (2, "", "", b"", -0.25, "{}", b""),
+    (7, "forget", "Seide, weiß ✓", b"\0" * 64, 0.0, "{}", None),
+    (8, "add", "x" * 900, b"k", 2e9, '{"n":{}}', PAYLOAD),
+]
+
+
+def encoded(*fields):
+    return encode_row(*fields, size=len(PAYLOAD) if fields[-1] is None else len(fields[-1]))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "log"
+    create_log(path, b'{"identity":1}')
+    with LogWriter(path) as log:
+        for fields in FIELDS[:2]:
+            log.append(ROW, encoded(*fields))
+        log.append(99, b"of a later release")
+        for fields in FIELDS[2:]:
+            log.stage(ROW, encoded(*fields))
+        log.commit()
+    return path
+
+
+def ours(path):
+    rows, damage = [], None
+    with LogReader(path) as log:
+        try:
+            for batch in log.refresh():
+                rows += [decode_row(log.read(frame.offset, frame.size)[1]) for frame in batch if frame.kind == ROW]
+        except DamageError as error:
+            damage = (error.frame, error.offset)
+    return rows, damage
+
+
+def theirs(path):
+    _, rows, damage = second_reader.rows(path.read_bytes())
+    return rows, damage and (damage.number, damage.offset)
+
+
+def plain(row):
+    head = row.head
+    return (head.sequence, head.time, head.key, head.kind, head.label, head.attributes, row.payload, head.size)
+
+
+def test_both_read_the_rows_to_the_byte(path):
+    rows, damage = ours(path)
+    assert damage is None and isinstance(rows[0], Row)
+    assert [(*plain(row)[:5], plain(row)[6]) for row in rows] == [
+        (sequence, time, key, kind, label, payload) for sequence, kind, label, key, time, _, payload in FIELDS
+    ]
+    assert [row.head.attributes for row in rows] == [json.loads(fields[5]) for fields in FIELDS]
+    found, damage = theirs(path)
+    assert [tuple(vars(row).values()) for row in found] == [plain(row) for row in rows] and damage is None
+    assert second_reader.rows(path.read_bytes())[0] == b'{"identity":1}'
+    assert decode_payload(found[0].arrays)["codes"].tobytes() == ARRAYS["codes"].tobytes()
+
+
+def test_both_find_the_same_damage(path, tmp_path):
+    data, copy = path.read_bytes(), tmp_path / "log"
+    for place in range(110, len(data), 7):
+        copy.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        rows, damage = ours(copy)
+        found, other = theirs(copy)
+        assert other == damage and [row.sequence for row in found] == [row.head.sequence for row in rows]
+        copy.write_bytes(data[:place])
+        assert [row.sequence for row in theirs(copy)[0]] == [row.head.sequence for row in ours(copy)[0]]
+        assert theirs(copy)[1] is None
+
+
+def test_it_finds_torn_tails_as_ours_does(tmp_path):
+    path = build(tmp_path / "log")
+    size = path.stat().st_size
+    with LogWriter(path) as log:
+        append(log, [b"a" * 700, b"b" * 700, b"c" * 700])
+        data = path.read_bytes()[: log.place.offset]
+    path.write_bytes(data[:size] + bytes(1000) + data[size + 1000 :])
+    _, whole, damage = second_reader.frames(path.read_bytes())
+    with LogReader(path) as log:
+        assert sum(len(batch) + 1 for batch in log.refresh()) == len(whole) == 13
+    assert damage is None
+
+
+def test_it_is_a_command(path):
+    command = [sys.executable, Path(second_reader.__file__), path]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    assert done.stdout.splitlines()[1].startswith(f"1 add wool {'01' * 32} 1.5 ")
+    assert len(done.stdout.splitlines()) == 5
+
+
+def test_it_reads_nothing_of_the_store():
+    lines = Path(second_reader.__file__).read_text().splitlines()
+    imports = [line for line in lines if line.startswith(("import", "from"))]
+    assert not any("store" in line for line in imports) and len(lines) <= 175
+
+
+def changed(offset, part):
+    data = encoded(*FIELDS[0])
+    return data[:offset] + part + data[offset + len(part) :]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        encoded(*FIELDS[0])[:-1],
+        encoded(*FIELDS[0]) + b"x",
+        changed(0, bytes(8)),
+        changed(0, b"\xff" * 8),
+        changed(8, b"\0" * 6 + b"\xf0\x7f"),
+        changed(16, b"\xff" * 8),
+        changed(24, b"\2"),
+        changed(26, b"\xff" * 4),
+        changed(38 + 32, b"\0"),
+        changed(38 + 32, b"\xff"),
+        encode_row(1, "", "", b"\0" * 65, 0.0, "{}", b"", 0),
+        encode_row(1, "", "", b"", 0.0, "[]", b"", 0),
+        encode_row(1, "", "", b"", 0.0, '{"a":NaN}', b"", 0),
+    ],
+)
+def test_a_row_that_was_never_made_is_refused(data):
+    with pytest.raises(ValueError):
+        decode_row(data)

@@ -33,7 +33,7 @@ def optional(library: str, extra: str, what: str, otherwise: str = "") -> Iterat
 
 
 def require(library: str, extra: str, what: str) -> None:
-    """Raise `missing(…)` where a library is not there; it is not imported, which may take seconds, before it is used."""
+    """Raise `missing(…)` where a library is not there, without importing it, which may take seconds."""
     if importlib.util.find_spec(library) is None:
         raise missing(library, extra, what)
 

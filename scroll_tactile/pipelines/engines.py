@@ -49,7 +49,7 @@ class Engine:
     def __enter__(self) -> Engine:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """The executor is the caller's."""
 
 
@@ -111,7 +111,7 @@ class Processes(Engine):
         else:
             self._free.append(pool)
 
-    def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for pool in list(self._all):
             pool.shutdown(wait=kind is None, cancel_futures=True)
 

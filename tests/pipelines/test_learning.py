@@ -6,9 +6,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from bags import START, biotac, typestore, write
 from live_touches import GEL, frames, gel_learner, shift
 from live_touches import learner as live_learner
-from recordings.bags import START, biotac, typestore, write
 from touches import PAD, SETTINGS, fed, filled, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner, sensors

@@ -5,10 +5,10 @@ A mean over windows forgets where a reading passes the noise's edge; kept touche
     score_c = max over kept i of c of Σ L_a[y, x_i],    a the noise under which a kept touch is likeliest.
 
 The sum is over all values that were read. A channel that never changes, where hardly any kept touch has it so, is
-stuck: it says nothing of its own and is left out, as are values that are missing. A channel that is often quiet says
-something by being so. Beside the kept touches of a material stand blends of those that are likely: what is felt lies
-between them. A touch is compared with the beginnings of kept ones, in their own time, or with the whole of each brought
-to its length: made at another speed, it has another length.
+stuck: it says nothing of its own and is left out, as are values that are missing. Where it is often quiet, it says
+something by being so, unless the values are likelier without it. Beside the kept touches of a material stand blends of
+those that are likely: what is felt lies between them. A touch is compared with the beginnings of kept ones, in their
+own time, or with the whole of each brought to its length: made at another speed, it has another length.
 
 All is a function of the set of kept touches, in any order.
 """
@@ -253,7 +253,17 @@ class Recall:
         """
         if levels.ndim != 2 or len(levels) != self.channels:
             raise InputError(f"expected levels of shape ({self.channels}, T); came {levels.shape}")
-        asked = _Asked.of(levels, self.longest, whole, self._quiet(left_out))
+        quiet = self._quiet(left_out)
+        asked = _Asked.of(levels, self.longest, whole, quiet)
+        found = self._compared(asked, left_out, noise, levels.shape[1])
+        stuck = _Asked.of(levels, self.longest, whole, np.zeros_like(quiet))
+        if np.array_equal(stuck.stuck, asked.stuck):
+            return found
+        # Channels that are often quiet are quiet here, too, or dead: as a value is the likelier.
+        apart = self._compared(stuck, left_out, noise, levels.shape[1])
+        return found if found.likelihood >= apart.likelihood else apart
+
+    def _compared(self, asked: _Asked, left_out: int | None, noise: Noise | None, columns: int) -> Recollection:
         given, noise = noise, self._roughly(asked, left_out) if noise is None else noise
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
@@ -263,7 +273,7 @@ class Recall:
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
                 noise, logs = finer, pairs.logs(self._table(finer))
-        return self._told(asked, rows, beside, logs, noise, levels.shape[1])
+        return self._told(asked, rows, beside, logs, noise, columns)
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
@@ -413,6 +423,7 @@ class Recall:
             stuck=asked.stuck,
             expected=expected,
             trust=trust_in(*shape_of(deviation, both), measured),
+            likelihood=got,
             evidence=got - by_chance(asked.levels[asked.seen]),
             surprise=float(usual) - got,
         )

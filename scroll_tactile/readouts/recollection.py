@@ -47,9 +47,9 @@ class Recollection:
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
     trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
-    evidence: the log-likelihood per value beyond that of values drawn at random from the touch's own; not above 0
-    where nothing that is kept explains the touch. surprise: the log-likelihood per value that is lacking to what a
-    touch of the set would have.
+    likelihood: its logarithm per value. evidence: that beyond the one of values drawn at random from the touch's own;
+    not above 0 where nothing that is kept explains the touch. surprise: what is lacking to the one that a touch of the
+    set would have.
     """
 
     scores: FloatArray
@@ -58,6 +58,7 @@ class Recollection:
     stuck: npt.NDArray[np.bool_]
     expected: FloatArray
     trust: float
+    likelihood: float
     evidence: float
     surprise: float
 

@@ -213,7 +213,7 @@ def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
     for each in touches[:quiet]:
         each.levels[3] = 0
     recall = recall_of(touches)
-    asked = touch(1, 100)
+    asked = touch(0, 100)
     asked[3] = 0
     assert recall.recollect(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
     if quiet == 2:  # without one of those there is one of 39
@@ -221,6 +221,30 @@ def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
         assert recall.recollect(asked, left_out=row).stuck[3]
         recall.follow([], {(touches[0].material, touches[0].key)})
         assert recall.recollect(asked).stuck[3]
+
+
+def test_channels_that_are_often_quiet_may_be_dead():
+    """Three of eight channels are quiet in half of the kept touches; in the touch that is asked they died."""
+    touches = kept()
+    for each in touches[::2]:
+        each.levels[:3] = 0
+    recall = recall_of(touches)
+    for material in range(MATERIALS):
+        quiet = next(each for each in touches[::2] if each.material == f"m{material}")
+        asked = touch(material, 100)
+        asked[:3] = 0
+        assert not recall.recollect(asked).stuck.any()  # kept touches of its material are so
+        dead = touch(material, 100)
+        dead[5:] = 0
+        found = recall.recollect(dead)
+        assert found.stuck.tolist() == [False] * 5 + [True] * 3
+        assert recall.materials[int(found.scores.argmax())] == quiet.material
+    never = recall_of([each for each in touches if each.levels[:3].any()] + touches[:2])
+    died = touch(3, 100)
+    died[:3] = 0  # of its material none is quiet: two touches of another are
+    found = never.recollect(died)
+    assert found.stuck[:3].all()
+    assert never.materials[int(found.scores.argmax())] == "m3"
 
 
 def test_scores_are_sums_over_all_values():

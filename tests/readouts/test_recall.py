@@ -206,7 +206,7 @@ def test_stuck_channels_and_missing_values_are_left_out_exactly(recall):
     assert np.abs(found.expected[2] - levels[2]).mean() < 8
 
 
-@pytest.mark.parametrize(("quiet", "stuck"), [(0, True), (1, True), (2, False), (8, False)])
+@pytest.mark.parametrize(("quiet", "stuck"), [(0, True), (1, True), (8, False)])
 def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
     """One of twenty kept touches or more: of an array of binary taxels most are quiet."""
     touches = kept()
@@ -216,11 +216,11 @@ def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
     asked = touch(0, 100)
     asked[3] = 0
     assert recall.recollect(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
-    if quiet == 2:  # without one of those there is one of 39
+    for each in touches[2:quiet]:
+        recall.follow([], {(each.material, each.key)})
+    if quiet == 8:  # two are left, of 34, and without one of those there is one of 33
         row = recall.rows()[touches[0].key]
         assert recall.recollect(asked, left_out=row).stuck[3]
-        recall.follow([], {(touches[0].material, touches[0].key)})
-        assert recall.recollect(asked).stuck[3]
 
 
 def test_channels_that_are_often_quiet_may_be_dead():

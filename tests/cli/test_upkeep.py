@@ -96,7 +96,9 @@ class TestCheckAndRepair:
             "forget": ["a"],
             "merge": [tmp_path, "--shared", "once"],
         }
-        assert "holds no store" in refused("memory", command, tmp_path / "none", *more.get(command, []))
+        opens = command in ("compact", "export", "retract", "forget", "merge")  # the others look at what may be damaged
+        expected = "there is no memory in" if opens else "holds no store"
+        assert expected in refused("memory", command, tmp_path / "none", *more.get(command, []))
         assert not (tmp_path / "none").exists()
 
 

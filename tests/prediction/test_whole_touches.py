@@ -75,6 +75,7 @@ def test_beginnings_after_one_touch_of_each_are_judged_by_windows_alone():
     assert right(viewed, ASKED) >= 0.9
 
 
+@pytest.mark.filterwarnings("ignore:all readings lie in:scroll_tactile.errors.RangeWarning")
 def test_readings_of_a_hundredth_of_the_range_whose_zero_moved():
     def small(touch):
         return 0.5 + 0.01 * (touch.readings - 0.5)

@@ -132,7 +132,7 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
         of, what = about[0] if array or several else (kind, about)
         plain = of == Nodetype.BASE and what[0] != "string"
         inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
-        if (array and not about[1]) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
+        if (array and about[1] < 1) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
             # There could be any number of them in no byte.
             raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
         total += inside * (about[1] if array and not plain else 1)

@@ -162,6 +162,14 @@ BAGS: dict[str, Attack] = {
     "R7 msg: an array of messages": mcap(
         lambda: [message(ONE)], "a/C[1000000000] data\n" + "=" * 80 + "\nMSG: a/C\nint8 x\n"
     ),
+    "R7 msg: fewer than nothing": mcap(
+        lambda: [message(ONE)],
+        "a/D[-1000000000] less\na/C[1000000000] data\n"
+        + "=" * 80
+        + "\nMSG: a/C\nint8 x\n"
+        + "=" * 80
+        + "\nMSG: a/D\nint8 x\n",
+    ),
     "R7 msg: an array of texts": mcap(lambda: [message(ONE)], "string[1000000000] data"),
     "R7 msg: fields": mcap(lambda: [message(ONE)], "".join(f"float32 f{i}\n" for i in range(20_000))),
     "R7 msg: a tower": mcap(lambda: [message(ONE)], tower(12, 10)),

@@ -9,8 +9,9 @@ touches have there, and the touch is judged again. Then, for each way to compare
 
 d the model's probabilities, S the log-likelihoods of the kept touches, t which part of how the touch differs from them
 is noise (`Recollection.trust`), c how far noise leaves it to be seen that neighbouring values deviate together. g and r
-are fitted to touches left out, for the beginnings of touches at each of some moments (see `readouts.early`). The two
-ways weigh exp(COUNTED e), e the evidence for each, per value.
+are fitted to touches left out, for the beginnings of touches at each of some moments (see `readouts.early`). As noise
+and strangeness take the model's word, β goes to that of the kept touches alone. The two ways weigh exp(COUNTED e), e
+the evidence for each, per value.
 """
 
 from __future__ import annotations

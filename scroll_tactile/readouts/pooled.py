@@ -14,7 +14,7 @@ from scroll_tactile.readouts.likelihood import CLEAN
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
 
-__all__ = ["SURE", "Apart", "Pooled", "pool", "recalled_of"]
+__all__ = ["Apart", "Pooled", "pool", "recalled_of"]
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -256,6 +256,8 @@ class Recall:
         quiet = self._quiet(left_out)
         asked = _Asked.of(levels, self.longest, whole, quiet)
         found = self._compared(asked, left_out, noise, levels.shape[1])
+        if not quiet.any():
+            return found
         stuck = _Asked.of(levels, self.longest, whole, np.zeros_like(quiet))
         if np.array_equal(stuck.stuck, asked.stuck):
             return found

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import re
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ _DEFLATES = 1032  # times as many bytes at most
 _DEEPEST = 32  # groups of HDF5 within each other
 _VISIT = 20  # steps of work that it takes to look at one object
 _EPISODES = 1 << 16  # may be empty
+_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class _Arrays(Source):
@@ -110,13 +113,56 @@ class Npy(_Arrays):
         self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
         return array[begin:end]
 
-    def _array(self) -> Any:
+    def _array(self) -> _NpyArray:
         self.budget = Budget(self.address, stored_bytes(self.path))
-        array = np.load(self.path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(array, np.ndarray):
-            array.close()
-            raise RecordingError(f"expected one array in {self.address}; it is an archive of several, an .npz")
-        return array
+        return _NpyArray(self.path, self.address)
+
+
+class _NpyArray:
+    """The array of a `.npy`, of which rows are read when they are asked for.
+
+    It is not mapped: a file that another program cuts off meanwhile would end this one, and holes would take memory
+    where the disk is memory.
+    """
+
+    def __init__(self, path: Path, address: str) -> None:
+        self._path, self._address = path, address
+        with path.open("rb") as file:
+            if file.read(4) == b"PK\x03\x04":
+                raise RecordingError(f"expected one array in {address}; it is an archive of several, an .npz")
+            file.seek(0)
+            version = np.lib.format.read_magic(file)
+            if version not in _NPY_HEADERS:
+                raise RecordingError(f"{address} is a .npy of version {version}; expected numbers, version 1 or 2")
+            self.shape, self._columns_first, self.dtype = _NPY_HEADERS[version](file)
+            self._begin, size = file.tell(), os.fstat(file.fileno()).st_size
+        if self.dtype.hasobject:
+            raise RecordingError(f"{address} holds Python objects, which are not read; expected numbers")
+        if min(self.shape, default=0) < 0 or size < self._begin + math.prod(self.shape) * self.dtype.itemsize:
+            raise RecordingError(f"{address} ends before the array of {self.dtype} {self.shape} that it announces")
+
+    @property
+    def ndim(self) -> int:
+        """How many axes it has."""
+        return len(self.shape)
+
+    def __getitem__(self, rows: slice) -> Any:
+        """These rows, shape (rows, …); raises RecordingError where the file has been cut off."""
+        begin, end, _ = rows.indices(self.shape[0])
+        rest = self.shape[1:]
+        with self._path.open("rb") as file:
+            if not self._columns_first:
+                return self._read(file, begin * math.prod(rest), (end - begin) * math.prod(rest)).reshape(
+                    end - begin, *rest
+                )
+            parts = [self._read(file, i * self.shape[0] + begin, end - begin) for i in range(math.prod(rest))]
+        return np.stack(parts, axis=-1).reshape(end - begin, *rest, order="F")
+
+    def _read(self, file: Any, first: int, count: int) -> Any:
+        read = np.fromfile(file, self.dtype, count, offset=self._begin + first * self.dtype.itemsize - file.tell())
+        if len(read) < count:
+            raise RecordingError(f"{self._address} was cut off while it was read")
+        return read
 
 
 class Hdf5(_Arrays):

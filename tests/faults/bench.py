@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import random
+import resource
 import shutil
 import signal
 import time
@@ -46,6 +47,7 @@ from store.records import from_json
 
 SECONDS = 10  # of work in one case
 SPARE = 256 * 2**20  # bytes beyond the memory's own
+ADDRESSES = 3 * 2**30  # of which no case can take more, so that the machine lives
 KINDS = ("frames", "records", "rows", "bytes", "identities", "generations", "files", "tables")
 SHARES = (50, 32, 11, 3, 1, 2, 0.5, 0.5)
 QUICK = (64, 24, 8, 1.5, 1, 0.5, 0.5, 0.5)
@@ -63,6 +65,13 @@ class Told:
     outcomes: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     peak: int = 0
+
+
+def limit_addresses() -> None:
+    """From here on, this process can take ADDRESSES bytes of addresses more than it has now."""
+    now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    most = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (now + ADDRESSES, most))
 
 
 class Bench:

@@ -20,7 +20,6 @@ import argparse
 import faulthandler
 import json
 import os
-import resource
 import shutil
 import signal
 import sys
@@ -36,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from faults import recorded
-from faults.bench import Bench, Finding, Told, prepared
+from faults.bench import Bench, Finding, Told, limit_addresses, prepared
 from faults.common import folder, parser, progress, quiet_coroutines, run
 from faults.model import one_scale, warm
 from faults.named import NAMED
@@ -46,7 +45,6 @@ from faults.zygote import Child, Zygote
 from scroll_tactile.memory.gate import Gate
 
 NAMES = 2**40  # the number of the first case that has a name
-ADDRESSES = 3 * 2**30  # of which no case can take more, so that the machine lives
 BATCH = 250  # cases a process
 PATIENCE = 120  # seconds without a word from a child
 
@@ -58,8 +56,7 @@ def work(channel: Connection, home: Path, corpus: Any, options: argparse.Namespa
         faulthandler.enable(log)
         if options.case < 0:
             os.dup2(nowhere.fileno(), 2)
-        now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (now + ADDRESSES, now + ADDRESSES))
+        limit_addresses()
         make: Any = RecordingBench if options.recordings else Bench
         bench = make(home, *corpus, options, log)
         names = named(options)

@@ -12,6 +12,7 @@ import faulthandler
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
@@ -27,7 +28,7 @@ from typing import Any, TextIO
 import numpy as np
 from made import FORMATS
 
-from faults.bench import SECONDS, Told, begin_peak, is_memory, peak, place, remove, size
+from faults.bench import SECONDS, Told, begin_peak, is_memory, limit_addresses, peak, place, remove, size
 from faults.mutants import mutated_bytes, mutated_json
 from faults.odd_recordings import made, mutated_lines, spiced
 from faults.received import fingerprint
@@ -113,7 +114,9 @@ class RecordingBench:
         """Do an attack that has a name, before every reader."""
         told = Told(number, name, name.partition(" ")[0])
         self._clear()
-        path, options = ATTACKS[name](self.case, self.watched / "secret")
+        resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        path, options = ATTACKS[name](self.case, self.watched / "secret")  # which may need more than its readers get
+        limit_addresses()
         self.watching = fingerprint(self.watched)  # some need files of others
         for reader in READERS:
             self._read(reader, path, options, told)

@@ -318,12 +318,13 @@ def named(pattern: str) -> Attack:
 
 def equal_rows(path: Path, about: Any, *, dictionary: bool) -> None:
     """A parquet file of 3.6·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
-    count = 36_000_000
     name = "observation.tactile.tip"
     about["features"][name]["shape"] = [1]
-    table = pa.table({name: pa.array(np.zeros(count, "f4")), "timestamp": pa.array(np.zeros(count, "f8"))})
+    batch = pa.record_batch({name: np.zeros(1_000_000, "f4"), "timestamp": np.zeros(1_000_000, "f8")})
     file = path / "data/chunk-000/file-000.parquet"
-    pq.write_table(table, file, compression="zstd", row_group_size=count, use_dictionary=dictionary)
+    with pq.ParquetWriter(file, batch.schema, compression="zstd", use_dictionary=dictionary) as writer:
+        for _ in range(36):  # in one group of rows; whole, it does not fit into what an attacked process may take
+            writer.write_batch(batch, row_group_size=64_000_000)
 
 
 def parquet_file(name: str, write: Callable[[Path], Any]) -> Attack:

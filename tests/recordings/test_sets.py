@@ -1,8 +1,10 @@
 """Data sets of arrays: LeRobot, robomimic, Zarr replay buffers, `.npy`; and addresses."""
 
+import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import fsspec
@@ -181,6 +183,39 @@ def test_npy_of_any_shape(tmp_path):
         np.save(path, array)
         with pytest.raises(RecordingError, match=message):
             read(path)
+
+
+@pytest.mark.parametrize("shape", [(3000, 19), (3000, 4, 5, 3), (3000,)])
+def test_npy_of_columns_one_after_another(tmp_path, shape):
+    array = np.asfortranarray(RNG.normal(size=shape))
+    np.save(tmp_path / "a.npy", array)
+    expected = np.ascontiguousarray(array if array.ndim > 1 else array[:, None])
+    assert read(tmp_path / "a.npy").readings.tobytes() == expected.tobytes()
+
+
+def test_npy_that_is_cut_off_while_it_is_read(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((100_000, 19)))
+    blocks = iterate(path)
+    next(blocks)
+    os.truncate(path, 1 << 16)
+    with pytest.raises(RecordingError, match=r"a\.npy was cut off while it was read"):
+        list(blocks)
+
+
+def test_holes_of_npy_take_no_memory_where_the_disk_is_memory():
+    home = Path("/dev/shm")
+    if not os.access(home, os.W_OK):
+        pytest.skip("no file system in memory here")
+    with tempfile.TemporaryDirectory(dir=home) as folder:
+        path = Path(folder) / "a.npy"
+        np.save(path, np.zeros((2, 19)))
+        with path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (1 << 24,)})
+            file.truncate(128 + (1 << 26))
+        before = path.stat().st_blocks
+        assert len(read(path)) == 1 << 24
+        assert path.stat().st_blocks == before
 
 
 def test_addresses_of_file_systems(tmp_path):

@@ -1,7 +1,7 @@
 """Arrays and records that survive a power cut.
 
 A `Store` is a folder with a journal, whose rows are durable when `append` returns, and with
-generations: snapshots of arrays, each replaced as a whole. It knows nothing of what the arrays mean.
+checkpoints: snapshots of arrays, each replaced as a whole. It knows nothing of what the arrays mean.
 FORMAT.md beside this file describes every byte of it.
 
     with Store.open(path, identity={"made for": "this"}) as store:
@@ -24,16 +24,16 @@ from store.exceptions import (
     StoreFullError,
     VersionError,
 )
-from store.records import JSON, Generation, Head, Record
+from store.records import JSON, Checkpoint, Head, Record
 from store.repair import Repair, repair_store
 from store.store import Store
 from store.survey import Problem, check_store
 
 __all__ = [
     "JSON",
+    "Checkpoint",
     "CompactedError",
     "DamageError",
-    "Generation",
     "Head",
     "LockedError",
     "NotAStoreError",

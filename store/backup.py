@@ -4,29 +4,31 @@ from __future__ import annotations
 
 import os
 import shutil
-import sqlite3
-from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from tempfile import mkdtemp
 
-from store.exceptions import DamageError, NotAStoreError, reported
+from store.exceptions import DamageError, NotAStoreError, StoreError, reported
 from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
-from store.groups import PARTIAL, folder_name
-from store.reader import JournalReader
-from store.schema import GENERATIONS, JOURNAL_FILE
+from store.layout import (
+    PARTIAL,
+    Current,
+    checkpoint_path,
+    log_path,
+    read_current,
+    write_current,
+)
+from store.log import LogReader
 from store.survey import Progress, check_store
 
 __all__ = ["back_up"]
 
-LARGEST_FILE = 2**30  # of a generation
+LARGEST_FILE = 2**30  # of a checkpoint
+PART = 2**20  # bytes that are copied at once
+ATTEMPTS = 100  # while a writer commits one checkpoint after another
 
 
-def back_up(source: Path, destination: Path, named: Callable[[], set[int]], progress: Progress | None) -> None:
-    """Copy the store in folder `source` to the new folder `destination`, as `Store.backup`.
-
-    named: the numbers of the generations that the journal names at that moment.
-    """
+def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
+    """Copy the store in folder `source` to the new folder `destination`, as `Store.backup`."""
     if os.path.lexists(destination):
         raise NotAStoreError(f"{destination} is there already; nothing was written: give the name of a new folder")
     if any(same_folder(source, above) for above in destination.resolve().parents if above.is_dir()):
@@ -36,14 +38,7 @@ def back_up(source: Path, destination: Path, named: Callable[[], set[int]], prog
         draft = Path(mkdtemp(prefix=f"{destination.name}.", suffix=PARTIAL, dir=destination.parent))
         try:
             shutil.copymode(source, draft)
-            with closing(JournalReader(source / JOURNAL_FILE)) as reader:
-                while True:
-                    _copy_generations(source, draft, reader.connection, named)
-                    with closing(sqlite3.connect(draft / JOURNAL_FILE)) as copy:
-                        reader.connection.backup(copy)
-                    if not reader.renew():
-                        break
-                    remove_tree(draft / GENERATIONS)
+            _copy(source, draft)
             _verify(source, draft, progress)
             sync_tree(draft)
             draft.rename(destination)
@@ -53,24 +48,36 @@ def back_up(source: Path, destination: Path, named: Callable[[], set[int]], prog
             raise
 
 
-def _copy_generations(source: Path, draft: Path, connection: sqlite3.Connection, named: Callable[[], set[int]]) -> None:
-    """Copy the generations that the journal names, and leave the connection in a transaction that sees it so."""
-    while True:
-        connection.execute("BEGIN")
-        numbers = {number for (number,) in connection.execute("SELECT number FROM generation")}
-        failure = None
+def _copy(source: Path, draft: Path) -> None:
+    """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
+    for _ in range(ATTEMPTS):
+        current = read_current(source)
         try:
-            for number in numbers:
-                _copy_tree(source / GENERATIONS / folder_name(number), draft / GENERATIONS / folder_name(number))
-        except FileNotFoundError as error:
+            _copy_named(source, draft, current)
+            failure = None
+        except (FileNotFoundError, DamageError) as error:
             failure = error
-        # A writer removes a folder only after the journal has ceased to name it.
-        if numbers <= named():
+        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
+        if read_current(source) == current:
             if failure is not None:
                 raise failure
+            write_current(draft, current)
             return
-        connection.execute("ROLLBACK")
-        remove_tree(draft / GENERATIONS)
+        for entry in draft.iterdir():
+            remove_tree(entry)
+    raise StoreError(f"{source} changed {ATTEMPTS} times while it was copied: back it up when less is written")
+
+
+def _copy_named(source: Path, draft: Path, current: Current) -> None:
+    for named in current.checkpoints:
+        _copy_tree(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
+    # The log last: it has every row that the checkpoints contain.
+    with LogReader(log_path(source, current.log), payloads=False) as log:
+        for _ in log.refresh():
+            pass
+        with log_path(draft, current.log).open("xb") as copy:
+            for offset in range(0, log.place.offset, PART):
+                copy.write(log.bytes_at(offset, min(PART, log.place.offset - offset)))
 
 
 def _copy_tree(source: Path, target: Path) -> None:

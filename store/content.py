@@ -1,4 +1,4 @@
-"""What is said of a generation's arrays, in the journal's row and in the group itself, and how they lie in chunks."""
+"""What is said of a checkpoint's arrays and how they lie in chunks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from store.encoding import kept_dtype, require_name, require_shape
 
 __all__ = ["GROUP_VERSION", "ArrayContent", "read_content"]
 
-GROUP_VERSION = 2
+GROUP_VERSION = 1
 
 # Pieces of a large array: small enough to be compressed in cache-sized steps and verified before they are
 # decompressed, large enough that a hundred megabytes are some tens of files to make durable.
@@ -25,15 +25,12 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class ArrayContent:
-    """An array of a generation: of the elements and of each of its files the sha256, in hexadecimal.
-
-    `files` is None in groups of format 1, which do not have these.
-    """
+    """An array of a checkpoint: of the elements and of each of its files the sha256, in hexadecimal."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
     sha256: str
-    files: tuple[str, ...] | None = None
+    files: tuple[str, ...] = ()
 
     @property
     def plain(self) -> np.dtype:
@@ -73,30 +70,27 @@ class ArrayContent:
 
 
 def read_content(content: Mapping[str, Any]) -> dict[str, ArrayContent]:
-    """Return what a generation's content says of its arrays, by name; nothing where its format is newer.
+    """Return what a checkpoint says of its arrays, by name; nothing where its format is newer.
 
-    Raises ValueError where it says it in another way than `write_group`, today's or an earlier one, has it.
+    Raises ValueError where it says it in another way than `write_group` has it.
     """
     version, arrays = content.get("format"), content.get("arrays")
     if type(version) is not int or version < 1:
-        raise ValueError(f"the format of a generation is {version!r}, not a number")
+        raise ValueError(f"the format of a checkpoint is {version!r}, not a number")
     if version > GROUP_VERSION:
         return {}
     if not isinstance(arrays, dict):
-        raise ValueError("a generation does not say what its arrays are")
+        raise ValueError("a checkpoint does not say what its arrays are")
     if len({str(name).casefold() for name in arrays}) < len(arrays):
-        raise ValueError("two arrays of a generation have one name")
-    return {require_name(name): _read_array(name, described, version) for name, described in arrays.items()}
+        raise ValueError("two arrays of a checkpoint have one name")
+    return {require_name(name): _read_array(name, described) for name, described in arrays.items()}
 
 
-def _read_array(name: str, described: object, version: int) -> ArrayContent:
+def _read_array(name: str, described: object) -> ArrayContent:
     if not isinstance(described, dict):
         raise ValueError(f"of array {name!r} {str(described)[:80]} is said")
     dtype = kept_dtype(described.get("dtype"))
     shape, sha256 = require_shape(described.get("shape"), dtype), _sha256(described.get("sha256"))
-    if version == 1:
-        # Releases up to 0.2 have more here, which the sha256 covers.
-        return ArrayContent(dtype, shape, sha256)
     files = described.get("files")
     if not isinstance(files, list):
         raise ValueError(f"array {name!r} does not say what its files are")

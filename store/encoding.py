@@ -12,7 +12,7 @@ from math import prod
 import numpy as np
 
 from store.exceptions import RecordError, VersionError
-from store.frames import compress, decompress, decompress_blosc
+from store.frames import compress, decompress
 
 __all__ = [
     "array_digest",
@@ -28,18 +28,17 @@ __all__ = [
 ]
 
 MAGIC = b"ARPL"
-PAYLOAD_VERSION = 2
+PAYLOAD_VERSION = 1
 HEADER = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
-RAW, BLOSC, ZSTD = 0, 1, 2
-COMPRESSED = {1: BLOSC, 2: ZSTD}  # by the payload's version
+RAW, ZSTD = 0, 1
 
 SMALL = 128  # bytes, of which compressing saves next to nothing
 
 # Of a small payload that stands for gigabytes nobody is to make room for these. `encode_payload` keeps to it.
 SPARE, RATIO = 64 * 2**20, 16
 
-# SQLite refuses blobs above 1e9 bytes, and a row this large stalls every append behind it.
+# A row this large stalls every append behind it.
 LARGEST_PAYLOAD = 256 * 2**20
 
 KEPT_TYPES = frozenset(["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"])
@@ -240,7 +239,7 @@ def _descriptions(payload: bytes) -> tuple[list[_Described], int]:
             f"a record's arrays are written in payload format {version}; this release reads up to "
             f"{PAYLOAD_VERSION}: upgrade it"
         )
-    if version not in COMPRESSED:
+    if version < 1:
         raise ValueError(f"there is no payload format {version}")
     start, described = HEADER.size, []
     for _ in range(count):
@@ -255,7 +254,7 @@ def _descriptions(payload: bytes) -> tuple[list[_Described], int]:
         start += 1 + 8 * axes + LENGTHS.size
         if size != prod(shape) * dtype.itemsize:
             raise ValueError(f"array {name!r} of shape {shape} and dtype {dtype} is said to have {size} bytes")
-        if codec not in (RAW, COMPRESSED[version]) or (codec == RAW and stored != size):
+        if codec not in (RAW, ZSTD) or (codec == RAW and stored != size):
             raise ValueError(f"array {name!r} has codec {codec} and {stored} bytes for {size}")
         described.append(_Described(name, dtype, shape, codec, size, stored))
     return described, start
@@ -266,8 +265,6 @@ def _filled(part: _Described, buffer: bytes) -> np.ndarray:
     target = flat_bytes(array)
     if part.codec == RAW:
         target[:] = np.frombuffer(buffer, np.uint8)
-    elif part.codec == BLOSC:
-        decompress_blosc(buffer, target)
     else:
         decompress(buffer, target, item_size(part.dtype))
     require_values(array)

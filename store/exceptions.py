@@ -16,7 +16,6 @@ Exception
 from __future__ import annotations
 
 import errno
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -25,7 +24,6 @@ from typing import Any
 
 __all__ = [
     "FULL",
-    "SQLITE_ERRORS",
     "CompactedError",
     "DamageError",
     "LockedError",
@@ -36,21 +34,11 @@ __all__ = [
     "StoreError",
     "StoreFullError",
     "VersionError",
-    "from_sqlite",
-    "is_damage",
     "reported",
 ]
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-
-# SQLite says IOERR, not FULL, when it cannot grow the shared memory beside the journal.
-IOERR_SHMSIZE = 10 | (19 << 8)
-IOERR_SHORT_READ = 10 | (2 << 8)
-DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_INTERRUPT})
-
-# The second where a message quotes damaged text that Python cannot decode.
-SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 
 
 class StoreError(Exception):
@@ -120,14 +108,12 @@ class RecordError(StoreError, ValueError):
 
 @contextmanager
 def reported(path: Path, doing: str) -> Iterator[None]:
-    """Run the block; raise an OSError or an error of SQLite in it as the StoreError that it amounts to.
+    """Run the block; raise an OSError in it as the StoreError that it amounts to.
 
     `path` is the file or folder concerned and `doing` completes "while …" in the message.
     """
     try:
         yield
-    except SQLITE_ERRORS as error:
-        raise from_sqlite(error, path, doing) from error
     except OSError as error:
         raise _from_system(error, path, doing) from error
 
@@ -140,38 +126,3 @@ def _from_system(error: OSError, path: Path, doing: str) -> StoreError:
     if error.errno in FORBIDDEN:
         return ReadOnlyError(f"{where} is not open to this user while {doing} ({error.strerror})")
     return StoreError(f"{where}: {error.strerror or error} while {doing}")
-
-
-def is_damage(error: sqlite3.Error | UnicodeDecodeError) -> bool:
-    """Return whether the error says that the file is not as SQLite, or the store, wrote it."""
-    if isinstance(error, UnicodeDecodeError):
-        return True
-    extended: int = getattr(error, "sqlite_errorcode", -1)
-    code = extended & 0xFF
-    if code == sqlite3.SQLITE_ERROR:
-        # Our statements are right: so tables or columns are missing, or their description is unreadable.
-        return str(error).startswith(("no such", "malformed", "unsupported file format"))
-    # Interrupted, because it took more steps than the file has room for.
-    return code in DAMAGED or extended == IOERR_SHORT_READ
-
-
-def from_sqlite(error: sqlite3.Error | UnicodeDecodeError, path: Path, doing: str) -> StoreError:
-    """Return the StoreError for a failed call of SQLite, by its result code."""
-    # Errors that Python itself raises, such as text that is not UTF-8, carry no code.
-    extended: int = getattr(error, "sqlite_errorcode", -1)
-    code = extended & 0xFF
-    if code == sqlite3.SQLITE_FULL or extended == IOERR_SHMSIZE:
-        return StoreFullError(f"no space left for {path} while {doing}: free some space and call again")
-    if is_damage(error):
-        return DamageError(
-            f"{path} is damaged ({error}) while {doing}: copy the folder before anything else, then repair the "
-            "store (repair_store)",
-            path=path,
-        )
-    if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):
-        return ReadOnlyError(f"{path} may not be written while {doing} ({error})")
-    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        return LockedError(f"another program is inside {path} while {doing} ({error}): close it there")
-    if code == sqlite3.SQLITE_TOOBIG:
-        return RecordError(f"the record is larger than SQLite takes while {doing}: keep it in a generation")
-    return StoreError(f"{path}: {error} while {doing}")

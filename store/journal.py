@@ -1,110 +1,272 @@
-"""The journal: rows in SQLite, each durable before `insert` returns and verified when it is read."""
+"""The journal: the rows of a store's log by their sequence, each durable before `insert` returns."""
 
 from __future__ import annotations
 
 import logging
-import sqlite3
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from array import array
+from bisect import bisect_right
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
-from store.reader import JournalReader, Limits
-from store.records import (
-    GENERATION_COLUMNS,
-    HEAD_COLUMNS,
-    JSON,
-    GenerationRow,
-    Head,
-    Record,
-    checksum,
-    from_json,
-    lost_heads,
-    payload_digest,
-    read_head,
-    read_meta,
-    uncovered,
-)
-from store.schema import connect_to_write
+from store.files import sync_folder
+from store.framing import Frame
+from store.layout import CURRENT_FILE, Current, log_path, read_current
+from store.log import LogReader, Place
+from store.log_writer import LogWriter
+from store.records import JSON, Head, Record, from_json
+from store.row_encoding import HEAD_BYTES, ROW, decode_head, decode_row, encode_row, head_size, row_sequence
 
-__all__ = ["Journal"]
+__all__ = ["Journal", "Rows"]
 
 logger = logging.getLogger(__name__)
 
-# Rows read at once where their arrays are not: a reader that pauses must hold no transaction open,
-# for that would keep the write-ahead log from ever being emptied.
-TOGETHER = 4096
+LAST_SEQUENCE = 2**62  # far beyond what anybody appends
+USUAL_HEAD = 512  # bytes that are read at once of a row's head
+ATTEMPTS = 8  # of a reader, while a writer puts another log in the place of the one
+MOST_PLACES = 4096
 
-# Far beyond what anybody appends, and short of where SQLite's integers end.
-LAST_SEQUENCE = 2**62
+
+class Rows:
+    """Which rows a log holds, in order: sequence, offset and size of each; and where damage lies between them."""
+
+    def __init__(self) -> None:
+        self.sequences, self.offsets, self.sizes = array("Q"), array("Q"), array("Q")
+        self.damage: dict[int, list[DamageError]] = {}  # by the count of the rows before it
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def add(self, sequence: int, frame: Frame) -> None:
+        """Add the row in a frame."""
+        self.sequences.append(sequence)
+        self.offsets.append(frame.offset)
+        self.sizes.append(frame.size)
+
+    def cut(self, count: int) -> None:
+        """Keep the first rows alone."""
+        del self.sequences[count:], self.offsets[count:], self.sizes[count:]
+
+    def extend(self, rows: Rows) -> None:
+        """Add rows behind these."""
+        for index, damage in rows.damage.items():
+            self.damage.setdefault(len(self) + index, []).extend(damage)
+        self.sequences += rows.sequences
+        self.offsets += rows.offsets
+        self.sizes += rows.sizes
+
+    def take(self, log: LogReader, until: int | None = None) -> Iterator[Place]:
+        """Add the rows that follow in a log, up to an offset; yield the place behind each batch. Damage is noted."""
+        while True:
+            try:
+                for batch in log.refresh():
+                    for frame in batch:
+                        if until is not None and frame.offset >= until:
+                            return
+                        if frame.kind == ROW:
+                            self._take(log, frame)
+                    yield log.place
+                return
+            except DamageError as damage:
+                self.damage.setdefault(len(self), []).append(damage)
+                log.resume()
+
+    def _take(self, log: LogReader, frame: Frame) -> None:
+        try:
+            sequence = row_sequence(log.peek(frame.offset, min(HEAD_BYTES, frame.size)))
+            if self.sequences and sequence <= self.sequences[-1]:
+                raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
+        except ValueError as error:
+            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
+            self.damage.setdefault(len(self), []).append(DamageError(what, path=log.path, offset=frame.offset))
+        else:
+            self.add(sequence, frame)
+
+
+class _OpenLog:
+    """The log that `CURRENT` names, opened, and what is known of its rows.
+
+    first: the last row before those that are known; read_all: whether there are none before these. places: rows, and
+    where in the log all behind them follow.
+    """
+
+    def __init__(self, folder: Path, current: Current, *, write: bool) -> None:
+        self.current, self.path = current, log_path(folder, current.log)
+        self.rows, self.first = Rows(), 0
+        named = current.newest
+        self.log = self._reader(None if named is None else named.place, write=write)
+        try:
+            if self.log.identity != current.log_identity:
+                raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
+            self.identity = self._read_identity()
+            if named is not None and self.log.place == named.place:
+                self.first = named.upto
+            self.read_all = self.first == 0
+            self.places = [(self.first, self.log.place)]
+            self.catch_up()
+            if write:
+                self._begin_writing()
+        except BaseException:
+            self.log.close()
+            raise
+
+    def _reader(self, place: Place | None, *, write: bool) -> LogReader:
+        """Return the log from a place on; where that is not in it a reader begins at the beginning."""
+        try:
+            return LogReader(self.path, place=place)
+        except DamageError as damage:
+            if write or place is None or not self.path.exists():
+                raise
+            logger.warning("%s; reading all of it", damage)
+            return LogReader(self.path)
+
+    def _read_identity(self) -> dict[str, JSON]:
+        try:
+            return from_json(self.log.header.decode())
+        except ValueError as error:
+            raise DamageError(f"the identity in {self.path} was never written so: {error}", path=self.path) from error
+
+    def _begin_writing(self) -> None:
+        for damage in self.rows.damage.values():
+            raise DamageError(
+                f"{damage[0]}: repair the store (repair_store) before anything is appended behind it", path=self.path
+            )
+        self.log.close()
+        self.log = LogWriter(self.path, place=self.log.place)
+
+    def catch_up(self) -> None:
+        """Take in what was committed since."""
+        for behind in self.rows.take(self.log):
+            self.note_place(behind)
+
+    def note_place(self, place: Place) -> None:
+        """Note the place behind all rows that are known."""
+        self.places.append((self.last_row, place))
+        if len(self.places) > MOST_PLACES:
+            del self.places[1:-1:2]
+
+    @property
+    def last_row(self) -> int:
+        """The sequence of the last row that is known."""
+        return self.rows.sequences[-1] if self.rows.sequences else self.first
+
+    @property
+    def last(self) -> int:
+        """The last row, or the last that a checkpoint contains, if later."""
+        # A checkpoint counts only when rows were lost: then their numbers must not be given out again.
+        return max([self.last_row, *(named.upto for named in self.current.checkpoints)])
+
+    def find(self, after: int) -> int:
+        """Return the index of the first row behind `after`, once all rows from there on are known."""
+        if after < self.first and not self.read_all:
+            self._read_before()
+        return bisect_right(self.rows.sequences, after)
+
+    def _read_before(self) -> None:
+        earlier, until = Rows(), self.places[0][1].offset
+        with LogReader(self.path, payloads=False) as reader:
+            if reader.identity != self.log.identity:
+                raise StoreError(f"{self.path} was replaced while it was read: call again")
+            for _ in earlier.take(reader, until):
+                pass
+        earlier.extend(self.rows)
+        self.rows, self.read_all = earlier, True
+
+    def head(self, index: int) -> Head:
+        """Return the head of a row. Raises DamageError, and ValueError for what is none."""
+        offset, size = self.rows.offsets[index], self.rows.sizes[index]
+        data = self.log.peek(offset, min(size, USUAL_HEAD))
+        if (needed := head_size(data, size)) > len(data):
+            data = self.log.peek(offset, needed)
+        return decode_head(data, size)
+
+    def data(self, index: int) -> bytes:
+        """Return the bytes of a row, verified. Raises DamageError."""
+        return self.log.read(self.rows.offsets[index], self.rows.sizes[index])[1]
 
 
 class Journal:
-    """An open journal file, usable from any thread; raises the store's own errors."""
+    """The journal of the store in `folder`, usable from any thread; raises the store's own errors.
 
-    def __init__(self, path: Path, *, write: bool) -> None:
-        self.path = path
+    To write, it is opened by whoever holds the writer's lock; a damaged end is refused then, for what is appended
+    would lie behind it.
+    """
+
+    def __init__(self, folder: Path, *, write: bool) -> None:
+        self.folder, self._write = folder, write
         self._guard = threading.RLock()
-        self._connection: sqlite3.Connection | None = None
-        self._batch = False
-        self._reader: JournalReader | None = None
-        with reported(path, "opening the journal"):
-            if write:
-                self._connection = connect_to_write(path)
-                self._limits = Limits(path, self._connection)
-            else:
-                self._reader = JournalReader(path)
-        try:
-            self.identity = self._read_identity()
-            self._last = self.last() if write else 0
-        except BaseException:
-            self.close()
-            raise
+        self._batch = self._failed = False
+        self._unsettled = False
+        with reported(folder, "opening the journal"):
+            self._open: _OpenLog | None = self._opened()
+
+    def _opened(self) -> _OpenLog:
+        for _ in range(ATTEMPTS):
+            current = read_current(self.folder)
+            try:
+                return _OpenLog(self.folder, current, write=self._write)
+            except FileNotFoundError as error:
+                # A writer removes a log after another has taken its place.
+                if read_current(self.folder) == current:
+                    path = log_path(self.folder, current.log)
+                    raise DamageError(
+                        f"{path}, which {self.folder / CURRENT_FILE} names, is not there: put it back from a copy, or "
+                        "repair the store (repair_store), which resumes from what verifies",
+                        path=path,
+                    ) from error
+        raise StoreError(f"{self.folder} is compacted again and again: open it later")
 
     @contextmanager
-    def _using(self, doing: str) -> Iterator[sqlite3.Connection]:
-        with self._guard, reported(self.path, doing):
-            if self._connection is None:
-                raise StoreClosedError(f"the store of {self.path} is closed")
-            self._limits.begin()
-            yield self._connection
+    def _using(self, doing: str) -> Iterator[_OpenLog]:
+        with self._guard, reported(self.folder, doing):
+            if self._open is None:
+                raise StoreClosedError(f"the store in {self.folder} is closed")
+            yield self._open
 
-    def _fetch(self, doing: str, query: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        """Return the rows of a query, those of a writer's own transaction, too."""
-        with self._guard, reported(self.path, doing):
-            if self._reader is not None:
-                return self._reader.fetch(query, values)
-            if self._connection is None:
-                raise StoreClosedError(f"the store of {self.path} is closed")
-            return self._limits.fetch(query, values)
+    @contextmanager
+    def _looking(self, doing: str) -> Iterator[_OpenLog]:
+        """The log in use, of a reader after it has read what was committed since."""
+        with self._using(doing) as at:
+            yield at if self._write else self._renewed(at)
 
-    def _read_identity(self) -> dict[str, JSON]:
-        meta = read_meta(self._fetch("reading what the store is for", "SELECT key, value, checksum FROM meta"))
-        self._lost = lost_heads(meta)
-        try:
-            return from_json(meta["identity"])
-        except (KeyError, ValueError) as error:
-            raise DamageError(
-                f"the identity in {self.path}, table meta, fails its checksum: repair the store (repair_store), "
-                "which takes it from a generation",
-                path=self.path,
-            ) from error
+    def _renewed(self, at: _OpenLog) -> _OpenLog:
+        current = read_current(self.folder)
+        if current.log == at.current.log:
+            at.current = current
+            try:
+                at.catch_up()
+                return at
+            except DamageError:
+                raise
+            except StoreError as error:  # its writer took back what had been read
+                logger.info("%s", error)
+        self._open = self._opened()
+        at.log.close()
+        return self._open
+
+    @property
+    def identity(self) -> dict[str, JSON]:
+        """What the store is for."""
+        with self._using("reading what the store is for") as at:
+            return at.identity
+
+    def current(self) -> Current:
+        """Return what `CURRENT` says, for a reader at this moment."""
+        with self._looking("looking for checkpoints") as at:
+            return at.current
+
+    def committed(self, current: Current) -> None:
+        """Take note of what was just written as `CURRENT`, with the same log."""
+        with self._using("committing") as at:
+            at.current = current
 
     def last(self) -> int:
-        """Return the sequence of the last row, or the last that a generation contains, if later; or 0."""
-        # Payloads and generations count only when rows were lost: then their numbers must not be given out
-        # again, and whoever reads on to the last must meet the gap.
-        query = (
-            "SELECT max(coalesce((SELECT max(sequence) FROM record), 0),"
-            " coalesce((SELECT max(sequence) FROM payload), 0)), (SELECT max(upto) FROM generation)"
-        )
-        ((last, upto),) = self._fetch("looking for the last row", query)
-        if upto is None or (isinstance(upto, int) and upto <= last):
-            return int(last)
-        return max([int(last), *(row.upto for row in self.generations() if row.sound)])
+        """Return the sequence of the last row, or the last that a checkpoint contains, if later; or 0."""
+        with self._looking("looking for the last row") as at:
+            return at.last
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -114,190 +276,193 @@ class Journal:
         """
         with self._guard:
             self.refuse_in_batch("beginning a batch")
-            with self._using("beginning a batch") as connection:
-                connection.execute("BEGIN IMMEDIATE")
-            self._batch = True
-            # Not inside `_using`: what the block itself raises is not the store's error.
+            at, writer = self._writing("beginning a batch")
+            count = len(at.rows)
+            self._batch, self._failed = True, False
             try:
                 yield
-                with self._using("making a batch durable"):
-                    if not connection.in_transaction:
-                        raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
-                    connection.execute("COMMIT")
+                if self._failed:
+                    raise StoreError(f"nothing of this batch was kept in {self.folder}: a row of it failed")
+                writer.commit()
+                at.note_place(writer.place)
             except BaseException:
-                self._undo_batch(connection)
+                self._undo(at, writer, count)
                 raise
             finally:
                 self._batch = False
-
-    def _undo_batch(self, connection: sqlite3.Connection) -> None:
-        try:
-            with self._using("rolling a batch back"):
-                connection.rollback()
-                self._last = self.last()
-        except StoreError as error:
-            # The caller has to learn what ended the batch; the next insert rolls back again.
-            logger.warning("%s: a batch could not be rolled back yet: %s", self.path, error)
 
     def refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
         with self._guard:
             if self._batch:
-                raise StoreError(f"{doing} is not possible in a batch of {self.path}: end it first")
+                raise StoreError(f"{doing} is not possible in a batch of {self.folder}: end it first")
+
+    def _writing(self, doing: str) -> tuple[_OpenLog, LogWriter]:
+        with self._using(doing) as at:
+            assert isinstance(at.log, LogWriter), "a store that is read refuses before"
+            if self._unsettled:
+                # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
+                sync_folder(self.folder)
+                self._unsettled = False
+            return at, at.log
 
     def insert(self, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes) -> int:
         """Add a row and return its sequence once it is durable, or, in a batch, once it is written.
 
         After any error the row is not there, nor any other of its batch.
         """
-        with self._using("appending a row") as connection:
-            if self._batch and not connection.in_transaction:
-                raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
-            if (sequence := self._last + 1) > LAST_SEQUENCE:
-                raise DamageError(f"{self.path} has a row, or a generation, of number {self._last}", path=self.path)
-            digest = payload_digest(payload)
-            fields = (sequence, kind.encode(), label.encode(), key, time, attributes.encode(), len(payload), digest)
-            values = (sequence, kind, label, key, time, attributes, len(payload), digest, checksum("record", *fields))
+        with self._guard:
+            at, writer = self._writing("appending a row")
+            count = len(at.rows)
+            if self._batch and self._failed:
+                raise StoreError(f"nothing more can be appended to {self.folder} in this batch: a row of it failed")
+            if (sequence := at.last + 1) > LAST_SEQUENCE:
+                raise DamageError(f"{at.path} has a row, or a checkpoint, of number {at.last}", path=at.path)
+            data = encode_row(sequence, kind, label, key, time, attributes, payload, len(payload))
             try:
+                at.rows.add(sequence, writer.stage(ROW, data))
                 if not self._batch:
-                    connection.execute("BEGIN IMMEDIATE")
-                connection.execute(f"INSERT INTO record ({HEAD_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?)", values)
-                connection.execute("INSERT INTO payload (sequence, bytes) VALUES (?,?)", (sequence, payload))
-                if not self._batch:
-                    connection.execute("COMMIT")
+                    writer.commit()
+                    at.note_place(writer.place)
             except BaseException:
-                connection.rollback()
-                # A failed sync may have left the row in place: then its number is taken.
-                self._last = self.last()
+                self._failed = True
+                self._undo(at, writer, count)
                 raise
-            self._last = sequence
             return sequence
+
+    @staticmethod
+    def _undo(at: _OpenLog, writer: LogWriter, count: int) -> None:
+        """Take back what is not durable; what was committed before an interruption stays, and is known."""
+        writer.rollback()
+        offsets = at.rows.offsets
+        while count < len(at.rows) and offsets[count] < writer.place.offset:
+            count += 1
+        at.rows.cut(count)
+        at.note_place(writer.place)
+
+    def place(self, upto: int) -> Place:
+        """Return a place in the log that all rows behind `upto` are behind."""
+        with self._using("looking for a place") as at:
+            found = bisect_right(at.places, upto, key=lambda noted: noted[0])
+            return at.places[max(found - 1, 0)][1]
 
     def rows(
         self, after: int, last: int, *, arrays: bool, kind: str | None = None, label: str | None = None
     ) -> Iterator[Head]:
         """Yield the verified rows behind `after` up to `last`, of one kind or label only where it is given.
 
-        arrays: as records, one in memory at a time. Raises DamageError at the first that fails its checksum, whose
-        arrays do or are missing, or that is missing itself where all are asked for; CompactedError where a base has
-        the arrays' place.
+        arrays: as records, one in memory at a time. Raises DamageError at the first that is not as it was written,
+        or that is missing itself where all are asked for; CompactedError where a base has the arrays' place.
         """
-        chosen = {column: value for column, value in (("kind", kind), ("label", label)) if value is not None}
-        where = " AND ".join(["sequence > ?", "sequence <= ?", *(f"{column} = ?" for column in chosen)])
-        payload = ", (SELECT bytes FROM payload WHERE sequence = record.sequence)" if arrays else ""
-        together = 1 if arrays else TOGETHER
-        query = f"SELECT {HEAD_COLUMNS}{payload} FROM record WHERE {where} ORDER BY sequence LIMIT {together}"
+        chosen = kind is not None or label is not None
         while after < last:
-            rows = self._fetch(f"reading rows behind {after}", query, (after, last, *chosen.values()))
-            for *fields, payload in rows if arrays else ((*row, b"") for row in rows):
-                if fields[0] <= after:
-                    raise self._damage(f"row {fields[0]} follows row {after} in", fields[0])
+            head = None
+            with self._using(f"reading rows behind {after}") as at:
+                index = at.find(after)
+                found = at.rows.sequences[index] if index < len(at.rows) else last + 1
                 if not chosen:
-                    self._require_no_gap(after + 1, fields[0] - 1)
-                found = read_head(tuple(fields))
-                if found is None:
-                    raise self._damage(f"row {fields[0]} fails its checksum in", fields[0])
-                yield self._record(*found, payload) if arrays else found[0]
-                after = fields[0]
-            if len(rows) < together:
-                if not chosen:
-                    self._require_no_gap(after + 1, last)
-                return
+                    self._require_no_gap(at, after, min(found - 1, last), index)
+                if found > last:
+                    return
+                try:
+                    head = self._record(at, index) if arrays else self._head(at, index)
+                except DamageError:
+                    if not chosen:
+                        raise
+            after = found
+            if head is not None and kind in (None, head.kind) and label in (None, head.label):
+                yield head
 
-    def _require_no_gap(self, first: int, last: int) -> None:
-        for begin, end in uncovered(first, last, self._lost):
-            raise self._damage(f"rows {begin} to {end} are missing from", end)
+    def _require_no_gap(self, at: _OpenLog, after: int, through: int, index: int) -> None:
+        first = max(after, at.current.compacted) + 1  # before that a repair may have left some out
+        if first > through:
+            return
+        missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
+        why = at.rows.damage.get(index)
+        raise self._damage(at, f"{missing}{'' if why is None else f' ({why[0]})'} from", through)
 
-    def _record(self, head: Head, digest: bytes, payload: object) -> Record:
-        if payload is None:
-            if head.sequence <= self.compacted():
-                raise self.given_up(head.sequence)
-            raise self._damage(f"the arrays of row {head.sequence} are missing from", head.sequence)
-        # A flipped bit can also change a value's type.
-        if not isinstance(payload, bytes) or payload_digest(payload) != digest:
-            raise self._damage(f"the arrays of row {head.sequence} fail their checksum in", head.sequence)
+    def _head(self, at: _OpenLog, index: int) -> Head:
+        sequence = at.rows.sequences[index]
         try:
-            return Record(**vars(head), arrays=decode_payload(payload))
-        except (TypeError, ValueError) as error:  # anybody can make the checksum
-            what = f"the arrays of row {head.sequence} were never written so ({error}) in"
-            raise self._damage(what, head.sequence) from error
+            head = at.head(index)
+            if head.sequence != sequence:
+                raise ValueError(f"it has the number {head.sequence}")
+        except ValueError as error:
+            raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
+        return head
+
+    def _record(self, at: _OpenLog, index: int) -> Record:
+        sequence = at.rows.sequences[index]
+        try:
+            row = decode_row(at.data(index))
+            if row.head.sequence != sequence:
+                raise ValueError(f"it has the number {row.head.sequence}")
+            if row.payload is None:
+                if sequence <= at.current.compacted:
+                    raise self.given_up(sequence)
+                raise ValueError("its arrays are missing")
+            return Record(**vars(row.head), arrays=decode_payload(row.payload))
+        except (DamageError, ValueError) as error:
+            raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
 
     def given_up(self, sequence: int) -> CompactedError:
         """Return the error for a row whose arrays a base stands for."""
+        with self._using("looking for a base") as at:
+            compacted = at.current.compacted
         return CompactedError(
-            f"the arrays of row {sequence} of {self.path} were given up when rows 1 to {self.compacted()} were "
-            "compacted"
+            f"the arrays of row {sequence} of {self.folder} were given up when rows 1 to {compacted} were compacted"
         )
 
-    def compacted(self) -> int:
-        """Return the last row that has given up its arrays for a base, 0 where none has."""
-        query = f"SELECT {GENERATION_COLUMNS} FROM generation WHERE base"
-        rows = [GenerationRow(*row) for row in self._fetch("looking for a base", query)]
-        # One that fails its checksum does not count: then the rows themselves say that their arrays are missing.
-        return max((row.upto for row in rows if row.sound), default=0)
-
-    def _damage(self, what: str, sequence: int) -> DamageError:
-        query = "SELECT number, upto FROM generation WHERE upto >= ? ORDER BY number DESC LIMIT 1"
-        try:
-            covering = self._fetch("looking for a generation", query, (sequence,))
-            still = "no generation contains it"
-            if covering:
-                still = f"generation {covering[0][0]} (up to row {covering[0][1]}) still contains it"
-        except StoreError:
-            still = "the table of generations cannot be read either"
+    @staticmethod
+    def _damage(at: _OpenLog, what: str, sequence: int) -> DamageError:
+        named = next((named for named in at.current.checkpoints if named.upto >= sequence), None)
+        still = "no checkpoint contains it"
+        if named is not None:
+            still = f"checkpoint {named.number} (up to row {named.upto}) still contains it"
         return DamageError(
-            f"{what} {self.path}; {still}; records(after={sequence}) continues behind it",
-            path=self.path,
+            f"{what} {at.path}; {still}; records(after={sequence}) continues behind it",
+            path=at.path,
             sequence=sequence,
         )
 
-    def generations(self) -> list[GenerationRow]:
-        """Return the rows of the committed generations, the newest first, not yet verified."""
-        query = f"SELECT {GENERATION_COLUMNS} FROM generation ORDER BY upto DESC, number DESC"
-        return [GenerationRow(*row) for row in self._fetch("looking for generations", query)]
+    def payloads(self, last: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the sequence and the bytes of each row up to `last`, in order; heads that are lost are left out.
 
-    def newest(self) -> int | None:
-        """Return the number of the newest generation, None when there is none."""
-        query = "SELECT number FROM generation ORDER BY upto DESC, number DESC LIMIT 1"
-        rows = self._fetch("looking for the newest generation", query)
-        return int(rows[0][0]) if rows else None
-
-    def make_current(self, row: GenerationRow, *, forget: Iterable[int]) -> None:
-        """In one transaction make `row` a generation and drop the rows numbered in `forget`.
-
-        Where it is a base the rows up to its `upto` give up their arrays in the same transaction.
+        Raises DamageError. Nothing can be appended meanwhile.
         """
-        with self._using(f"committing generation {row.number}") as connection:
-            self.refuse_in_batch("committing a generation")
+        with self._using("reading rows") as at:
+            for index in range(at.find(0), len(at.rows)):
+                sequence = at.rows.sequences[index]
+                if sequence > last:
+                    return
+                try:
+                    data = at.data(index)
+                except DamageError as error:
+                    raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
+                yield sequence, data
+
+    @contextmanager
+    def switching(self) -> Iterator[None]:
+        """In the block another log takes the place of this one, and nothing is appended; afterwards that is used."""
+        with self._using("putting another log in place") as at:
             try:
-                connection.execute("BEGIN IMMEDIATE")
-                connection.execute(
-                    f"INSERT INTO generation ({GENERATION_COLUMNS}) VALUES (?,?,?,?,?,?,?)", row.values()
-                )
-                connection.executemany("DELETE FROM generation WHERE number = ?", [(old,) for old in forget])
-                if row.base:
-                    connection.execute("DELETE FROM payload WHERE sequence <= ?", (row.upto,))
-                connection.execute("COMMIT")
-            except BaseException:
-                connection.rollback()
-                raise
+                yield
+            finally:
+                # A sync that failed leaves it open which of the two is named.
+                if read_current(self.folder).log != at.current.log:
+                    self._unsettled = True
+                    self._open = self._opened()
+                    at.log.close()
+            self._writing("putting another log in place")
 
-    def shrink(self) -> None:
-        """Give the space of what was dropped back to the disk; needs as much again meanwhile.
-
-        Raises StoreError where that is not to be had, or where a reader is in the file just now.
-        """
-        with self._using("giving back space") as connection:
-            connection.execute("VACUUM")
-            (busy, *_) = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
-            if busy:
-                raise StoreError(f"{self.path} is being read just now; it shrinks when the store is closed")
+    def size(self) -> int:
+        """Return the bytes of the log."""
+        with self._looking("measuring the log") as at:
+            return at.path.lstat().st_size
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
-        with self._guard, reported(self.path, "closing the journal"):
-            reader, self._reader = self._reader, None
-            connection, self._connection = self._connection, None
-            for each in (reader, connection):
-                if each is not None:
-                    each.close()
+        with self._guard, reported(self.folder, "closing the journal"):
+            at, self._open = self._open, None
+            if at is not None:
+                at.log.close()

@@ -10,6 +10,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -20,7 +21,7 @@ from store.files import open_regular
 from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
 from store.records import LARGEST_NUMBER, payload_digest
 
-__all__ = ["LogFile", "LogReader", "Place"]
+__all__ = ["LogFile", "LogReader", "Place", "find_identity"]
 
 PART = 2**18  # bytes that are read at once
 # A window older than the file, what a writer is just writing, and damage look alike the first time, and not the third.
@@ -156,21 +157,35 @@ class LogReader:
     kept elsewhere, and given again, it saves reading what is before it. A batch can be read an instant before it is
     durable. One thread at a time may refresh; any may read.
 
+    payloads: whether `refresh` verifies these, too; where it does not, `read` still does. identity: of a log whose
+    first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
+
     Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
     """
 
     WRITES = False
 
-    def __init__(self, path: Path, *, place: Place | None = None) -> None:
+    def __init__(
+        self, path: Path, *, place: Place | None = None, payloads: bool = True, identity: bytes | None = None
+    ) -> None:
         self.path = path
+        self._payloads = payloads
+        self.header_damage: DamageError | None = None
         with reported(path, "opening the log"):
             self._file = LogFile(path, write=self.WRITES)
             try:
                 self._window = _Window(self._file)
                 self._torn: Place | None = None
                 self._proved: Frame | None = None
-                self._last = self._first = self._read_header()
-                self.place = Place.behind(self._last)
+                self._first: Frame | None = None
+                try:
+                    self._first = self._read_header()
+                    self.place = Place.behind(self._first)
+                except DamageError as damage:
+                    if identity is None:
+                        raise
+                    self._begin_without_header(identity, damage)
+                self._last = self._first
                 if place is not None and place != self.place:
                     self._last = self._commit_before(place)
                     self.place = place
@@ -196,6 +211,12 @@ class LogReader:
         self.header = self._payload(frame)
         return frame
 
+    def _begin_without_header(self, identity: bytes, damage: DamageError) -> None:
+        self.header, self.identity, self._mark, self.header_damage = b"", identity, MARK + identity, damage
+        self._torn = self.place = Place(0, 0, 0, NO_CHECKSUM)
+        with suppress(DamageError):
+            self.resume()
+
     def _commit_before(self, place: Place) -> Frame:
         offset = place.offset - FRAME_BYTES
         is_inside = 0 < offset < self._file.size()
@@ -220,7 +241,7 @@ class LogReader:
         """
         with reported(self.path, "reading the log"):
             last = self._last
-            if read_frame(self._file.read(last.offset, FRAME_BYTES), last.offset) != last:
+            if last is not None and read_frame(self._file.read(last.offset, FRAME_BYTES), last.offset) != last:
                 raise StoreError(f"{self.path} no longer ends as it did, its writer took a batch back: open it anew")
             damage = None
             while damage is None:
@@ -264,7 +285,7 @@ class LogReader:
             frame = read_frame(self._window.read(place.offset, FRAME_BYTES), place.offset)
             if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
                 return batch, place
-            if self._window.digest(frame.payload_offset, frame.size) != frame.digest:
+            if self._payloads and self._window.digest(frame.payload_offset, frame.size) != frame.digest:
                 return batch, place
             batch.append(frame)
             if frame.kind == COMMIT:
@@ -320,6 +341,16 @@ class LogReader:
                 raise self._damage(f"holds no frame with a payload of {size} bytes there", offset, 0)
             return frame, self._payload(frame)
 
+    def peek(self, offset: int, size: int) -> bytes:
+        """Return `size` bytes of the payload of the frame at an offset, not verified, fewer where the file ends."""
+        with reported(self.path, "reading the beginning of a frame"):
+            return self._file.read(offset + FRAME_BYTES, size)
+
+    def bytes_at(self, offset: int, size: int) -> bytes:
+        """Return bytes of the file as they are, fewer where it ends."""
+        with reported(self.path, "copying the log"):
+            return self._file.read(offset, size)
+
     def _payload(self, frame: Frame) -> bytes:
         payload = b""
         if frame.size <= LARGEST_PAYLOAD and frame.end <= self._file.size():
@@ -347,3 +378,21 @@ class LogReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def find_identity(path: Path) -> bytes | None:
+    """Return the identity that the frames of a log carry, by the first of them that can be found; None without one."""
+    with reported(path, "looking for frames"):
+        file = LogFile(path, write=False)
+        try:
+            for offset in range(0, file.size(), PART):
+                data = file.read(offset, PART + FRAME_BYTES - 1)
+                found = data.find(MARK)
+                while 0 <= found < PART:
+                    frame = read_frame(data[found : found + FRAME_BYTES], offset + found)
+                    if frame is not None:
+                        return frame.identity
+                    found = data.find(MARK, found + 1)
+        finally:
+            file.close()
+    return None

@@ -182,6 +182,14 @@ class LogWriter(LogReader):
                 raise self._damage(f"has no frame with a payload of {size} bytes staged there", offset, 0)
             return frame, data[FRAME_BYTES:]
 
+    def peek(self, offset: int, size: int) -> bytes:
+        """As a reader's; of a staged frame, too."""
+        with self._writing:
+            begin = offset - self._written
+            if 0 <= begin < len(self._staged):
+                return bytes(self._staged[begin + FRAME_BYTES : begin + FRAME_BYTES + size])
+            return super().peek(offset, size)
+
     def close(self) -> None:
         """Forget what is staged, give the room ahead back and close the file; a second call does nothing."""
         with self._writing, suppress(StoreError, OSError):

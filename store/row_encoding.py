@@ -6,14 +6,26 @@ import math
 import struct
 from dataclasses import dataclass
 
-from store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json
+from store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
 
-__all__ = ["ROW", "Row", "decode_row", "encode_row"]
+__all__ = [
+    "HEAD_BYTES",
+    "ROW",
+    "Row",
+    "decode_head",
+    "decode_row",
+    "encode_row",
+    "head_size",
+    "head_without_arrays",
+    "row_sequence",
+]
 
 ROW = 2  # the kind of a frame that holds a record
 
 # sequence, time, bytes of the arrays' payload, whether that follows; lengths of key, kind, label and attributes.
 FIELDS = struct.Struct("<QdQBBIII")
+DIGEST_BYTES = 16
+HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 
 
 @dataclass(frozen=True)
@@ -30,24 +42,58 @@ def encode_row(
     """Return the bytes of checked values: `attributes` as JSON, and of arrays that were given up their `size` alone."""
     texts = (key, kind.encode(), label.encode(), attributes.encode())
     kept = payload is not None
-    return b"".join((FIELDS.pack(sequence, time, size, kept, *map(len, texts)), *texts, payload or b""))
+    fields = FIELDS.pack(sequence, time, size, kept, *map(len, texts))
+    return b"".join((fields, payload_digest(b"".join((fields, *texts))), *texts, payload or b""))
 
 
-def decode_row(data: bytes) -> Row:
-    """Return the record; raise ValueError for what `encode_row` never made. Anybody can make a checksum."""
-    if len(data) < FIELDS.size:
-        raise ValueError(f"a row has at least {FIELDS.size} bytes, not {len(data)}")
-    sequence, time, size, kept, *lengths = FIELDS.unpack_from(data)
-    texts, start = [], FIELDS.size
-    for length in lengths:
-        texts.append(data[start : start + length])
-        start += length
-    if start + (size if kept else 0) != len(data) or kept > 1:
-        raise ValueError(f"a row of {len(data)} bytes says that it has {start} and {size}")
+def head_without_arrays(head: Head) -> bytes:
+    """Return the bytes of a row that has given up its arrays."""
+    text = to_json("attributes", head.attributes)
+    return encode_row(head.sequence, head.kind, head.label, head.key, head.time, text, None, head.size)
+
+
+def row_sequence(data: bytes) -> int:
+    """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
+    if len(data) < HEAD_BYTES:
+        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
+    sequence: int = FIELDS.unpack_from(data)[0]
+    if not 1 <= sequence <= LARGEST_NUMBER:
+        raise ValueError(f"a row has the sequence {sequence}")
+    return sequence
+
+
+def head_size(data: bytes, whole: int) -> int:
+    """Return the bytes of a row without its arrays, of which `data` has the first; raise ValueError for no row.
+
+    whole: the bytes of the row.
+    """
+    if len(data) < HEAD_BYTES:
+        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
+    _, _, size, kept, *lengths = FIELDS.unpack_from(data)
+    end: int = HEAD_BYTES + sum(lengths)
+    if end + (size if kept else 0) != whole or kept > 1:
+        raise ValueError(f"a row of {whole} bytes says that it has {end} and {size}")
+    return end
+
+
+def decode_head(data: bytes, whole: int) -> Head:
+    """Return the head of a row of `whole` bytes, of which `data` has the head, verified by its own digest.
+
+    Raises ValueError for what `encode_row` never made. Anybody can make a digest.
+    """
+    end = head_size(data, whole)
+    sequence, time, size, _, *lengths = FIELDS.unpack_from(data)
+    fields, texts = data[: FIELDS.size], data[HEAD_BYTES:end]
+    if payload_digest(fields + texts) != data[FIELDS.size : HEAD_BYTES]:
+        raise ValueError("a row's head is not as it was written")
     if not 1 <= sequence <= LARGEST_NUMBER or size > LARGEST_NUMBER or not math.isfinite(time):
         raise ValueError(f"a row has the sequence {sequence}, {size} bytes and the time {time}")
-    key, kind, label, attributes = texts
-    head = Head(
+    parts, start = [], 0
+    for length in lengths:
+        parts.append(texts[start : start + length])
+        start += length
+    key, kind, label, attributes = parts
+    return Head(
         sequence,
         check_text("the kind", kind.decode()),
         check_text("the label", label.decode()),
@@ -56,4 +102,9 @@ def decode_row(data: bytes) -> Row:
         from_json(attributes.decode()),
         size,
     )
-    return Row(head, data[start:] if kept else None)
+
+
+def decode_row(data: bytes) -> Row:
+    """Return the record; raise ValueError for what `encode_row` never made. Anybody can make a checksum."""
+    head, kept = decode_head(data, len(data)), FIELDS.unpack_from(data)[3]
+    return Row(head, data[head_size(data, len(data)) :] if kept else None)

@@ -14,6 +14,8 @@ from typing import Literal, Self, cast
 import numpy as np
 
 from store.backup import back_up
+from store.checkpoint_files import Draft
+from store.checkpoints import Checkpoints
 from store.encoding import check_arrays, encode_payload
 from store.exceptions import (
     CompactedError,
@@ -24,16 +26,14 @@ from store.exceptions import (
     StoreError,
     reported,
 )
-from store.files import file_size, store_folder, tree_size
-from store.generations import Generations
-from store.groups import Draft
-from store.header import holds_store, lock_to_write
+from store.files import store_folder, sync_folder, tree_size
 from store.journal import Journal
+from store.layout import CHECKPOINTS, Current, holds_store, log_path, require_unshared, write_current
 from store.lock import WriterLock
-from store.records import JSON, Generation, Head, Record, check_key, check_text, check_time, from_json, to_json
-from store.schema import GENERATIONS, JOURNAL_FILE
+from store.log import LogReader
+from store.log_writer import create_log
+from store.records import JSON, Checkpoint, Head, Record, check_key, check_text, check_time, from_json, to_json
 from store.survey import Progress
-from store.writeahead import require_whole_log
 
 __all__ = ["Store"]
 
@@ -85,25 +85,15 @@ class Store:
         self._lock: WriterLock | None = None
         with ExitStack() as undo:
             if mode == "write":
-                self._lock = lock_to_write(folder, identity)
+                self._lock = _lock_to_write(folder, identity)
                 undo.callback(self._lock.release)
-            require_whole_log(folder)
-            self._journal = self._opened(folder / JOURNAL_FILE)
+            self._journal = Journal(folder, write=mode == "write")
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
-            self._generations = Generations(folder, self._journal)
+            self._checkpoints = Checkpoints(folder, self._journal)
             if mode == "write":
-                self._generations.remove_unnamed()
+                self._checkpoints.remove_unnamed()
             undo.pop_all()
-
-    def _opened(self, journal: Path) -> Journal:
-        try:
-            return Journal(journal, write=self.mode == "write")
-        except StoreError:
-            # A repair may just be putting another journal in the place of the one that was there a moment ago.
-            if self.mode == "write" or not holds_store(journal.parent):
-                raise
-            return Journal(journal, write=False)
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -160,7 +150,7 @@ class Store:
         """
         self._check_open(write=True)
         self._journal.refuse_in_batch("beginning a batch")
-        self._generations.wait()
+        self._checkpoints.wait()
         with self._journal.batch():
             yield
 
@@ -189,7 +179,7 @@ class Store:
             raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
         for record in self._journal.rows(sequence - 1, sequence, arrays=True):
             return cast(Record, record)
-        raise self._journal.given_up(sequence)
+        raise self._journal.given_up(sequence)  # a repair left it out
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -200,74 +190,79 @@ class Store:
         """
         self._check_open()
         _check_after(after)
-        if after < (compacted := self._journal.compacted()):
+        if after < (compacted := self._journal.current().compacted):
             raise CompactedError(
                 f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
                 "base(), and continue behind its upto"
             )
-        # A query for each row, so that a reader that pauses holds no transaction open: that would
-        # keep the write-ahead log from ever being emptied.
         return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
 
-    def latest(self, *, only: Collection[str] | None = None) -> Generation | None:
-        """Return the newest generation that verifies, None when there is none.
+    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
+        """Return the newest checkpoint that verifies, None when there is none.
 
         only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
-        over. With none it is the generation's attributes, in well below a millisecond.
-        A logged warning names the file and the array of each generation that it passes over.
-        Raises VersionError for a generation of a newer format.
+        over. With none it is the checkpoint's attributes, in well below a millisecond.
+        A logged warning names the file and the array of each checkpoint that it passes over.
+        Raises VersionError for a checkpoint of a newer format.
         """
         self._check_open()
-        return self._generations.latest(only)
+        return self._checkpoints.latest(only)
 
     @property
     def newest(self) -> int | None:
-        """The number of the newest committed generation, None when there is none; `latest` may pass it over."""
+        """The number of the newest committed checkpoint, None when there is none; `latest` may pass it over."""
         self._check_open()
-        return self._journal.newest()
+        newest = self._journal.current().newest
+        return None if newest is None else newest.number
 
     @property
     def compacted(self) -> int:
         """The last record that has given up its arrays for a base, 0 where none has."""
         self._check_open()
-        return self._journal.compacted()
+        return self._journal.current().compacted
 
-    def base(self) -> Generation | None:
-        """Return the generation that stands for the compacted records, None when there are none.
+    def base(self) -> Checkpoint | None:
+        """Return the checkpoint that stands for the compacted records, None when there are none.
 
         Raises DamageError where it does not verify, and VersionError for a newer format.
         """
         self._check_open()
-        return self._generations.base()
+        return self._checkpoints.base()
 
     def commit(
         self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
     ) -> int:
-        """Write a generation that contains the records up to `upto`, make it current, return its number.
+        """Write a checkpoint that contains the records up to `upto`, make it current, return its number.
 
-        The generation with the highest `upto` is current, and of several with the same the last committed.
+        The checkpoint with the highest `upto` is current, and of several with the same the last committed.
         It waits for a background commit first, and raises its failure here in place of committing.
         Raises RecordError for arrays, attributes or an `upto` that cannot be kept, StoreFullError,
-        ReadOnlyError or another StoreError; the generation before then stays current.
+        ReadOnlyError or another StoreError; the checkpoint before then stays current.
         """
         draft = self._draft(arrays, upto, attributes)
         self._idle()
-        return self._generations.commit(draft)
+        return self._checkpoints.commit(draft)
 
     def compact(
-        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
+        self,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        upto: int,
+        attributes: Mapping[str, JSON] | None = None,
+        newest: tuple[Mapping[str, np.ndarray], Mapping[str, JSON]] | None = None,
     ) -> None:
         """Let a base stand for the records up to `upto`: they give up their arrays and keep their heads.
 
-        The base is a generation like others, but kept until the next base; a replay of the records begins
-        with it. It takes effect whole or not at all. A generation with all records has to be committed
-        before, so that one damaged file cannot take everything: RecordError otherwise, DamageError where
-        that generation cannot be read back, and as `commit`. It gives the space back to the disk where there
-        is room to do so, and logs a warning where there is not.
+        The base is a checkpoint like others, but kept until the next base; a replay of the records begins
+        with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it; without
+        it the base is the newest. A log without the arrays is written beside the one there is, all is read back, and
+        takes effect together or not at all; then the earlier log and checkpoints are removed. Nobody can append
+        meanwhile. Raises DamageError where a record behind `upto` cannot be read, and as `commit`.
         """
-        draft = self._draft(arrays, upto, attributes)
+        base = self._draft(arrays, upto, attributes)
+        last = None if newest is None else self._draft(newest[0], self._journal.last(), newest[1])
         self._idle()
-        self._generations.compact(draft)
+        self._checkpoints.compact(base, last)
 
     def commit_later(
         self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
@@ -279,14 +274,14 @@ class Store:
         What cannot be kept is refused at once, with RecordError.
         """
         draft = self._draft(arrays, upto, attributes)
-        self._generations.raise_failure()
-        self._generations.commit_later(draft)
+        self._checkpoints.raise_failure()
+        self._checkpoints.commit_later(draft)
 
     def _draft(self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None) -> Draft:
         self._check_open(write=True)
         # The rows of a batch may yet be rolled back.
-        self._journal.refuse_in_batch("committing a generation")
-        first, last = self._journal.compacted(), self._journal.last()
+        self._journal.refuse_in_batch("committing a checkpoint")
+        first, last = self._journal.current().compacted, self._journal.last()
         if isinstance(upto, bool) or not isinstance(upto, int) or not first <= upto <= last:
             # Recovery could not resume before the base: the rows behind it have given up their arrays.
             raise RecordError(
@@ -302,13 +297,13 @@ class Store:
         self._idle()
 
     def _idle(self) -> None:
-        self._generations.wait()
-        self._generations.raise_failure()
+        self._checkpoints.wait()
+        self._checkpoints.raise_failure()
 
     def backup(self, destination: str | os.PathLike[str], *, progress: Progress | None = None) -> None:
         """Copy the store to the new folder `destination`, also while it is written, from here or elsewhere.
 
-        The copy is the store as it was at one moment since the call: all records durable then, and the generations.
+        The copy is the store as it was at one moment since the call: all records durable then, and the checkpoints.
         It appears there verified, complete and durable, or not at all; a power cut may leave a folder named
         `destination`.….partial. Nobody who writes waits for it. `progress` is called as by `check_store`.
 
@@ -316,35 +311,34 @@ class Store:
         copy does not verify, StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open()
-        back_up(self.path, store_folder(destination), self._generations.named, progress)
+        back_up(self.path, store_folder(destination), progress)
 
     def size(self) -> dict[str, int]:
-        """Return the bytes on the disk: {"journal": …, "generations": …}."""
+        """Return the bytes on the disk: {"journal": …, "checkpoints": …}."""
         self._check_open()
         with reported(self.path, "measuring the store"):
-            journal = sum(file_size(self.path / (JOURNAL_FILE + suffix)) for suffix in ("", "-wal", "-shm"))
-            return {"journal": journal, "generations": tree_size(self.path / GENERATIONS)}
+            return {"journal": self._journal.size(), "checkpoints": tree_size(self.path / CHECKPOINTS)}
 
     def close(self) -> None:
         """Wait for the background commit, release the files and the lock; a second call does nothing.
 
         Raises the failure of a background commit, after everything is released, and StoreError in a batch.
         """
-        # What a fork inherited belongs to the parent: closing SQLite there can undo its locks.
+        # What a fork inherited belongs to the parent.
         if os.getpid() != self._process:
             return
         self._journal.refuse_in_batch("closing the store")
         with self._closing:
             if self._closed:
                 return
-            self._generations.close()
+            self._checkpoints.close()
             self._closed = True
             try:
                 self._journal.close()
             finally:
                 if self._lock is not None:
                     self._lock.release()
-        self._generations.raise_failure()
+        self._checkpoints.raise_failure()
 
     def __enter__(self) -> Self:
         self._check_open()
@@ -364,3 +358,30 @@ class Store:
 def _check_after(after: int) -> None:
     if after < 0:
         raise RecordError(f"after must not be negative, not {after}")
+
+
+def _lock_to_write(folder: Path, identity: str | None) -> WriterLock:
+    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
+
+    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
+    """
+    with reported(folder, "making the folder"):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(folder.parent)
+    require_unshared(folder)
+    lock = WriterLock(folder)
+    try:
+        # Asked again, under the lock: another writer may have made the store, and left, since.
+        if not holds_store(folder):
+            if identity is None:
+                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
+            with reported(folder, "making the store"):
+                create_log(log_path(folder, 1), identity.encode())
+                with LogReader(log_path(folder, 1)) as log:
+                    write_current(folder, Current(1, log.identity))
+                sync_folder(folder.parent)
+    except BaseException:
+        lock.release()
+        raise
+    return lock

@@ -2,39 +2,66 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from store.checkpoint_files import CheckpointReader
 from store.encoding import decode_payload
-from store.exceptions import DamageError, VersionError, reported
+from store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from store.files import store_folder
-from store.generations import numbers
-from store.groups import PARTIAL, GroupReader, folder_name, read_own_description
-from store.header import strangers
-from store.records import (
-    JSON,
-    GenerationRow,
-    Spans,
-    from_json,
-    lost_heads,
-    payload_digest,
-    read_head,
-    to_json,
-    uncovered,
+from store.framing import FRAME_BYTES, NO_CHECKSUM, read_frame
+from store.journal import Rows
+from store.layout import (
+    CHECKPOINTS,
+    CURRENT_FILE,
+    DAMAGED,
+    NEW,
+    PARTIAL,
+    Current,
+    NamedCheckpoint,
+    checkpoint_path,
+    holds_store,
+    log_numbers,
+    log_path,
+    numbers,
+    read_current,
+    strangers,
 )
-from store.salvage import Fault, Row, Salvage, require_salvageable
-from store.schema import DAMAGED_FILE, DRAFT_FILE, GENERATIONS, JOURNAL_FILE, REPAIRED_FILE
+from store.log import LogReader, Place, find_identity
+from store.records import JSON, from_json
+from store.row_encoding import ROW, decode_head, decode_row, head_size, row_sequence
 
-__all__ = ["FoundGeneration", "Problem", "Progress", "Survey", "check_store"]
+__all__ = ["Fault", "FoundCheckpoint", "FoundLog", "Problem", "Progress", "Survey", "check_store", "require_store"]
 
 # Called with what is being done, how many of it are done, and how many there are.
 Progress = Callable[[str, int, int], object]
 REPORT_EVERY = 256  # rows
 ATTEMPTS = 4
+USUAL_HEAD = 512  # bytes that are read at once of a row's head
+NOWHERE = Place(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
+
+
+class Fault(enum.Enum):
+    """What can be wrong with a row, said of one and of several."""
+
+    MISSING = ("is missing", "are missing")
+    DAMAGED = ("fails its checksum", "fail their checksums")
+    NO_ARRAYS = ("has lost its arrays", "have lost their arrays")
+    DAMAGED_ARRAYS = ("has arrays that fail their checksum", "have arrays that fail their checksums")
+    FOREIGN_ARRAYS = ("has arrays that were never written so", "have arrays that were never written so")
+
+    @property
+    def takes_head(self) -> bool:
+        """Whether not even the row without its arrays is left."""
+        return self in (Fault.MISSING, Fault.DAMAGED)
+
+    def describe(self, first: int, last: int) -> str:
+        """Return in words that rows `first` to `last` have this fault."""
+        return f"row {first} {self.value[0]}" if first == last else f"rows {first} to {last} {self.value[1]}"
 
 
 @dataclass(frozen=True)
@@ -53,8 +80,8 @@ class Problem:
 def check_store(path: str | PathLike[str], *, progress: Progress | None = None) -> list[Problem]:
     """Return all that is wrong with the store in folder `path`, the journal first; nothing for a sound one.
 
-    It verifies every checksum: SQLite's structure of the journal, each row and its arrays, each array
-    of each generation, and what these say of themselves. It changes nothing, and a writer may be at work.
+    It verifies every checksum: `CURRENT`, each frame of the log, each row and its arrays, each array of each
+    checkpoint, and what these say of themselves. It changes nothing, and a writer may be at work.
     Where something is a link, a pipe or a device it reads nothing and names these.
     `progress` is called with what is being verified, how many of it are done, and how many there are.
 
@@ -62,123 +89,270 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     where a file cannot be read for a reason that says nothing against it.
     """
     folder = store_folder(path)
-    require_salvageable(folder)
+    require_store(folder)
     with reported(folder, "checking the store"):
         if found := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
             return found
         for _ in range(ATTEMPTS):
-            with closing(Salvage(folder / JOURNAL_FILE)) as salvage:
-                survey = Survey(folder, salvage, progress or (lambda *_: None))
-                found = survey.problems() + list(survey.leftovers())
-                if not salvage.moved:
-                    break
+            survey = Survey(folder, progress or (lambda *_: None))
+            found = survey.problems() + list(survey.leftovers())
+            if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
+                break
         return found
 
 
-@dataclass(frozen=True)
-class FoundGeneration:
-    """A generation as it was found.
+def require_store(folder: Path) -> None:
+    """Return where `folder` holds a store, or what is left of one. Raises NotAStoreError and VersionError."""
+    try:
+        if not holds_store(folder):
+            raise NotAStoreError(f"{folder} holds no store")
+    except DamageError:
+        return
 
-    `row` is the journal's, or, where that is gone, made from what the group says of itself; None where neither
-    verifies. `damage` is what keeps it from being used; `own`, what is wrong with what the group says of itself.
+
+@dataclass(frozen=True)
+class FoundCheckpoint:
+    """A checkpoint as it was found. `named` is as `CURRENT` has it, or, where that is lost, as it describes itself.
+
+    `named` is None where neither is readable. `damage` is what keeps it from being used.
     """
 
     number: int
     folder: Path
-    row: GenerationRow | None
+    named: NamedCheckpoint | None
+    is_base: bool
     damage: list[DamageError]
-    own: DamageError | None
+    identity: dict[str, JSON] | None
 
     @property
     def sound(self) -> bool:
         """Whether recovery can resume from it."""
-        return self.row is not None and not self.damage
+        return not self.damage
 
     @property
     def upto(self) -> int:
         """The last row that it contains, -1 where nobody knows."""
-        return -1 if self.row is None else self.row.upto
+        return -1 if self.named is None else self.named.upto
 
-    @property
-    def is_base(self) -> bool:
-        """Whether it stands for rows that have no arrays."""
-        return self.row is not None and bool(self.row.base)
+
+class FoundLog:
+    """A log as it was found: the sequences of its rows, each with what is wrong with it, and other damage.
+
+    path: the log, or what an interrupted repair left of it. identity: the store's, None where that is lost.
+    compacted: the last row without arrays. damage: what is wrong with it but for rows.
+    """
+
+    def __init__(self, path: Path, identity: bytes | None, progress: Progress) -> None:
+        self.path, self.damage = path, list[str]()
+        self.identity: dict[str, JSON] | None = None
+        self.rows: list[tuple[int, Fault | None]] = []
+        self.torn: set[int] = set()
+        self.compacted = 0
+        self._offsets: dict[int, tuple[int, int]] = {}
+        self._reader: LogReader | None = None
+        if not path.exists():
+            self.damage.append(f"{path} is gone")
+            return
+        try:
+            self._reader = LogReader(path, identity=identity or find_identity(path))
+        except DamageError as error:
+            self.damage.append(str(error))
+            return
+        if identity is not None and self._reader.identity != identity:
+            self.damage.append(f"{path} is the log of another store, or of another time: nothing of it was read")
+            self._reader.close()
+            self._reader = None
+            return
+        self._read(self._reader, progress)
+
+    def _read(self, log: LogReader, progress: Progress) -> None:
+        if log.header_damage is not None:
+            self.damage.append(str(log.header_damage))
+        else:
+            try:
+                self.identity = from_json(log.header.decode())
+            except ValueError as error:
+                self.damage.append(f"the identity in {self.path} was never written so: {error}")
+        rows = Rows()
+        for done, _ in enumerate(rows.take(log)):
+            if done % REPORT_EVERY == 0:
+                progress("batches", done, done)
+        for index in range(len(rows) + 1):
+            for damage in rows.damage.get(index, ()):
+                self._note_damage(log, damage)
+            if index < len(rows):
+                if index % REPORT_EVERY == 0:
+                    progress("rows", index, len(rows))
+                self._note_row(log, rows.sequences[index], rows.offsets[index], rows.sizes[index])
+
+    def _note_damage(self, log: LogReader, damage: DamageError) -> None:
+        """Note a damaged frame: as a row with a fault where its first bytes still say which."""
+        before = self.rows[-1][0] if self.rows else 0
+        try:
+            offset = -1 if damage.offset is None else damage.offset
+            frame = read_frame(log.bytes_at(offset, FRAME_BYTES), offset) if offset >= 0 else None
+            if frame is not None and frame.identity == log.identity and frame.kind == ROW:
+                data = log.peek(offset, min(frame.size, USUAL_HEAD))
+                data = log.peek(offset, head_size(data, frame.size))
+                sequence = row_sequence(data)
+                if sequence > before:
+                    decode_head(data, frame.size)
+                    self._offsets[sequence] = offset, frame.size
+                    self.rows.append((sequence, Fault.DAMAGED_ARRAYS))
+                    return
+        except ValueError:
+            pass
+        self.damage.append(str(damage))
+        self.torn.add(before)
+
+    def _note_row(self, log: LogReader, sequence: int, offset: int, size: int) -> None:
+        if self.rows and sequence <= self.rows[-1][0]:
+            self.damage.append(f"row {sequence} follows row {self.rows[-1][0]} in {self.path}")
+            return
+        fault = None
+        try:
+            row = decode_row(log.read(offset, size)[1])
+            if row.head.sequence != sequence:
+                fault = Fault.DAMAGED
+            elif row.payload is None:
+                self.compacted = sequence
+            elif not _is_readable(row.payload):
+                fault = Fault.FOREIGN_ARRAYS
+        except (DamageError, ValueError):
+            fault = Fault.DAMAGED
+        self._offsets[sequence] = offset, size
+        self.rows.append((sequence, fault))
+
+    def data(self, sequence: int) -> bytes:
+        """Return the bytes of a row, verified once more. Raises DamageError."""
+        assert self._reader is not None
+        return self._reader.read(*self._offsets[sequence])[1]
+
+    def head_data(self, sequence: int) -> bytes:
+        """Return the bytes of a row's head, not verified."""
+        assert self._reader is not None
+        offset, size = self._offsets[sequence]
+        data = self._reader.peek(offset, min(size, USUAL_HEAD))
+        return self._reader.peek(offset, head_size(data, size))
+
+    def row_size(self, sequence: int) -> int:
+        """Return the bytes of a row."""
+        return self._offsets[sequence][1]
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader is not None:
+            self._reader.close()
 
 
 class Survey:
-    """All that is found of the store in `folder`, whose journal is `salvage`, and whether it verifies.
+    """All that is found of the store in `folder`, and whether it verifies.
 
-    `identity` is None where it is lost; `compacted` is the last row whose arrays a base stands for, whether that
-    base is sound or not; `unnamed` are the folders of generations that the journal does not know. `last` is the
-    last sequence of which there is any sign; `faults` are the rows that do not verify, as (first, last, fault),
-    ascending; `strays` are payloads that ought not to be there. A writer may be at work meanwhile. Raises
+    `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays a base
+    stands for, whether that base is sound or not. `last` is the last sequence of which there is any sign; `faults` are
+    the rows that do not verify, as (first, last, fault), ascending. A writer may be at work meanwhile. Raises
     VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
     against it.
     """
 
-    def __init__(self, folder: Path, salvage: Salvage, progress: Progress) -> None:
-        self.folder, self.salvage, self.progress, self.journal = folder, salvage, progress, salvage.path
-        # The folders before the rows: a generation that is committed in between is then known, not a leftover.
-        parent = self.folder / GENERATIONS
-        there = numbers(parent)
-        self.meta, self.damaged_meta = salvage.meta()
-        rows, whole = salvage.generations()
-        self.damaged_generation_rows = [row.number for row in rows if not row.sound]
-        trusted = whole and not self.damaged_generation_rows and not salvage.damage
-        named = {row.number: row for row in rows if row.sound}
-        self.lost_heads = lost_heads(self.meta)
-        if _json_or_none(self.meta.get("identity", "{}")) is None:  # forged: its checksum was right
-            del self.meta["identity"]
-            self.damaged_meta += 1
-        self.identity = _identity(parent, self.meta, there)
-        self.generations: list[FoundGeneration] = []
-        chosen = [*named, *(number for number in there if number not in named and not trusted)]
-        for done, number in enumerate(chosen):
-            progress("generations", done, len(chosen))
-            found = self._examine(parent / folder_name(number), number, named.get(number))
-            # A writer may have replaced it while it was read: that is no damage.
-            still_named = number in {row.number for row in salvage.generations()[0]}
-            if found.sound or number not in named or still_named:
-                self.generations.append(found)
-        self.unnamed = [parent / folder_name(number) for number in there if number not in chosen]
-        self.compacted = max((found.upto for found in self.generations if found.is_base), default=0)
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.folder, self.progress = folder, progress
+        self.current: Current | None = None
+        self.damage: list[Problem] = []
+        try:
+            self.current = read_current(folder)
+        except FileNotFoundError:
+            self.damage.append(Problem(folder / CURRENT_FILE, f"{folder / CURRENT_FILE} is gone", "spare"))
+        except DamageError as error:
+            self.damage.append(Problem(error.path, str(error), "spare"))
+        self.checkpoints = list(self._found())
+        self.log = self._found_log()
+        self.identity = self.log.identity
+        if self.identity is None and self.sound:
+            self.identity = self.sound[0].identity
+        self._drop_foreign()
+        self.compacted = self.log.compacted if self.current is None else self.current.compacted
+        self._find_faults()
+
+    def _found(self) -> Iterator[FoundCheckpoint]:
+        named: dict[int, NamedCheckpoint | None]
+        if self.current is None:
+            named = dict.fromkeys(numbers(self.folder))
+        else:
+            named = {named.number: named for named in self.current.checkpoints}
+        for done, (number, expected) in enumerate(named.items()):
+            self.progress("checkpoints", done, len(named))
+            yield self._examine(number, expected)
+
+    def _examine(self, number: int, named: NamedCheckpoint | None) -> FoundCheckpoint:
+        path = checkpoint_path(self.folder, number)
+        base = None if self.current is None else self.current.base
+        is_base = base is not None and base.number == number
+        try:
+            reader = CheckpointReader(path)
+            found = NamedCheckpoint(reader.number, reader.upto, reader.sha256, NOWHERE)
+            expected = found if named is None else named
+            if (found.number, found.upto, found.sha256) != (number, expected.upto, expected.sha256):
+                raise DamageError(
+                    f"{path} says that it is checkpoint {found.number}, up to row {found.upto}, and another than was "
+                    "written there",
+                    path=path / "zarr.json",
+                )
+            return FoundCheckpoint(number, path, expected, is_base, list(reader.damage()), dict(reader.identity))
+        except DamageError as wrong:
+            return FoundCheckpoint(number, path, named, is_base, [wrong], None)
+
+    def _found_log(self) -> FoundLog:
+        """Return the log that counts: without `CURRENT` the newest for whose compacted rows a checkpoint stands."""
+        if self.current is not None:
+            path = log_path(self.folder, self.current.log)
+            return FoundLog(_or_aside(path), self.current.log_identity, self.progress)
+        there = [log_path(self.folder, number) for number in reversed(log_numbers(self.folder))]
+        there += sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}"), reverse=True)
+        newest = self.sound[0].upto if self.sound else 0
+        first: FoundLog | None = None
+        for path in there:
+            log = FoundLog(path, None, self.progress)
+            if log.compacted <= newest:
+                if first is not None:
+                    first.close()
+                return log
+            if first is None:
+                first = log
+            else:
+                log.close()
+        return first or FoundLog(log_path(self.folder, 1), None, self.progress)
+
+    def _drop_foreign(self) -> None:
+        """Where a checkpoint is another store's it does not count."""
+        for i, found in enumerate(self.checkpoints):
+            if found.sound and found.identity != self.identity:
+                wrong = DamageError(f"{found.folder} is a checkpoint of another store", path=found.folder)
+                self.checkpoints[i] = FoundCheckpoint(
+                    found.number, found.folder, found.named, found.is_base, [wrong], None
+                )
+
+    def _find_faults(self) -> None:
+        upto = max((found.upto for found in self.checkpoints), default=0)
         self.faults: list[tuple[int, int, Fault]] = []
-        self._verify_rows(max((found.upto for found in self.generations), default=0))
+        before = 0
+        for sequence, fault in self.log.rows:
+            self._note_gap(before, sequence - 1)
+            if fault is not None and not (fault is not Fault.DAMAGED and sequence <= self.compacted):
+                self._note(sequence, sequence, fault)
+            elif fault is None and self.compacted < sequence <= self.log.compacted:
+                self._note(sequence, sequence, Fault.NO_ARRAYS)
+            before = sequence
+        self.last = max(before, upto)
+        if before in self.log.torn:
+            self.last = max(self.last, before + 1)
+        self._note_gap(before, self.last)
 
-    def _verify_rows(self, upto: int) -> None:
-        """Verify every row, and the arrays of those behind the base; `upto` is the last that a generation contains."""
-        last, whole = self.salvage.last()
-        self.last, compacted = max(last, upto), self.compacted
-        for first, through, row in self.salvage.rows(self.last, self.lost_heads, whole=whole):
-            if isinstance(row, Fault):
-                for begin, end in uncovered(first, through, self.lost_heads):
-                    self._note(begin, end, row)
-                continue
-            self.last = max(self.last, through)
-            if first % REPORT_EVERY == 0:
-                self.progress("rows", first, self.last)
-            fault = self._fault(row, arrays=first > compacted)
-            if fault is Fault.NO_ARRAYS and not self.faulty(first - 1, first - 1):
-                # A writer may have compacted it since.
-                compacted = max(compacted, self.salvage.compacted())
-                fault = fault if first > compacted else None
-            if fault is not None:
-                self._note(first, first, fault)
-        self.faults = self.faulty(1, self.last)
-        self.strays: Spans = self.salvage.strays(compacted)
-
-    def _fault(self, row: Row, *, arrays: bool) -> Fault | None:
-        head = read_head(row)
-        if head is None:
-            return Fault.DAMAGED
-        if not arrays:
-            return None
-        payload, readable = self.salvage.payload(row[0])
-        if payload is None:
-            return Fault.NO_ARRAYS if readable else Fault.UNREADABLE_ARRAYS
-        if payload_digest(payload) != head[1]:
-            return Fault.DAMAGED_ARRAYS
-        return None if _is_readable(payload) else Fault.FOREIGN_ARRAYS
+    def _note_gap(self, before: int, last: int) -> None:
+        """Note rows that are missing; before the base a repair may have left some out, where nothing is damaged."""
+        first = before + 1 if before in self.log.torn else max(before, self.compacted) + 1
+        if first <= last:
+            self._note(first, last, Fault.MISSING)
 
     def _note(self, first: int, last: int, fault: Fault) -> None:
         if self.faults and self.faults[-1][1] == first - 1 and self.faults[-1][2] is fault:
@@ -194,151 +368,78 @@ class Survey:
         ]
 
     @property
-    def sound(self) -> list[FoundGeneration]:
-        """The generations that recovery can resume from, the newest first."""
-        found = [found for found in self.generations if found.sound]
+    def sound(self) -> list[FoundCheckpoint]:
+        """The checkpoints that recovery can resume from, the newest first."""
+        found = [found for found in self.checkpoints if found.sound]
         return sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
 
     @property
-    def has_base(self) -> bool:
-        """Whether a sound generation stands for the compacted rows, or none were compacted."""
-        return not self.compacted or any(found.upto == self.compacted and found.is_base for found in self.sound)
+    def base(self) -> FoundCheckpoint | None:
+        """The sound checkpoint that stands for the compacted rows."""
+        return next((found for found in self.sound if found.upto == self.compacted), None) if self.compacted else None
 
-    def _examine(self, folder: Path, number: int, row: GenerationRow | None) -> FoundGeneration:
-        known, own = None, None
+    def moved(self) -> bool:
+        """Whether a writer has committed something since."""
         try:
-            known = read_own_description(folder)
-            own = self._disagreement(folder / "zarr.json", known, number, row)
-        except DamageError as wrong:
-            own = wrong
-        if row is None and known is not None and own is None:
-            row = self._row_of(folder, known)
-        if row is None:
-            return FoundGeneration(number, folder, None, [], own)
-        try:
-            damage = list(GroupReader(folder, number, row.verified(self.journal)[1]).damage())
-        except DamageError as wrong:
-            damage = [wrong]
-        if own is not None and known is not None:
-            # It verifies, and says that it is another: then it is.
-            damage.append(own)
-        return FoundGeneration(number, folder, row, damage, own)
-
-    def _disagreement(
-        self, header: Path, known: dict[str, Any], number: int, row: GenerationRow | None
-    ) -> DamageError | None:
-        expected: dict[str, Any] = {"number": number}
-        if self.identity is not None:
-            expected["identity"] = self.identity
-        if row is not None:
-            attributes, content = row.verified(self.journal)
-            expected |= {"upto": row.upto, "attributes": attributes, **content}
-        for name, value in expected.items():
-            if known.get(name) != value:
-                detail = "" if name in ("arrays", "attributes") else f": {known.get(name)!r}, not {value!r}"
-                return DamageError(
-                    f"{header} is of another generation, or of another store, than expected: it says another "
-                    f"{name}{detail}",
-                    path=header,
-                )
-        return None
-
-    def _row_of(self, folder: Path, known: dict[str, Any]) -> GenerationRow:
-        """Return the journal's row as it must have been; a base is one where no row up to it has its arrays."""
-        base = known["upto"] > 0 and not self.salvage.may_have_payloads(known["upto"])
-        content = {"format": known["format"], "arrays": known["arrays"]}
-        attributes = to_json("attributes", known["attributes"])
-        time = (folder / "zarr.json").stat().st_mtime
-        return GenerationRow.of(known["number"], known["upto"], int(base), time, attributes, content)
+            return read_current(self.folder) != self.current
+        except (DamageError, FileNotFoundError):
+            return False
 
     def problems(self) -> list[Problem]:
         """Return what is damaged."""
-        return [*self._in_journal(), *self._in_rows(), *self._in_generations()]
-
-    def _in_journal(self) -> Iterator[Problem]:
-        for what in self.salvage.damage:
-            yield Problem(self.journal, what, "lost" if self.salvage.is_gone else "spare")
-        missing = sorted({"format", "created", "identity"} - set(self.meta))
-        if self.damaged_meta or missing:
-            what = f"{self.damaged_meta} rows of table meta in {self.journal} fail their checksums"
-            what += f"; without a row that verifies: {', '.join(missing)}" if missing else ""
-            yield Problem(self.journal, what, "spare" if self.identity is not None else "lost")
-
-    def _in_rows(self) -> Iterator[Problem]:
+        found = list(self.damage)
+        structure: Literal["lost", "spare"] = "lost" if self.log.identity is None and not self.log.rows else "spare"
+        found += [Problem(self.log.path, what, structure) for what in self.log.damage]
         for first, last, fault in self.faults:
-            yield Problem(self.journal, f"{fault.describe(first, last)} in {self.journal}", "lost")
-        for first, last in self.strays:
-            rows = f"row {first}" if first == last else f"rows {first} to {last}"
-            what = f"{self.journal} holds arrays of {rows} that no row has, or a base stands for"
-            yield Problem(self.journal, what, "spare")
+            found.append(Problem(self.log.path, f"{fault.describe(first, last)} in {self.log.path}", "lost"))
+        for checkpoint in self.checkpoints:
+            if self.current is not None or checkpoint.named is not None:
+                kind: Literal["lost", "spare"] = "spare" if self._is_spare(checkpoint) else "lost"
+                found += [Problem(damage.path, str(damage), kind) for damage in checkpoint.damage]
+        if self.identity is None:
+            found.append(Problem(self.folder, f"nothing in {self.folder} tells what the store is for", "lost"))
+        return found
 
-    def _in_generations(self) -> Iterator[Problem]:
-        known = {found.number: found for found in self.generations}
-        for number in self.damaged_generation_rows:
-            generation = known.get(number)
-            spare = (generation is not None and generation.sound) or self._is_spare(generation)
-            what = f"the row of generation {number} in {self.journal} fails its checksum"
-            yield Problem(self.journal, what, "spare" if spare else "lost")
-        for found in self.generations:
-            kind: Literal["lost", "spare"] = "spare" if self._is_spare(found) else "lost"
-            for damage in found.damage:
-                yield Problem(damage.path, str(damage), kind)
-            if found.own is not None and found.own not in found.damage:
-                # A generation that the journal knows need not describe itself.
-                yield Problem(found.own.path, str(found.own), "spare" if found.sound else kind)
-
-    def _is_spare(self, generation: FoundGeneration | None) -> bool:
-        """Return whether the state that a generation holds can be had without it."""
-        upto = self.last if generation is None or generation.row is None else generation.upto
-        uptos = [other.upto for other in self.sound if other is not generation]
-        if generation is not None and generation.is_base and upto == self.compacted:
+    def _is_spare(self, checkpoint: FoundCheckpoint) -> bool:
+        """Return whether the state that a checkpoint holds can be had without it."""
+        upto = self.last if checkpoint.named is None else checkpoint.upto
+        uptos = [other.upto for other in self.sound if other is not checkpoint]
+        if checkpoint.is_base and upto == self.compacted:
             return upto in uptos
         starts = [start for start in [*uptos, *([0] if not self.compacted else [])] if start >= self.compacted]
         return any(start >= upto or not self.faulty(start + 1, upto) for start in starts)
 
     def leftovers(self) -> Iterator[Problem]:
         """Yield the files that are there too many, and who removes them."""
-        aside = "was put aside by a repair: remove it when you need it no more"
-        for path in self.unnamed:
-            yield Problem(path, f"{path} is of no generation that counts: the next writer removes it", "leftover")
-        parent = self.folder / GENERATIONS
-        for path in sorted(parent.iterdir()) if parent.is_dir() else ():
-            if path.name.endswith(PARTIAL):
-                yield Problem(path, f"{path} was, or is being, written: the next writer removes it", "leftover")
-            elif ".damaged" in path.name:
-                yield Problem(path, f"{path} {aside}", "leftover")
-        for path in sorted(self.folder.iterdir()):
-            if path.name.startswith(DAMAGED_FILE):
-                yield Problem(path, f"{path} {aside}", "leftover")
-            elif path.name.startswith((DRAFT_FILE, REPAIRED_FILE)):
-                what = f"{path} is of a repair that did not end: the next writer removes it"
-                yield Problem(path, what, "leftover")
+        known = {found.folder for found in self.checkpoints} | {self.log.path}
+        parent = self.folder / CHECKPOINTS
+        entries = [*self.folder.iterdir(), *(parent.iterdir() if parent.is_dir() else ())]
+        ours = {log_path(self.folder, number) for number in log_numbers(self.folder)}
+        ours |= {checkpoint_path(self.folder, number) for number in numbers(self.folder)}
+        for path in sorted(entries):
+            if DAMAGED in path.name:
+                what = f"{path} was put aside by a repair: remove it when you need it no more"
+            elif path.name.endswith((NEW, PARTIAL)):
+                what = f"{path} was, or is being, written: the next writer removes it"
+            elif path in ours - known:
+                what = f"{path} is named by nothing: the next writer removes it"
+            else:
+                continue
+            yield Problem(path, what, "leftover")
 
 
-def _json_or_none(text: str) -> dict[str, JSON] | None:
-    try:
-        return from_json(text)
-    except ValueError:
-        return None
-
-
-def _identity(parent: Path, meta: dict[str, str], there: list[int]) -> dict[str, JSON] | None:
-    """Return the journal's identity, or that of the newest generation that describes itself."""
-    if "identity" in meta:
-        return _json_or_none(meta["identity"])
-    for number in reversed(there):
-        try:
-            return dict(read_own_description(parent / folder_name(number))["identity"])
-        except DamageError:
-            continue
-    return None
+def _or_aside(path: Path) -> Path:
+    """Return a log's path, or where an interrupted repair put it."""
+    aside = path.with_name(path.name + DAMAGED)
+    return aside if not path.exists() and aside.exists() else path
 
 
 def _is_readable(payload: bytes) -> bool:
     """Whether a payload is what `encode_payload` makes: anyone can make its digest; one of a newer release counts."""
-    with suppress(VersionError):
-        try:
-            decode_payload(payload)
-        except ValueError:
-            return False
+    try:
+        decode_payload(payload)
+    except VersionError:
+        return True
+    except ValueError:
+        return False
     return True

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from store.schema import JOURNAL_FILE, create_journal
 
 from examples.benchmarks.timing import Timing, circumstances, timed
 from scroll_tactile.cli.terminal import console
 from store.journal import Journal
 from store.log_writer import LogWriter, create_log
 from store.row_encoding import ROW, encode_row
-from store.schema import JOURNAL_FILE, create_journal
 
 __all__ = ["run_appending", "show_appending"]
 

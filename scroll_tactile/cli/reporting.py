@@ -51,7 +51,7 @@ def report(
 
 def _is_memory(source: Path) -> bool:
     """Whether a memory lies there, sound or not; what holds no store may be a recording."""
-    from store.header import holds_store
+    from store.layout import holds_store
 
     if not source.is_dir():
         return False

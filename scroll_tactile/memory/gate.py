@@ -27,12 +27,13 @@ from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanne
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import WindowPlan
-from store import DamageError, Generation, Head, NotAStoreError, Record, Store
+from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
+from store.files import file_size
+from store.layout import log_numbers, log_path
 
 __all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
 
-JOURNAL = ("journal.sqlite", "journal.sqlite-wal")
-SMALLEST_ROW = 32  # bytes of the journal: two digests
+SMALLEST_ROW = 128  # bytes of the log: a frame and a row without texts
 # What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
 WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
 
@@ -66,7 +67,7 @@ class Gate:
                 self._generations.check(record.arrays, record.attributes, None, thorough=self._thorough)
         return record
 
-    def generation(self, generation: Generation) -> Generation:
+    def generation(self, generation: Checkpoint) -> Checkpoint:
         """This generation. Raises DamageError."""
         with self._refusing(f"generation {generation.number}"):
             arrays, attributes, upto = generation.arrays, generation.attributes, generation.upto
@@ -96,8 +97,7 @@ class Gate:
 
     def _most_rows(self) -> int:
         """How many rows the journal can hold, by its size."""
-        files = [self._path / name for name in JOURNAL]
-        return sum(file.stat().st_size for file in files if file.exists()) // SMALLEST_ROW
+        return sum(file_size(log_path(self._path, number)) for number in log_numbers(self._path)) // SMALLEST_ROW
 
 
 class MemoryStore(Store):
@@ -133,14 +133,14 @@ class MemoryStore(Store):
         """As `Store.records`."""
         return map(self.gate.record, super().records(after))
 
-    def latest(self, *, only: Collection[str] | None = None) -> Generation | None:
+    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
         """As `Store.latest`; what has not all of its arrays is not looked at."""
         if only is not None:
             return super().latest(only=only)
         newest = super().latest()
         return None if newest is None else self.gate.generation(newest)
 
-    def base(self) -> Generation | None:
+    def base(self) -> Checkpoint | None:
         """As `Store.base`."""
         base = super().base()
         return None if base is None else self.gate.generation(base)
@@ -167,7 +167,7 @@ def open_store(
     return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
 
 
-def require_counted(path: Path, generation: Generation, heads: Sequence[Head]) -> None:
+def require_counted(path: Path, generation: Checkpoint, heads: Sequence[Head]) -> None:
     """Raise DamageError where a generation counts more touches of a material than the journal's rows name.
 
     heads: all rows of the journal; where a repair lost some, nobody knows.

@@ -393,12 +393,13 @@ class Ledger:
             before = sum(store.size().values())
             self.require_writing()
             if upto > memory.base:
-                self._snapshot()
                 store.base()  # a damaged one has what the new one needs
+                newest = memory.to_arrays() if upto < memory.sequence else None  # with f*, which the base may lack
                 base = memory.until(store, upto) if upto < memory.sequence else memory
                 arrays, attributes = base.to_arrays(upto, candidates_of(base, store))
                 with self._mutation():
-                    store.compact(arrays, upto=upto, attributes=attributes)
+                    store.compact(arrays, upto=upto, attributes=attributes, newest=newest)
+                    self._saved = memory.sequence
                     memory.base = upto
                     memory.excluded |= {sequence for sequence in memory.retracted if sequence <= upto}
                     memory.retracted = {sequence for sequence in memory.retracted if sequence > upto}

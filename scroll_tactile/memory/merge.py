@@ -16,7 +16,7 @@ from scroll_tactile.memory.partial import Joint, Partial, sums_without
 from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, retracted_by
 from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
-from store import Generation, Head, Record, Store
+from store import Checkpoint, Head, Record, Store
 from store.files import same_folder
 
 __all__ = [
@@ -154,7 +154,7 @@ class Incoming:
     """
 
     source: Journal
-    base: Generation | None
+    base: Checkpoint | None
     rows: list[Head]
     shared: int
     left_out: list[Head]
@@ -236,7 +236,7 @@ class Incoming:
             return None
         return sums_without(source, memory, {head.sequence for head in self.left_out})
 
-    def _rows_to_append(self, base: Generation | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+    def _rows_to_append(self, base: Checkpoint | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:
             left_out = ("tuned", "descriptions")  # f* stays there; descriptions come as rows of their own
             attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
@@ -260,7 +260,7 @@ def standing(rows: Iterable[Head]) -> list[Head]:
 
 
 def _descriptions(
-    ours: Store, memory: Memory, theirs: Journal, base: Generation | None, choice: Choice
+    ours: Store, memory: Memory, theirs: Journal, base: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
     if isinstance(theirs, Partial | Joint):

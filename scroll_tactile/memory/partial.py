@@ -32,7 +32,7 @@ from scroll_tactile.memory.row_checks import check_description
 from scroll_tactile.memory.rows import MEMBER, OBSERVE, SOURCE, Arrays
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.windows import WindowPlan
-from store import DamageError, Generation, Head, Record, RecordError
+from store import Checkpoint, DamageError, Head, Record, RecordError
 from store.encoding import check_arrays, encode_payload
 from store.packed import PackedFile, PackedWriter, packing
 
@@ -182,7 +182,7 @@ class Partial:
         arrays = self._file.row(self._places[i], int(self._sizes[i]), self._digests[i].tobytes())
         return self.gate.record(Record(**vars(self._heads[i]), arrays=arrays))
 
-    def base(self) -> Generation | None:
+    def base(self) -> Checkpoint | None:
         """What stands for the touches that have no rows: the sums; None with rows.
 
         Raises MismatchError where these are a step of a fleet's run, which leaves exemplars to the rows.
@@ -195,9 +195,9 @@ class Partial:
             raise MismatchError(f"{self.path} is a step of a fleet's run: merge the partials that it was made of")
         return None if self.has_rows else self.sums()
 
-    def sums(self) -> Generation:
+    def sums(self) -> Checkpoint:
         """What all touches taught. Raises DamageError, also where these are not the touches it names."""
-        found = Generation(0, len(self._heads), self._attributes, self._file.arrays("sums"))
+        found = Checkpoint(0, len(self._heads), self._attributes, self._file.arrays("sums"))
         sums = self.gate.generation(found)
         observed = sums.arrays["observations"]
         said = dict(zip(cast("list[str]", sums.attributes["materials"]), observed.tolist(), strict=True))
@@ -277,7 +277,7 @@ class Joint:
     def base(self) -> None:
         """No base: there are rows."""
 
-    def sums(self) -> Generation:
+    def sums(self) -> Checkpoint:
         """As `Partial.sums`. Raises DamageError where they are not the sums of these touches."""
         found = self._sums.sums()
         if found.upto != len(self._touches):

@@ -40,7 +40,7 @@ from scroll_tactile.readouts.likelihood import LevelArray
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
-from store import CompactedError, DamageError, Generation, Head, Record, Store
+from store import Checkpoint, CompactedError, DamageError, Head, Record, Store
 
 __all__ = ["Memory", "apply_description", "give_back_scratch"]
 
@@ -333,7 +333,7 @@ class Memory:
         of_base = {row for row in retracted_by(found) if row <= self.base}
         return retracted_by(head for head in found if head.sequence <= upto) | of_base | self.retracted | self.excluded
 
-    def _take_from(self, generation: Generation, store: Store) -> None:
+    def _take_from(self, generation: Checkpoint, store: Store) -> None:
         """Take in a generation of a store; what an earlier version wrote does not say how often a touch is there."""
         self._take(generation.arrays, generation.attributes, 0)
         if "copies" in generation.attributes or not len(self.sample):
@@ -504,7 +504,7 @@ class Memory:
         self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
         self._take_tuned(arrays, attributes)
 
-    def take_tuned(self, generation: Generation) -> None:
+    def take_tuned(self, generation: Checkpoint) -> None:
         """Take f* from a generation, if it has another one."""
         self._take_tuned(generation.arrays, generation.attributes)
 

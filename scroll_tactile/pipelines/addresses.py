@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from scroll_tactile.pipelines.sources import Refused, find_sources
 from scroll_tactile.recordings.locations import file_system, is_remote
-from store.header import holds_store
+from store.layout import CURRENT_FILE, holds_store
 from store.packed import BEGIN
 
 __all__ = ["expand", "is_memory"]
@@ -19,7 +19,6 @@ __all__ = ["expand", "is_memory"]
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
 PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual names of packed memories
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
-JOURNAL = "journal.sqlite"
 
 T = TypeVar("T")
 
@@ -52,7 +51,7 @@ def _is_remote_memory(address: str) -> bool:
         return False
     files, path = file_system(address)
     if files.isdir(path):
-        return bool(files.exists(f"{path.rstrip('/')}/{JOURNAL}"))
+        return bool(files.exists(f"{path.rstrip('/')}/{CURRENT_FILE}"))
     with files.open(path, "rb", cache_type="none") as file:
         return bool(file.read(len(BEGIN)) == BEGIN)
 
@@ -112,9 +111,9 @@ def _listed(address: str) -> list[str]:
     scheme, place = address.partition("://")[0], path.rstrip("/")
     names = sorted(str(name) for name in files.find(place))
     inside = {name[len(place) + 1 :] for name in names}
-    if inside & {*WHOLE, JOURNAL}:
+    if inside & {*WHOLE, CURRENT_FILE}:
         return [address]
-    folders = {name.rpartition("/")[0] for name in names if name.endswith((f"/{JOURNAL}", "/metadata.yaml"))}
+    folders = {name.rpartition("/")[0] for name in names if name.endswith((f"/{CURRENT_FILE}", "/metadata.yaml"))}
     alone = [
         name for name in names if name.lower().endswith(RECORDINGS + PACKED) and not name.startswith(tuple(folders))
     ]

@@ -5,9 +5,9 @@ import sqlite3
 from contextlib import closing, contextmanager
 
 import numpy as np
+from store.generations import Generations
 
 from store import Store, check_store
-from store.generations import Generations
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}

@@ -14,12 +14,12 @@ from forged import describe_again, in_a_process, put_generation, write_first_for
 from forging import put_row
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from store.groups import GroupReader
 from store_builds import flip
 
 from store import DamageError, RecordError, Store, StoreError, VersionError, check_store
 from store import chunks as store_chunks
 from store import records as store_records
-from store.groups import GroupReader
 
 ARRAYS = {
     "rows": np.arange(4000.0).reshape(1000, 4),

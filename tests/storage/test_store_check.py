@@ -8,9 +8,9 @@ import threading
 from contextlib import closing
 
 import pytest
+import store.schema
 from store_builds import LAST, add, change, commit, contents, damage, flip, folders, state, values
 
-import store.schema
 from store import DamageError, NotAStoreError, Problem, Store, StoreError, VersionError, check_store, repair_store
 
 

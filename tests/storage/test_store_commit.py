@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from store_builds import folders
-
 import store.generations
 import store.groups
+from store_builds import folders
+
 from store import DamageError, Store, StoreError, check_store
 from store.chunks import ArrayFiles
 

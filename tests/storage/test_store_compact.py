@@ -6,9 +6,9 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+import store.generations
 from store_builds import as_after_a_crash, change, folders, query
 
-import store.generations
 from store import CompactedError, DamageError, RecordError, Store, StoreError
 
 LAST = 12

@@ -6,10 +6,10 @@ import threading
 
 import numpy as np
 import pytest
+from store.writeahead import FRAME_BYTES, HEADER_BYTES, damaged_frame, mend_log
 from store_builds import as_after_a_crash, damage
 
 from store import DamageError, Store, check_store, repair_store
-from store.writeahead import FRAME_BYTES, HEADER_BYTES, damaged_frame, mend_log
 
 ROWS = 40
 

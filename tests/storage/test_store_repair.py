@@ -9,6 +9,7 @@ import threading
 from contextlib import closing
 
 import pytest
+import store.header
 from store_builds import (
     IDENTITY,
     LAST,
@@ -28,7 +29,6 @@ from store_builds import (
     values,
 )
 
-import store.header
 import store.repair
 import store.store
 from store import (

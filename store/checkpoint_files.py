@@ -1,4 +1,4 @@
-"""One generation on disk: a zarr group, written whole and durable, read back whole or in part, and verified."""
+"""A checkpoint on disk: a zarr group, written whole and durable, read back whole or in part, and verified."""
 
 from __future__ import annotations
 
@@ -17,76 +17,77 @@ from store.content import GROUP_VERSION, ArrayContent, read_content
 from store.encoding import array_digest, flat_bytes
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import read_regular, remove_tree, sync_folder, sync_tree
+from store.layout import PARTIAL, checkpoint_path
 from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["PARTIAL", "Draft", "GroupReader", "folder_name", "read_own_description", "require_known", "write_group"]
-
-PARTIAL = ".partial"
+__all__ = ["CheckpointReader", "Draft", "write_checkpoint"]
 
 # The memory of 800 BioTac touches, 29.3 MB, becomes 19.1 MB (level 1: 20.0; level 6: 18.7; with shuffled bytes, as in
 # Blosc, 17.3; but zarr's format has no codec for these alone).
 LEVEL = 3
 
 # What a reader meets where a file is missing or is not a file; other failures of the system
-# (no permission, too many open files) say nothing against the generation.
+# (no permission, too many open files) say nothing against the checkpoint.
 GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
-
-
-def folder_name(number: int) -> str:
-    """Return the name of a generation's folder: its number in eight digits, or more when it needs them."""
-    return f"{number:08d}"
 
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Checked arrays that are to become a generation; `attributes` is JSON."""
+    """Checked arrays that are to become a checkpoint; `attributes` is JSON."""
 
     arrays: Mapping[str, np.ndarray]
     upto: int
     attributes: str
 
 
-def write_group(parent: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> dict[str, Any]:
-    """Write a draft as a durable zarr group in `parent`; return what a reader verifies it against.
+def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> str:
+    """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
-    That is the group's format and, for each array, its dtype, shape and sha256, as JSON. The group also
-    describes itself so, and names its store, so that it verifies without the journal. On any error nothing is
-    left behind. Raises StoreFullError, ReadOnlyError or StoreError.
+    That is its number, `upto`, attributes, the store's identity, the format and, for each array, dtype, shape and
+    sha256. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
     """
     described = {
         name: ArrayContent(array.dtype, array.shape, array_digest(array)) for name, array in draft.arrays.items()
     }
-    known = {"number": number, "upto": draft.upto, "attributes": from_json(draft.attributes), "identity": identity}
-    final = parent / folder_name(number)
-    partial = parent / (folder_name(number) + PARTIAL)
+    known: dict[str, Any] = {
+        "number": number,
+        "upto": draft.upto,
+        "attributes": from_json(draft.attributes),
+        "identity": identity,
+    }
+    final = checkpoint_path(folder, number)
+    partial = final.with_name(final.name + PARTIAL)
     try:
-        with reported(partial, f"writing generation {number}"):
-            parent.mkdir(exist_ok=True)
+        with reported(partial, f"writing checkpoint {number}"):
+            if not final.parent.is_dir():
+                final.parent.mkdir()
+                sync_folder(folder)
             remove_tree(partial)
             group = _write_zarr(partial, draft, described, LEVEL)
             if sum(content.size for content in described.values()) > most_bytes(partial):
                 # Readers make no room for so much that so little stands for: anybody could claim it.
                 remove_tree(partial)
                 group = _write_zarr(partial, draft, described, None)
-            content = {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
-            group.update_attributes(known | content | {"sha256": _own_digest(known | content)})
+            known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
+            digest = _own_digest(known)
+            group.update_attributes(known | {"sha256": digest})
             try:
                 _read_attributes(partial / "zarr.json")
             except (ValueError, DamageError) as error:
                 raise RecordError(
-                    f"generation {number} has more attributes than could be read again: {error}"
+                    f"checkpoint {number} has more attributes than could be read again: {error}"
                 ) from error
             sync_tree(partial)
             partial.rename(final)
-            sync_folder(parent)
+            sync_folder(final.parent)
     except BaseException:
         remove_tree(partial)
         remove_tree(final)
         raise
-    return content
+    return digest
 
 
 def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSON]:
@@ -129,34 +130,36 @@ def _write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent],
     return group
 
 
-class GroupReader:
-    """The generation in folder `path`, verified against `content`, which `write_group` returned.
+class CheckpointReader:
+    """The checkpoint in folder `path`: how it describes itself, and its arrays, verified.
 
-    Every method raises DamageError that names the file or folder, the array and the generation, VersionError
+    Every method raises DamageError that names the file or folder, the array and the checkpoint, VersionError
     for a newer format, and StoreError for a file that cannot be read for a reason that says nothing against it.
     """
 
-    def __init__(self, path: Path, number: int, content: Mapping[str, Any]) -> None:
-        require_known(path, content["format"])
-        self._path, self._number, self._described = path, number, read_content(content)
-        header = path / "zarr.json"
+    def __init__(self, path: Path) -> None:
+        self._path, self._known = path, _read_description(path)
+        self.number: int = self._known["number"]
+        self.upto: int = self._known["upto"]
+        self.sha256: str = self._known["sha256"]
+        self.attributes: Mapping[str, JSON] = self._known["attributes"]
+        self.identity: Mapping[str, JSON] = self._known["identity"]
+        self._described = read_content(self._known)
         try:
-            found, room = _read_attributes(header).get("format"), most_bytes(path)
-        except Exception as error:
-            raise _unreadable(error, f"generation {number} in {header}", header) from error
-        if found != content["format"]:
-            raise DamageError(
-                f"generation {number} in {header} claims format {found!r}, not {content['format']}", path=header
-            )
+            room = most_bytes(path)
+        except OSError as error:
+            raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
         if (size := sum(array.size for array in self._described.values())) > room:
             raise DamageError(
-                f"generation {number} in {path} claims arrays of {size} bytes; its files can stand for {room} at most",
+                f"checkpoint {self.number} in {path} claims arrays of {size} bytes; its files can stand for {room} at "
+                "most",
                 path=path,
             )
 
     def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-        """Return these arrays, all where it is not said, verified, writable and the caller's own."""
-        return {name: self._array(name) for name in (self._described if names is None else names)}
+        """Return those of these arrays that it has, or all, verified, writable and the caller's own."""
+        chosen = self._described if names is None else [name for name in self._described if name in names]
+        return {name: self._array(name) for name in chosen}
 
     def damage(self) -> Iterator[DamageError]:
         """Yield what is wrong with the arrays, array by array; nothing where all verifies."""
@@ -168,7 +171,7 @@ class GroupReader:
 
     def _array(self, name: str) -> np.ndarray:
         folder, content = self._path / name, self._described[name]
-        what = f"array {name!r} of generation {self._number} in {folder}"
+        what = f"array {name!r} of checkpoint {self.number} in {folder}"
         try:
             array = ArrayFiles(self._path, name, content).read()
         except Exception as error:
@@ -196,30 +199,30 @@ def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
     return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
 
 
-def read_own_description(path: Path) -> dict[str, Any]:
-    """Return what the group in folder `path` says of itself: number, upto, attributes, identity, format, arrays.
-
-    Raises DamageError where it is not as it was written, and VersionError for a newer format.
-    """
+def _read_description(path: Path) -> dict[str, Any]:
     header = path / "zarr.json"
     try:
         known = _read_attributes(header)
         stored = known.pop("sha256", None)
         sound = _own_digest(known) == stored
     except Exception as error:
-        raise _unreadable(error, f"a generation in {header}", header) from error
+        raise _unreadable(error, f"a checkpoint in {header}", header) from error
     # Before the version, which a flipped bit can make a newer one.
     if not sound:
         raise DamageError(
-            f"what {header} says of its generation is not what was written: its sha256 differs", path=header
+            f"what {header} says of its checkpoint is not what was written: its sha256 differs", path=header
         )
     try:
         read_content(known)
-        require_known(path, known["format"])
+        if known["format"] > GROUP_VERSION:
+            raise VersionError(
+                f"{path} is written in format {known['format']}; this release reads checkpoints up to format "
+                f"{GROUP_VERSION}: upgrade it; nothing was changed"
+            )
         _require_described(known)
     except ValueError as error:
-        raise _unreadable(error, f"a generation in {header}", header) from error
-    return known
+        raise _unreadable(error, f"a checkpoint in {header}", header) from error
+    return known | {"sha256": stored}
 
 
 def _require_described(known: Mapping[str, Any]) -> None:
@@ -229,12 +232,3 @@ def _require_described(known: Mapping[str, Any]) -> None:
             raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
     if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["upto"] <= LARGEST_NUMBER):
         raise ValueError(f"its number is {known['number']}, its upto {known['upto']}")
-
-
-def require_known(path: Path, version: int) -> None:
-    """Raise VersionError where a generation's format is newer than this release reads."""
-    if version > GROUP_VERSION:
-        raise VersionError(
-            f"{path} is written in format {version}; this release reads generations up to format "
-            f"{GROUP_VERSION}: upgrade it; nothing was changed"
-        )

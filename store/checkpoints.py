@@ -1,0 +1,213 @@
+"""The checkpoints of an open store: which one is read, how a new one is committed, and how a base takes rows' place."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from dataclasses import replace
+from pathlib import Path
+
+from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
+from store.exceptions import DamageError, StoreError, reported
+from store.files import remove_tree
+from store.journal import Journal
+from store.layout import (
+    MOST_DIGITS,
+    Current,
+    NamedCheckpoint,
+    checkpoint_path,
+    log_numbers,
+    log_path,
+    numbers,
+    read_current,
+    remove_unnamed,
+    write_current,
+)
+from store.log import LogReader, Place
+from store.log_writer import create_log
+from store.records import Checkpoint, to_json
+from store.row_encoding import HEAD_BYTES, ROW, decode_head, head_without_arrays, row_sequence
+
+__all__ = ["Checkpoints", "place_in"]
+
+logger = logging.getLogger(__name__)
+
+
+class Checkpoints:
+    """The checkpoints that `CURRENT` in `folder` names. `Store` has methods of the same names."""
+
+    def __init__(self, folder: Path, journal: Journal) -> None:
+        self._folder = folder
+        self._journal = journal
+        self._committing = threading.Lock()
+        self._worker = ThreadPoolExecutor(1, f"store commit {folder.name}")
+        self._queue = threading.Lock()
+        self._waiting: Draft | None = None
+        self._submitted: Future[None] | None = None
+        self._failure: Exception | None = None
+
+    def latest(self, only: Collection[str] | None = None) -> Checkpoint | None:
+        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all."""
+        passed: set[int] = set()
+        while left := [named for named in self._journal.current().checkpoints if named.number not in passed]:
+            passed.add(left[0].number)
+            try:
+                return self._load(left[0], only)
+            except DamageError as damage:
+                if self._is_named(left[0]):
+                    logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
+        return None
+
+    def base(self) -> Checkpoint | None:
+        """Return the checkpoint that stands for the compacted rows, None when there are none."""
+        while (named := self._journal.current().base) is not None:
+            try:
+                return self._load(named)
+            except DamageError:
+                if self._is_named(named):
+                    raise
+        return None
+
+    def _is_named(self, named: NamedCheckpoint) -> bool:
+        """Whether it still counts: a writer replaces checkpoints and removes them."""
+        return named in self._journal.current().checkpoints
+
+    def _load(self, named: NamedCheckpoint, only: Collection[str] | None = None) -> Checkpoint:
+        reader = self._verified(named)
+        return Checkpoint(named.number, named.upto, reader.attributes, reader.arrays(only))
+
+    def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
+        path = checkpoint_path(self._folder, named.number)
+        reader = CheckpointReader(path)
+        known = (reader.number, reader.upto, reader.sha256, dict(reader.identity))
+        if known != (named.number, named.upto, named.sha256, self._journal.identity):
+            raise DamageError(
+                f"{path} is another checkpoint, or another store's, than the one that is named", path=path
+            )
+        return reader
+
+    def commit(self, draft: Draft) -> int:
+        """Write a draft as a checkpoint, have `CURRENT` name it, and return its number."""
+        with self._committing:
+            current = self._journal.current()
+            named = self._write(draft, self._journal.place(draft.upto))
+            if current.newest is None or named.upto >= current.newest.upto:
+                self._commit(replace(current, newest=named))
+            self.remove_unnamed()
+            return named.number
+
+    def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:
+        number = 1 + max(numbers(self._folder, unfinished=True), default=0)
+        if number >= 10**MOST_DIGITS:
+            raise DamageError(f"{self._folder} has a checkpoint of number {number - 1}", path=self._folder)
+        sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
+        return NamedCheckpoint(number, draft.upto, sha256, place)
+
+    def _commit(self, current: Current) -> None:
+        # When this fails all folders stay, for the next commit or open to remove: what could not be synced may be on
+        # the disk all the same, and count after a crash.
+        with reported(self._folder, "committing"):
+            try:
+                write_current(self._folder, current)
+            finally:
+                found = read_current(self._folder)
+                if found.log == self._journal.current().log:
+                    self._journal.committed(found)
+
+    def compact(self, draft: Draft, newest: Draft | None) -> None:
+        """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
+        with self._committing:
+            with self._journal.switching():
+                number = 1 + max(log_numbers(self._folder, unfinished=True))
+                path = log_path(self._folder, number)
+                header = to_json("identity", self._journal.identity).encode()
+                try:
+                    create_log(path, header, self._rows(draft.upto, self._journal.last()))
+                    drafts = [draft] if newest is None else [draft, newest]
+                    named = [self._write(each, place_in(path, each.upto)[1]) for each in drafts]
+                    for damage in (damage for one in named for damage in self._verified(one).damage()):
+                        raise damage
+                except BaseException:
+                    remove_tree(path)
+                    raise
+                self._commit(Current(number, place_in(path, 0)[0], newest=named[-1], base=named[0]))
+            self.remove_unnamed()
+
+    def _rows(self, upto: int, last: int) -> Iterator[tuple[int, bytes]]:
+        for sequence, data in self._journal.payloads(last):
+            try:
+                yield ROW, head_without_arrays(decode_head(data, len(data))) if sequence <= upto else data
+            except ValueError as error:
+                raise DamageError(
+                    f"row {sequence} of {self._folder} was never written so: {error}",
+                    path=self._folder,
+                    sequence=sequence,
+                ) from error
+
+    def commit_later(self, draft: Draft) -> None:
+        """Do `commit` in a background thread; a newer one takes the place of one that still waits.
+
+        Logs a failure and keeps it until `raise_failure`.
+        """
+        with self._queue:
+            self._waiting = draft
+        try:
+            self._submitted = self._worker.submit(self._commit_newest)
+        except RuntimeError:  # the interpreter is shutting down, and starts no job any more
+            self._commit_newest()
+
+    def _commit_newest(self) -> None:
+        with self._queue:
+            draft, self._waiting = self._waiting, None
+        if draft is None:
+            return
+        try:
+            self.commit(draft)
+        except Exception as error:
+            logger.exception("%s: a background commit failed; the journal still holds its rows", self._folder)
+            self._failure = error
+
+    def wait(self) -> None:
+        """Return when no background commit runs or waits."""
+        if self._submitted is not None:
+            wait_for([self._submitted])
+
+    def raise_failure(self) -> None:
+        """Raise the failure of an earlier background commit, once, as a StoreError."""
+        with self._queue:
+            failure, self._failure = self._failure, None
+        if isinstance(failure, StoreError):
+            raise failure
+        if failure is not None:
+            raise StoreError(f"a background commit failed: {failure!r}") from failure
+
+    def close(self) -> None:
+        """Wait for the background commit and end its thread."""
+        self._worker.shutdown()
+
+    def remove_unnamed(self) -> None:
+        """Remove what `CURRENT` does not name: what was replaced, and what a writer that died left."""
+        try:
+            with reported(self._folder, "removing checkpoints"):
+                remove_unnamed(self._folder, self._journal.current())
+        except StoreError as error:
+            # The commit itself stands; the next one, or the next open, removes what is left.
+            logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
+
+
+def place_in(path: Path, upto: int) -> tuple[bytes, Place]:
+    """Return the identity of a log that was just written, and a place in it behind which are all rows behind `upto`.
+
+    Raises DamageError where it does not read back.
+    """
+    with LogReader(path) as log:
+        found = log.place
+        for batch in log.refresh():
+            rows = [frame for frame in batch if frame.kind == ROW]
+            if rows and row_sequence(log.peek(rows[-1].offset, HEAD_BYTES)) > upto:
+                break
+            found = log.place
+        return log.identity, found

@@ -10,6 +10,7 @@ from tempfile import mkdtemp
 from store.exceptions import DamageError, NotAStoreError, StoreError, reported
 from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
 from store.layout import (
+    CURRENT_FILE,
     PARTIAL,
     Current,
     checkpoint_path,
@@ -51,14 +52,14 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
 def _copy(source: Path, draft: Path) -> None:
     """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
     for _ in range(ATTEMPTS):
-        current = read_current(source)
+        current = read_current(source / CURRENT_FILE)
         try:
             _copy_named(source, draft, current)
             failure = None
         except (FileNotFoundError, DamageError) as error:
             failure = error
         # A writer removes what it replaces only after `CURRENT` has ceased to name it.
-        if read_current(source) == current:
+        if read_current(source / CURRENT_FILE) == current:
             if failure is not None:
                 raise failure
             write_current(draft, current)

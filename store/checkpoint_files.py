@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from store.archive import Files
 from store.chunks import ArrayFiles, file_digests, most_bytes
 from store.content import GROUP_VERSION, ArrayContent, read_content
 from store.encoding import array_digest, flat_bytes
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
-from store.files import read_regular, remove_tree, sync_folder, sync_tree
+from store.files import remove_tree, sync_folder, sync_tree
 from store.layout import PARTIAL, checkpoint_path
 from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json
 
@@ -67,7 +68,7 @@ def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[
                 sync_folder(folder)
             remove_tree(partial)
             group = _write_zarr(partial, draft, described, LEVEL)
-            if sum(content.size for content in described.values()) > most_bytes(partial):
+            if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
                 # Readers make no room for so much that so little stands for: anybody could claim it.
                 remove_tree(partial)
                 group = _write_zarr(partial, draft, described, None)
@@ -75,7 +76,7 @@ def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[
             digest = _own_digest(known)
             group.update_attributes(known | {"sha256": digest})
             try:
-                _read_attributes(partial / "zarr.json")
+                _read_attributes(partial / "zarr.json", Files(folder))
             except (ValueError, DamageError) as error:
                 raise RecordError(
                     f"checkpoint {number} has more attributes than could be read again: {error}"
@@ -131,14 +132,14 @@ def _write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent],
 
 
 class CheckpointReader:
-    """The checkpoint in folder `path`: how it describes itself, and its arrays, verified.
+    """A checkpoint of a store: how it describes itself, and its arrays, verified. path: its folder.
 
     Every method raises DamageError that names the file or folder, the array and the checkpoint, VersionError
     for a newer format, and StoreError for a file that cannot be read for a reason that says nothing against it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._known = path, _read_description(path)
+    def __init__(self, path: Path, files: Files) -> None:
+        self._path, self._files, self._known = path, files, _read_description(path, files)
         self.number: int = self._known["number"]
         self.upto: int = self._known["upto"]
         self.sha256: str = self._known["sha256"]
@@ -146,7 +147,7 @@ class CheckpointReader:
         self.identity: Mapping[str, JSON] = self._known["identity"]
         self._described = read_content(self._known)
         try:
-            room = most_bytes(path)
+            room = most_bytes(files.sizes(path))
         except OSError as error:
             raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
         if (size := sum(array.size for array in self._described.values())) > room:
@@ -173,7 +174,7 @@ class CheckpointReader:
         folder, content = self._path / name, self._described[name]
         what = f"array {name!r} of checkpoint {self.number} in {folder}"
         try:
-            array = ArrayFiles(self._path, name, content).read()
+            array = ArrayFiles(self._path, name, content, self._files.read).read()
         except Exception as error:
             raise _unreadable(error, what, folder) from error
         if array_digest(array) != content.sha256:
@@ -181,9 +182,9 @@ class CheckpointReader:
         return array
 
 
-def _read_attributes(header: Path) -> dict[str, Any]:
+def _read_attributes(header: Path, files: Files) -> dict[str, Any]:
     """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
-    group: dict[str, Any] = from_json(read_regular(header, LARGEST_JSON, within=header.parent.parent).decode())
+    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
     attributes = group.get("attributes")
     if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
         raise ValueError("it describes no group of zarr's format 3")
@@ -199,10 +200,10 @@ def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
     return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
 
 
-def _read_description(path: Path) -> dict[str, Any]:
+def _read_description(path: Path, files: Files) -> dict[str, Any]:
     header = path / "zarr.json"
     try:
-        known = _read_attributes(header)
+        known = _read_attributes(header, files)
         stored = known.pop("sha256", None)
         sound = _own_digest(known) == stored
     except Exception as error:

@@ -10,6 +10,7 @@ from concurrent.futures import wait as wait_for
 from dataclasses import replace
 from pathlib import Path
 
+from store.archive import Files
 from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
 from store.exceptions import DamageError, StoreError, reported
 from store.files import remove_tree
@@ -22,7 +23,6 @@ from store.layout import (
     log_numbers,
     log_path,
     numbers,
-    read_current,
     remove_unnamed,
     write_current,
 )
@@ -37,13 +37,13 @@ logger = logging.getLogger(__name__)
 
 
 class Checkpoints:
-    """The checkpoints that `CURRENT` in `folder` names. `Store` has methods of the same names."""
+    """The checkpoints that a store's `CURRENT` names. `Store` has methods of the same names."""
 
-    def __init__(self, folder: Path, journal: Journal) -> None:
-        self._folder = folder
+    def __init__(self, files: Files, journal: Journal) -> None:
+        self._files, self._folder = files, files.folder
         self._journal = journal
         self._committing = threading.Lock()
-        self._worker = ThreadPoolExecutor(1, f"store commit {folder.name}")
+        self._worker = ThreadPoolExecutor(1, f"store commit {files.folder.name}")
         self._queue = threading.Lock()
         self._waiting: Draft | None = None
         self._submitted: Future[None] | None = None
@@ -81,7 +81,7 @@ class Checkpoints:
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)
-        reader = CheckpointReader(path)
+        reader = CheckpointReader(path, self._files)
         known = (reader.number, reader.upto, reader.sha256, dict(reader.identity))
         if known != (named.number, named.upto, named.sha256, self._journal.identity):
             raise DamageError(
@@ -113,7 +113,7 @@ class Checkpoints:
             try:
                 write_current(self._folder, current)
             finally:
-                found = read_current(self._folder)
+                found = self._files.current()
                 if found.log == self._journal.current().log:
                     self._journal.committed(found)
 

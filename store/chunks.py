@@ -7,9 +7,7 @@ made, only one that our own writers would have made for the array counts, and of
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,6 @@ import numpy as np
 from store.content import ArrayContent
 from store.encoding import flat_bytes, require_values
 from store.exceptions import DamageError
-from store.files import read_regular
 from store.frames import decompress_zstd
 from store.records import from_json
 
@@ -33,21 +30,22 @@ SPARE, RATIO = 192 * 2**20, 16
 CHUNK_MORE = 64  # bytes: the header of its frame, and what is no smaller compressed
 
 
-def most_bytes(group: Path) -> int:
-    """Return how many bytes of arrays the files in a checkpoint's folder may stand for."""
-    files = (Path(folder, name).lstat() for folder, _, names in os.walk(group) for name in names)
-    return SPARE + RATIO * sum(found.st_size for found in files if stat.S_ISREG(found.st_mode))
+def most_bytes(sizes: Iterable[int]) -> int:
+    """Return how many bytes of arrays files of these sizes may stand for."""
+    return SPARE + RATIO * sum(sizes)
 
 
 class ArrayFiles:
-    """The files of an array in `folder` of the checkpoint `group`; `content` says what must be in them.
+    """The files of an array in the checkpoint in folder `group`; `content` says what must be in them.
+
+    read: returns the bytes of a file of at most so many.
 
     Every method raises DamageError, ValueError for what is not as it was written, and OSError.
     """
 
-    def __init__(self, group: Path, name: str, content: ArrayContent) -> None:
-        self._group, self._folder, self._content = group, group / name, content
-        text = read_regular(self._folder / "zarr.json", LARGEST_DESCRIPTION, within=group).decode()
+    def __init__(self, group: Path, name: str, content: ArrayContent, read: Callable[[Path, int], bytes]) -> None:
+        self._folder, self._content, self._read = group / name, content, read
+        text = read(self._folder / "zarr.json", LARGEST_DESCRIPTION).decode()
         known = from_json(text)
         self._chunk, self._compressed = content.chunk, _is_compressed(known, content)
         expected = _description(content)
@@ -66,7 +64,7 @@ class ArrayFiles:
         most = prod(self._chunk) * plain.itemsize
         most += most // 64 + 1024 + CHUNK_MORE
         for i, (place, path) in enumerate(self._files()):
-            data = read_regular(path, most, within=self._group)
+            data = self._read(path, most)
             if hashlib.sha256(data).hexdigest() != content.files[i]:
                 raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
             self._fill(plain, place, data)

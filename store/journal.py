@@ -8,13 +8,13 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
+from store.archive import Files
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
 from store.framing import Frame
-from store.layout import CURRENT_FILE, Current, log_path, read_current
+from store.layout import CURRENT_FILE, Current, log_path
 from store.log import LogReader, Place
 from store.log_writer import LogWriter
 from store.records import JSON, Head, Record, from_json
@@ -93,8 +93,8 @@ class _OpenLog:
     where in the log all behind them follow.
     """
 
-    def __init__(self, folder: Path, current: Current, *, write: bool) -> None:
-        self.current, self.path = current, log_path(folder, current.log)
+    def __init__(self, files: Files, current: Current, *, write: bool) -> None:
+        self._files, self.current, self.path = files, current, log_path(files.folder, current.log)
         self.rows, self.first = Rows(), 0
         named = current.newest
         self.log = self._reader(None if named is None else named.place, write=write)
@@ -116,12 +116,12 @@ class _OpenLog:
     def _reader(self, place: Place | None, *, write: bool) -> LogReader:
         """Return the log from a place on; where that is not in it a reader begins at the beginning."""
         try:
-            return LogReader(self.path, place=place)
+            return LogReader(self.path, place=place, file=self._files.open_log(self.path))
         except DamageError as damage:
-            if write or place is None or not self.path.exists():
+            if write or place is None:
                 raise
             logger.warning("%s; reading all of it", damage)
-            return LogReader(self.path)
+            return LogReader(self.path, file=self._files.open_log(self.path))
 
     def _read_identity(self) -> dict[str, JSON]:
         try:
@@ -167,7 +167,7 @@ class _OpenLog:
 
     def _read_before(self) -> None:
         earlier, until = Rows(), self.places[0][1].offset
-        with LogReader(self.path, payloads=False) as reader:
+        with LogReader(self.path, payloads=False, file=self._files.open_log(self.path)) as reader:
             if reader.identity != self.log.identity:
                 raise StoreError(f"{self.path} was replaced while it was read: call again")
             for _ in earlier.take(reader, until):
@@ -189,28 +189,28 @@ class _OpenLog:
 
 
 class Journal:
-    """The journal of the store in `folder`, usable from any thread; raises the store's own errors.
+    """The journal of a store, usable from any thread; raises the store's own errors.
 
     To write, it is opened by whoever holds the writer's lock; a damaged end is refused then, for what is appended
     would lie behind it.
     """
 
-    def __init__(self, folder: Path, *, write: bool) -> None:
-        self.folder, self._write = folder, write
+    def __init__(self, files: Files, *, write: bool) -> None:
+        self._files, self.folder, self._write = files, files.folder, write
         self._guard = threading.RLock()
         self._batch = self._failed = False
         self._unsettled = False
-        with reported(folder, "opening the journal"):
+        with reported(self.folder, "opening the journal"):
             self._open: _OpenLog | None = self._opened()
 
     def _opened(self) -> _OpenLog:
         for _ in range(ATTEMPTS):
-            current = read_current(self.folder)
+            current = self._files.current()
             try:
-                return _OpenLog(self.folder, current, write=self._write)
+                return _OpenLog(self._files, current, write=self._write)
             except FileNotFoundError as error:
                 # A writer removes a log after another has taken its place.
-                if read_current(self.folder) == current:
+                if self._files.current() == current:
                     path = log_path(self.folder, current.log)
                     raise DamageError(
                         f"{path}, which {self.folder / CURRENT_FILE} names, is not there: put it back from a copy, or "
@@ -230,10 +230,10 @@ class Journal:
     def _looking(self, doing: str) -> Iterator[_OpenLog]:
         """The log in use, of a reader after it has read what was committed since."""
         with self._using(doing) as at:
-            yield at if self._write else self._renewed(at)
+            yield at if self._write or self._files.is_packed else self._renewed(at)
 
     def _renewed(self, at: _OpenLog) -> _OpenLog:
-        current = read_current(self.folder)
+        current = self._files.current()
         if current.log == at.current.log:
             at.current = current
             try:
@@ -449,7 +449,7 @@ class Journal:
                 yield
             finally:
                 # A sync that failed leaves it open which of the two is named.
-                if read_current(self.folder).log != at.current.log:
+                if self._files.current().log != at.current.log:
                     self._unsettled = True
                     self._open = self._opened()
                     at.log.close()
@@ -458,7 +458,7 @@ class Journal:
     def size(self) -> int:
         """Return the bytes of the log."""
         with self._looking("measuring the log") as at:
-            return at.path.lstat().st_size
+            return at.log.size
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -23,6 +23,7 @@ __all__ = [
     "CURRENT_FILE",
     "DAMAGED",
     "DERIVED",
+    "LOG",
     "PARTIAL",
     "Current",
     "NamedCheckpoint",
@@ -158,10 +159,9 @@ def _hex(text: Any, size: int) -> bytes:
     return bytes.fromhex(text)
 
 
-def read_current(folder: Path) -> Current:
-    """Return what `CURRENT` says. Raises DamageError, VersionError, and OSError where it is not there."""
-    path = folder / CURRENT_FILE
-    return Current.from_bytes(read_regular(path, LARGEST_CURRENT), path)
+def read_current(path: Path, read: Callable[[Path, int], bytes] = read_regular) -> Current:
+    """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
+    return Current.from_bytes(read(path, LARGEST_CURRENT), path)
 
 
 def write_current(folder: Path, current: Current) -> None:
@@ -231,7 +231,7 @@ def holds_store(folder: Path) -> bool:
         for error in strangers(folder):
             raise error
         try:
-            read_current(folder)
+            read_current(folder / CURRENT_FILE)
             return True
         except FileNotFoundError:
             pass

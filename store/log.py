@@ -62,10 +62,15 @@ class Place(NamedTuple):
 
 
 class LogFile:
-    """A regular file, read and written at offsets from any thread; raises OSError, DamageError for anything else."""
+    """A regular file, read and written at offsets from any thread; raises OSError, DamageError for anything else.
 
-    def __init__(self, path: Path, *, write: bool) -> None:
+    window: offset and size of the part of the file that is all there is, for one that is only read.
+    """
+
+    def __init__(self, path: Path, *, write: bool, window: tuple[int, int] | None = None) -> None:
         self.path = path
+        self._begin = 0 if window is None else window[0]
+        self._end = None if window is None else window[1]
         self._guard = threading.Lock()
         self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
 
@@ -78,8 +83,10 @@ class LogFile:
 
     def read(self, offset: int, size: int) -> bytes:
         """Return so many bytes at an offset, fewer where the file ends."""
+        if self._end is not None:
+            size = max(0, min(size, self._end - offset))
         with self._guard:
-            os.lseek(self.descriptor, offset, os.SEEK_SET)
+            os.lseek(self.descriptor, self._begin + offset, os.SEEK_SET)
             data = part = os.read(self.descriptor, size)
             while part and len(data) < size:
                 part = os.read(self.descriptor, size - len(data))
@@ -89,7 +96,7 @@ class LogFile:
     def write(self, offset: int, data: bytes | bytearray) -> None:
         """Write all bytes at an offset, in one call unless the system takes fewer."""
         with self._guard, memoryview(data) as rest:
-            os.lseek(self.descriptor, offset, os.SEEK_SET)
+            os.lseek(self.descriptor, self._begin + offset, os.SEEK_SET)
             done = 0
             while done < len(rest):
                 done += os.write(self.descriptor, rest[done:])
@@ -105,7 +112,7 @@ class LogFile:
                 "read. In a folder that comes from elsewhere trust nothing",
                 path=self.path,
             )
-        return found.st_size
+        return found.st_size if self._end is None else self._end
 
     def is_at(self, path: Path) -> bool:
         """Return whether `path` still names this file."""
@@ -159,6 +166,7 @@ class LogReader:
 
     payloads: whether `refresh` verifies these, too; where it does not, `read` still does. identity: of a log whose
     first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
+    file: the log, opened already.
 
     Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
     """
@@ -166,13 +174,19 @@ class LogReader:
     WRITES = False
 
     def __init__(
-        self, path: Path, *, place: Place | None = None, payloads: bool = True, identity: bytes | None = None
+        self,
+        path: Path,
+        *,
+        place: Place | None = None,
+        payloads: bool = True,
+        identity: bytes | None = None,
+        file: LogFile | None = None,
     ) -> None:
         self.path = path
         self._payloads = payloads
         self.header_damage: DamageError | None = None
         with reported(path, "opening the log"):
-            self._file = LogFile(path, write=self.WRITES)
+            self._file = LogFile(path, write=self.WRITES) if file is None else file
             try:
                 self._window = _Window(self._file)
                 self._torn: Place | None = None
@@ -362,6 +376,12 @@ class LogReader:
         return payload
 
     @property
+    def size(self) -> int:
+        """The bytes of the file."""
+        with reported(self.path, "measuring the log"):
+            return self._file.size()
+
+    @property
     def moved(self) -> bool:
         """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
         with reported(self.path, "looking for the log"):
@@ -380,10 +400,12 @@ class LogReader:
         self.close()
 
 
-def find_identity(path: Path) -> bytes | None:
-    """Return the identity that the frames of a log carry, by the first of them that can be found; None without one."""
-    with reported(path, "looking for frames"):
-        file = LogFile(path, write=False)
+def find_identity(file: LogFile) -> bytes | None:
+    """Return the identity that the frames of a log carry, by the first of them that can be found; None without one.
+
+    The file is closed.
+    """
+    with reported(file.path, "looking for frames"):
         try:
             for offset in range(0, file.size(), PART):
                 data = file.read(offset, PART + FRAME_BYTES - 1)

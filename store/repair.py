@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
+from store.archive import Files
 from store.checkpoints import place_in
 from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
@@ -75,7 +76,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):
-            survey = Survey(folder, progress or (lambda *_: None))
+            survey = Survey(Files(folder), progress or (lambda *_: None))
             try:
                 if not survey.problems():
                     return Repair(survey.last, [], None)

@@ -13,6 +13,7 @@ from typing import Literal, Self, cast
 
 import numpy as np
 
+from store.archive import files_of
 from store.backup import back_up
 from store.checkpoint_files import Draft
 from store.checkpoints import Checkpoints
@@ -26,7 +27,7 @@ from store.exceptions import (
     StoreError,
     reported,
 )
-from store.files import store_folder, sync_folder, tree_size
+from store.files import store_folder, sync_folder
 from store.journal import Journal
 from store.layout import CHECKPOINTS, Current, holds_store, log_path, require_unshared, write_current
 from store.lock import WriterLock
@@ -57,7 +58,7 @@ class Store:
         identity: Mapping[str, JSON] | None = None,
         mode: Literal["write", "read"] = "write",
     ) -> Self:
-        """Open the store in folder `path`.
+        """Open the store at `path`, a folder, or to read also a packed one, see `write_archive`.
 
         To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it
         for good; an existing store keeps its own, and the caller compares. To read, it makes and changes
@@ -71,7 +72,9 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        if not holds_store(folder) and (mode == "read" or kept is None):
+        if folder.is_file() and mode == "write":
+            raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
+        if not folder.is_file() and not holds_store(folder) and (mode == "read" or kept is None):
             hint = "" if mode == "read" else "; give an identity to make one"
             raise NotAStoreError(f"{folder} holds no store{hint}")
         return cls(folder, kept, mode)
@@ -87,10 +90,13 @@ class Store:
             if mode == "write":
                 self._lock = _lock_to_write(folder, identity)
                 undo.callback(self._lock.release)
-            self._journal = Journal(folder, write=mode == "write")
+            files = files_of(folder)
+            undo.callback(files.close)
+            self._journal = Journal(files, write=mode == "write")
             undo.callback(self._journal.close)
             self.identity = self._journal.identity
-            self._checkpoints = Checkpoints(folder, self._journal)
+            self._checkpoints = Checkpoints(files, self._journal)
+            self._files = files
             if mode == "write":
                 self._checkpoints.remove_unnamed()
             undo.pop_all()
@@ -317,7 +323,7 @@ class Store:
         """Return the bytes on the disk: {"journal": …, "checkpoints": …}."""
         self._check_open()
         with reported(self.path, "measuring the store"):
-            return {"journal": self._journal.size(), "checkpoints": tree_size(self.path / CHECKPOINTS)}
+            return {"journal": self._journal.size(), "checkpoints": sum(self._files.sizes(self.path / CHECKPOINTS))}
 
     def close(self) -> None:
         """Wait for the background commit, release the files and the lock; a second call does nothing.
@@ -336,6 +342,7 @@ class Store:
             try:
                 self._journal.close()
             finally:
+                self._files.close()
                 if self._lock is not None:
                     self._lock.release()
         self._checkpoints.raise_failure()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Literal
 
+from store.archive import Files, files_of
 from store.checkpoint_files import CheckpointReader
 from store.encoding import decode_payload
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
@@ -28,7 +30,6 @@ from store.layout import (
     log_numbers,
     log_path,
     numbers,
-    read_current,
     strangers,
 )
 from store.log import LogReader, Place, find_identity
@@ -78,7 +79,7 @@ class Problem:
 
 
 def check_store(path: str | PathLike[str], *, progress: Progress | None = None) -> list[Problem]:
-    """Return all that is wrong with the store in folder `path`, the journal first; nothing for a sound one.
+    """Return all that is wrong with the store at `path`, in a folder or packed; nothing for a sound one.
 
     It verifies every checksum: `CURRENT`, each frame of the log, each row and its arrays, each array of each
     checkpoint, and what these say of themselves. It changes nothing, and a writer may be at work.
@@ -89,15 +90,19 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     where a file cannot be read for a reason that says nothing against it.
     """
     folder = store_folder(path)
-    require_store(folder)
     with reported(folder, "checking the store"):
-        if found := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
-            return found
-        for _ in range(ATTEMPTS):
-            survey = Survey(folder, progress or (lambda *_: None))
-            found = survey.problems() + list(survey.leftovers())
-            if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
-                break
+        files = files_of(folder)
+        if not files.is_packed:
+            require_store(folder)
+            if strange := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
+                return strange
+        with closing(files):
+            for _ in range(ATTEMPTS):
+                survey = Survey(files, progress or (lambda *_: None))
+                survey.log.close()
+                found = survey.problems() + list(survey.leftovers())
+                if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
+                    break
         return found
 
 
@@ -142,7 +147,7 @@ class FoundLog:
     compacted: the last row without arrays. damage: what is wrong with it but for rows.
     """
 
-    def __init__(self, path: Path, identity: bytes | None, progress: Progress) -> None:
+    def __init__(self, files: Files, path: Path, identity: bytes | None, progress: Progress) -> None:
         self.path, self.damage = path, list[str]()
         self.identity: dict[str, JSON] | None = None
         self.rows: list[tuple[int, Fault | None]] = []
@@ -150,11 +155,12 @@ class FoundLog:
         self.compacted = 0
         self._offsets: dict[int, tuple[int, int]] = {}
         self._reader: LogReader | None = None
-        if not path.exists():
+        try:
+            known = find_identity(files.open_log(path)) if identity is None else identity
+            self._reader = LogReader(path, identity=known, file=files.open_log(path))
+        except FileNotFoundError:
             self.damage.append(f"{path} is gone")
             return
-        try:
-            self._reader = LogReader(path, identity=identity or find_identity(path))
         except DamageError as error:
             self.damage.append(str(error))
             return
@@ -246,7 +252,7 @@ class FoundLog:
 
 
 class Survey:
-    """All that is found of the store in `folder`, and whether it verifies.
+    """All that is found of a store, and whether it verifies.
 
     `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays a base
     stands for, whether that base is sound or not. `last` is the last sequence of which there is any sign; `faults` are
@@ -255,14 +261,15 @@ class Survey:
     against it.
     """
 
-    def __init__(self, folder: Path, progress: Progress) -> None:
-        self.folder, self.progress = folder, progress
+    def __init__(self, files: Files, progress: Progress) -> None:
+        self.files, self.folder, self.progress = files, files.folder, progress
         self.current: Current | None = None
         self.damage: list[Problem] = []
         try:
-            self.current = read_current(folder)
+            self.current = files.current()
         except FileNotFoundError:
-            self.damage.append(Problem(folder / CURRENT_FILE, f"{folder / CURRENT_FILE} is gone", "spare"))
+            path = self.folder / CURRENT_FILE
+            self.damage.append(Problem(path, f"{path} is gone", "spare"))
         except DamageError as error:
             self.damage.append(Problem(error.path, str(error), "spare"))
         self.checkpoints = list(self._found())
@@ -289,7 +296,7 @@ class Survey:
         base = None if self.current is None else self.current.base
         is_base = base is not None and base.number == number
         try:
-            reader = CheckpointReader(path)
+            reader = CheckpointReader(path, self.files)
             found = NamedCheckpoint(reader.number, reader.upto, reader.sha256, NOWHERE)
             expected = found if named is None else named
             if (found.number, found.upto, found.sha256) != (number, expected.upto, expected.sha256):
@@ -306,13 +313,13 @@ class Survey:
         """Return the log that counts: without `CURRENT` the newest for whose compacted rows a checkpoint stands."""
         if self.current is not None:
             path = log_path(self.folder, self.current.log)
-            return FoundLog(_or_aside(path), self.current.log_identity, self.progress)
+            return FoundLog(self.files, _or_aside(path), self.current.log_identity, self.progress)
         there = [log_path(self.folder, number) for number in reversed(log_numbers(self.folder))]
         there += sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}"), reverse=True)
         newest = self.sound[0].upto if self.sound else 0
         first: FoundLog | None = None
         for path in there:
-            log = FoundLog(path, None, self.progress)
+            log = FoundLog(self.files, path, None, self.progress)
             if log.compacted <= newest:
                 if first is not None:
                     first.close()
@@ -321,7 +328,7 @@ class Survey:
                 first = log
             else:
                 log.close()
-        return first or FoundLog(log_path(self.folder, 1), None, self.progress)
+        return first or FoundLog(self.files, log_path(self.folder, 1), None, self.progress)
 
     def _drop_foreign(self) -> None:
         """Where a checkpoint is another store's it does not count."""
@@ -381,7 +388,7 @@ class Survey:
     def moved(self) -> bool:
         """Whether a writer has committed something since."""
         try:
-            return read_current(self.folder) != self.current
+            return self.files.current() != self.current
         except (DamageError, FileNotFoundError):
             return False
 
@@ -411,6 +418,8 @@ class Survey:
 
     def leftovers(self) -> Iterator[Problem]:
         """Yield the files that are there too many, and who removes them."""
+        if self.files.is_packed:
+            return
         known = {found.folder for found in self.checkpoints} | {self.log.path}
         parent = self.folder / CHECKPOINTS
         entries = [*self.folder.iterdir(), *(parent.iterdir() if parent.is_dir() else ())]

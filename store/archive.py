@@ -1,0 +1,175 @@
+"""A packed store: its folder in one zip, nothing in it compressed again, and read where it lies."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zipfile
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from uuid import uuid4
+
+from store.exceptions import DamageError, NotAStoreError, reported
+from store.files import open_regular, read_regular, remove_tree, sync_folder
+from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
+from store.log import LogFile
+
+__all__ = ["Archive", "Files", "files_of", "write_archive"]
+
+NAMES = re.compile(
+    rf"{CURRENT_FILE}|{LOG}\d{{8,18}}|{CHECKPOINTS}/\d{{8,18}}/(zarr\.json|[\w.-]{{1,100}}/(zarr\.json|c(/\d{{1,18}}){{0,64}}))",
+    re.ASCII,
+)
+LOCAL = struct.Struct("<4s22xHH")  # of the header before each file: its mark, and the bytes of its name and of more
+LINK = 0o120000  # of a file's mode
+MOST_FILES = 2**18
+DATE = (1980, 1, 1, 0, 0, 0)  # zip's earliest: the same bytes whenever it is written
+
+
+class Files:
+    """The files of a store in a folder, read: regular ones alone."""
+
+    is_packed = False
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def read(self, path: Path, limit: int) -> bytes:
+        """Return the bytes of a file of the store, of at most `limit`. Raises DamageError, OSError."""
+        return read_regular(path, limit, within=self.folder)
+
+    def open_log(self, path: Path) -> LogFile:
+        """Open a log to read. Raises DamageError, OSError."""
+        return LogFile(path, write=False)
+
+    def sizes(self, folder: Path) -> Iterator[int]:
+        """Yield the bytes of each file below a folder."""
+        for where, _, names in os.walk(folder):
+            yield from (found.st_size for found in (Path(where, name).lstat() for name in names))
+
+    def current(self) -> Current:
+        """Return what `CURRENT` says. Raises DamageError, VersionError, and OSError where it is not there."""
+        path = self.folder / CURRENT_FILE
+        return read_current(path, self.read)
+
+    def close(self) -> None:
+        """Release what is open."""
+
+
+class Archive(Files):
+    """The files of a store in a zip, which is at `folder`; each is a range of the zip's bytes.
+
+    Raises NotAStoreError for what is no zip of a store, DamageError where its lists of files disagree.
+    """
+
+    is_packed = True
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        with reported(path, "opening a packed store"):
+            self._file = LogFile(path, write=False)
+            try:
+                self._size = self._file.size()
+                self._ranges = self._listed()
+            except BaseException:
+                self._file.close()
+                raise
+
+    def _listed(self) -> dict[str, tuple[int, int]]:
+        try:
+            with os.fdopen(open_regular(self.folder, os.O_RDONLY), "rb") as file, zipfile.ZipFile(file) as listed:
+                entries = listed.infolist()
+        except (zipfile.BadZipFile, ValueError, struct.error, NotImplementedError, OverflowError) as error:
+            raise NotAStoreError(f"{self.folder} is no packed store: {error}") from error
+        if not any(entry.filename == CURRENT_FILE for entry in entries):
+            raise NotAStoreError(f"{self.folder} is a zip, and no packed store: it holds no {CURRENT_FILE}")
+        ranges: dict[str, tuple[int, int]] = {}
+        for entry in entries:
+            plain = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
+            if not plain or entry.compress_size != entry.file_size or entry.external_attr >> 16 & LINK == LINK:
+                raise self._damage(f"lists {entry.filename[:100]!r} as a link, or as compressed or encrypted")
+            if not NAMES.fullmatch(entry.filename) or entry.filename in ranges or len(ranges) >= MOST_FILES:
+                raise self._damage(f"lists {entry.filename[:100]!r}, which is no file of a store, or twice")
+            ranges[entry.filename] = self._begin(entry), entry.file_size
+        ordered = sorted((begin, begin + size) for begin, size in ranges.values())
+        if any(end > begin for (_, end), (begin, _) in pairwise(ordered)) or ordered[-1][1] > self._size:
+            raise self._damage("lists files that overlap, or end behind its own end")
+        return ranges
+
+    def _begin(self, entry: zipfile.ZipInfo) -> int:
+        head = self._file.read(entry.header_offset, LOCAL.size) if 0 <= entry.header_offset < self._size else b""
+        if len(head) == LOCAL.size:
+            mark, name, more = LOCAL.unpack(head)
+            begin: int = entry.header_offset + LOCAL.size
+            if mark == b"PK\3\4" and self._file.read(begin, name) == entry.filename.encode("ascii"):
+                return begin + int(name) + int(more)
+        raise self._damage(f"lists {entry.filename!r} where another file begins, or none")
+
+    def _damage(self, what: str) -> DamageError:
+        return DamageError(
+            f"{self.folder} {what}: it is damaged or was made to harm. Fetch it again from where it was packed",
+            path=self.folder,
+        )
+
+    def _range(self, path: Path) -> tuple[int, int]:
+        name = path.relative_to(self.folder).as_posix()
+        if name not in self._ranges:
+            raise FileNotFoundError(2, "no such file in the packed store", str(path))
+        return self._ranges[name]
+
+    def read(self, path: Path, limit: int) -> bytes:
+        """As `Files.read`."""
+        begin, size = self._range(path)
+        if size > limit:
+            raise DamageError(f"{path} has {size} bytes; at most {limit} are read there", path=path)
+        return self._file.read(begin, size)
+
+    def open_log(self, path: Path) -> LogFile:
+        """As `Files.open_log`."""
+        return LogFile(self.folder, write=False, window=self._range(path))
+
+    def sizes(self, folder: Path) -> Iterator[int]:
+        """As `Files.sizes`."""
+        inside = folder.relative_to(self.folder).as_posix() + "/"
+        yield from (size for name, (_, size) in self._ranges.items() if name.startswith(inside))
+
+    def close(self) -> None:
+        """As `Files.close`."""
+        self._file.close()
+
+
+def files_of(path: Path) -> Files:
+    """Return the files of the store at `path`, a folder or a zip."""
+    return Archive(path) if path.is_file() else Files(path)
+
+
+def write_archive(folder: Path, path: Path) -> None:
+    """Write what `CURRENT` in a store's folder names as a zip, whole and durable or not at all.
+
+    Nobody may write to the folder meanwhile. What is at `path` is replaced. Raises StoreFullError, ReadOnlyError or
+    another StoreError.
+    """
+    draft = path.with_name(f"{path.name}.{uuid4().hex}.partial")
+    with reported(path, "packing a store"):
+        current = Files(folder).current()
+        named = [checkpoint_path(folder, each.number) for each in current.checkpoints]
+        files = [folder / CURRENT_FILE, log_path(folder, current.log)]
+        files += sorted(file for group in named for file in group.rglob("*") if file.is_file())
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with draft.open("xb") as file:
+                with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
+                    for each in files:
+                        entry = zipfile.ZipInfo(each.relative_to(folder).as_posix(), DATE)
+                        with each.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
+                            while part := source.read(2**20):
+                                target.write(part)
+                file.flush()
+                os.fsync(file.fileno())
+            draft.replace(path)
+            sync_folder(path.parent)
+        except BaseException:
+            remove_tree(draft)
+            raise

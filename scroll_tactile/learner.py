@@ -29,7 +29,6 @@ from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exem
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, observations
-from scroll_tactile.memory.partial import Joint
 from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
@@ -377,7 +376,7 @@ class TactileLearner:
 
     def merge(
         self,
-        other: TactileLearner | str | os.PathLike[str] | Joint,
+        other: TactileLearner | str | os.PathLike[str],
         *,
         shared: Literal["once", "twice"],
         descriptions: Choice = "same",
@@ -395,8 +394,7 @@ class TactileLearner:
         InputError, StoreError. Nothing was changed then.
         """
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        given = {} if isinstance(path, Joint) else {"other": path}
-        require_arguments({**given, "shared": shared, "descriptions": descriptions}, {"progress": progress})
+        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
         return self._ledger.merge(path, shared, descriptions, progress or _silent)
 
     def backup(

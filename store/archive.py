@@ -16,13 +16,14 @@ from store.files import open_regular, read_regular, remove_tree, sync_folder
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
 from store.log import LogFile
 
-__all__ = ["Archive", "Files", "files_of", "write_archive"]
+__all__ = ["ARCHIVE_BYTES", "Archive", "Files", "files_of", "is_archive", "write_archive"]
 
 NAMES = re.compile(
     rf"{CURRENT_FILE}|{LOG}\d{{8,18}}|{CHECKPOINTS}/\d{{8,18}}/(zarr\.json|[\w.-]{{1,100}}/(zarr\.json|c(/\d{{1,18}}){{0,64}}))",
     re.ASCII,
 )
 LOCAL = struct.Struct("<4s22xHH")  # of the header before each file: its mark, and the bytes of its name and of more
+ARCHIVE_BYTES = LOCAL.size + len(CURRENT_FILE)
 LINK = 0o120000  # of a file's mode
 MOST_FILES = 2**18
 DATE = (1980, 1, 1, 0, 0, 0)  # zip's earliest: the same bytes whenever it is written
@@ -138,6 +139,11 @@ class Archive(Files):
     def close(self) -> None:
         """As `Files.close`."""
         self._file.close()
+
+
+def is_archive(begin: bytes) -> bool:
+    """Return whether a file that begins with these ARCHIVE_BYTES is a packed store, as `write_archive` writes it."""
+    return begin[:4] == b"PK\3\4" and begin[LOCAL.size :].startswith(CURRENT_FILE.encode())
 
 
 def files_of(path: Path) -> Files:

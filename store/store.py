@@ -115,6 +115,11 @@ class Store:
             raise ReadOnlyError(f'{self.path} was opened with mode="read"')
 
     @property
+    def is_packed(self) -> bool:
+        """Whether it is a packed store, which is only read."""
+        return self._files.is_packed
+
+    @property
     def last(self) -> int:
         """The sequence of the last durable record, 0 when there is none."""
         self._check_open()

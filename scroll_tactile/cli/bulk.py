@@ -112,7 +112,7 @@ def learn(
     Episodes name themselves where a recording says what they are. The exit code is 1 where something was refused.
     """
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.pipelines.learning import learn as learn_sources
+    from scroll_tactile.pipelines.learning import learn_sources
     from scroll_tactile.pipelines.sources import find_sources, has_touches
 
     found, missing = find_sources(sources)

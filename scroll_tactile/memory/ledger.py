@@ -7,7 +7,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +29,6 @@ from scroll_tactile.memory.merge import (
     observations_of,
 )
 from scroll_tactile.memory.packing import pack_memory
-from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.rows import (
     DESCRIBE,
     MEMBER,
@@ -48,7 +47,6 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
 from store import CompactedError, DamageError, Head, ReadOnlyError, Record, Store, StoreClosedError, StoreError
-from store.files import is_there
 
 __all__ = ["Ledger"]
 
@@ -68,7 +66,8 @@ class Ledger:
 
     lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
     described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
-    since it was last cleared; None where that is too much, or more has changed.
+    since it was last cleared; None where that is too much, or more has changed. saves: whether checkpoints are written;
+    without them the journal still has all.
     """
 
     def __init__(
@@ -85,6 +84,7 @@ class Ledger:
         self.version = 0
         self.described = 0
         self.follow = False
+        self.saves = True
         self.added: list[Added] | None = []
         self._load = load
         self._memory = load()
@@ -358,18 +358,48 @@ class Ledger:
 
     def merge(
         self,
-        other: str | os.PathLike[str] | Joint,
+        other: str | os.PathLike[str],
         shared: Literal["once", "twice"],
         descriptions: Choice,
         progress: Callable[[str, int, int], object],
     ) -> Merged:
         """As `TactileLearner.merge`."""
+        return self._merge(other, shared, descriptions, progress, one_name=False)[0]
+
+    def merge_sources(
+        self, other: str | os.PathLike[str], descriptions: Choice, progress: Callable[[str, int, int], object]
+    ) -> tuple[Merged, list[tuple[str, str]]]:
+        """Merge what was learned from sources: each touch once, and under its first name.
+
+        Returns also of each touch that is refused where it came from, and why. Raises ObservationError where one
+        cannot be left out, for what it was learned into was compacted.
+        """
+        merged, refused = self._merge(other, "once", descriptions, progress, one_name=True)
+        return merged, [(str(head.attributes.get(SOURCE, other)), why) for head, why in refused]
+
+    def _merge(
+        self,
+        other: str | os.PathLike[str],
+        shared: Literal["once", "twice"],
+        descriptions: Choice,
+        progress: Callable[[str, int, int], object],
+        *,
+        one_name: bool,
+    ) -> tuple[Merged, list[tuple[Head, str]]]:
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
             self._require_no_batch("a merge")
-            with _opened(other) as source:
+            with MemoryStore.open(other, mode="read") as source:
                 source.read_with(memory.plan, thorough=True)
-                incoming = Incoming.of(store, memory, source, once=shared == "once", descriptions=descriptions)
+                incoming = Incoming.of(
+                    store,
+                    memory,
+                    source,
+                    self.contents(),
+                    once=shared == "once",
+                    one_name=one_name,
+                    descriptions=descriptions,
+                )
                 before = memory.sequence
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
@@ -377,7 +407,7 @@ class Ledger:
                     self._contents.added(map(_touch, came))
             self._changed()
             self._snapshot_if_due()
-        return Merged(added, incoming.shared, len(incoming.descriptions))
+        return Merged(added, incoming.shared, len(incoming.descriptions)), incoming.refused
 
     def pack(self, path: str | os.PathLike[str], rows: bool, readings: bool, source: str | None) -> None:
         """As `TactileLearner.pack`."""
@@ -460,7 +490,7 @@ class Ledger:
 
     def _snapshot_if_due(self) -> None:
         rows = max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW)
-        if self.store is None or self._batching or self._memory.sequence - self._saved < rows:
+        if self.store is None or not self.saves or self._batching or self._memory.sequence - self._saved < rows:
             return
         arrays, attributes = self._memory.to_arrays()
         try:
@@ -488,7 +518,7 @@ class Ledger:
                 return
             try:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.
-                if store.mode == "write" and self._whole and self._memory.sequence > self._saved:
+                if store.mode == "write" and self.saves and self._whole and self._memory.sequence > self._saved:
                     self._pass_over_failures(store)
                     self._snapshot()
             finally:
@@ -519,11 +549,3 @@ def _sound(store: Store, kind: str | None = None) -> Iterator[Head]:
             if damage.sequence is None or damage.sequence <= after:
                 return
             after = damage.sequence
-
-
-def _opened(other: str | os.PathLike[str] | Joint) -> AbstractContextManager[MemoryStore | Partial | Joint]:
-    """A memory to be merged: in a folder, in a file, or partials that are open already."""
-    if isinstance(other, Joint):
-        return nullcontext(other)
-    path = Path(other)
-    return Partial(path) if is_there(path) and path.is_file() else MemoryStore.open(path, mode="read")

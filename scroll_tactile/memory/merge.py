@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 from pydantic import BaseModel
 
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory.contents import Contents, refusal
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.gate import require_counted, wrong_retractions
+from scroll_tactile.memory.gate import MemoryStore, require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
-from scroll_tactile.memory.partial import Joint, Partial, sums_without
-from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, retracted_by
+from scroll_tactile.memory.packing import sums_without
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, retracted_by, standing
 from scroll_tactile.memory.state import Memory, apply_description
 from scroll_tactile.results import Observation, Receipt
 from store import Checkpoint, Head, Record, Store
@@ -22,13 +23,11 @@ from store.files import same_folder
 __all__ = [
     "Choice",
     "Incoming",
-    "Journal",
     "compaction_point",
     "observation_of",
     "observations",
     "observations_from",
     "observations_of",
-    "standing",
 ]
 
 
@@ -137,9 +136,6 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
     return memory.base if len(sequences) <= keep else sequences[-keep] - 1
 
 
-Journal = Store | Partial | Joint
-"""What can be merged: a memory's folder, or partials of one."""
-
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
@@ -149,44 +145,52 @@ class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed.
-    left_out: those of them that are counted once, and what a fleet refused. descriptions: by material, those that we
-    have not. Made by `Incoming.of`.
+    left_out: those of them that are counted once, and what is refused. refused: touches that are there under another
+    name, and why that is refused. descriptions: by material, those that we have not. Made by `Incoming.of`.
     """
 
-    source: Journal
+    source: MemoryStore
     base: Checkpoint | None
     rows: list[Head]
     shared: int
     left_out: list[Head]
+    refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
 
     @classmethod
-    def of(cls, ours: Store, memory: Memory, theirs: Journal, *, once: bool, descriptions: Choice) -> Incoming:
+    def of(
+        cls,
+        ours: Store,
+        memory: Memory,
+        theirs: MemoryStore,
+        contents: Contents,
+        *,
+        once: bool,
+        one_name: bool,
+        descriptions: Choice,
+    ) -> Incoming:
         """Look through both journals.
 
-        once: leave out streams that both observed, of one material with one content hash. Raises MismatchError where
-        theirs cannot be a part of ours, or describes a material otherwise and nobody chose, ObservationError where a
-        shared stream cannot be left out, DamageError for what opening theirs refuses, and for a shared stream that is
-        not what its key says, here or there.
+        contents: which touches we have. once: leave out streams that both observed, of one material with one content
+        hash. one_name: refuse touches that are there under another name. Raises MismatchError where theirs cannot be a
+        part of ours, or describes a material otherwise and nobody chose, ObservationError where a touch cannot be left
+        out, DamageError for what opening theirs refuses, and for a shared stream that is not what its key says, here
+        or there.
         """
         _require_mergeable(ours, memory, theirs)
         base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
         incoming = standing(heads)
-        known = {(head.label, head.key): head for head in standing(ours.heads()) if head.kind != MERGE}
-        both = [head for head in incoming if head.kind != MERGE and (head.label, head.key) in known]
-        fixed = [head for head in both if head.sequence <= base or head.kind == MEMBER]
-        if once and fixed:
-            raise ObservationError(
-                f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be counted "
-                f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
-                'or count them twice, with shared="twice"'
-            )
-        refused = theirs.refused if isinstance(theirs, Joint) else frozenset()
-        out = {*(known if once else ()), *refused}
-        rows = [head for head in incoming if (head.label, head.key) not in out]
-        left_out = [head for head in incoming if (head.label, head.key) in out]
+        both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
+        refused = list(_refused(incoming, contents)) if one_name else []
+        out = {*(both if once else ()), *(head.sequence for head, _ in refused)}
+        if fixed := [
+            head for head in incoming if head.sequence in out and (head.sequence <= base or head.kind == MEMBER)
+        ]:
+            raise _cannot_be_left_out(theirs, fixed, refused)
+        rows = [head for head in incoming if head.sequence not in out]
+        left_out = [head for head in incoming if head.sequence in out]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
@@ -196,10 +200,11 @@ class Incoming:
         described = _descriptions(ours, memory, theirs, found, descriptions)
         _require_sound(theirs, heads, coming={head.sequence for head in rows})
         if once:
-            for head in (known[head.label, head.key] for head in both):
-                if head.kind == OBSERVE and head.sequence > ours.compacted:
-                    ours.record(head.sequence)
-        return cls(theirs, found, rows, len(both), left_out, described)
+            for head in (head for head in incoming if head.sequence in both):
+                sequence = _row(contents, head) or 0
+                if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
+                    ours.record(sequence)
+        return cls(theirs, found, rows, len(both), left_out, refused, described)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -230,7 +235,7 @@ class Incoming:
     def _sums(self, memory: Memory) -> Memory | None:
         """What the rows taught, of those that are not left out; None where only replaying them tells."""
         source = self.source
-        if not isinstance(source, Partial | Joint) or not source.has_rows:
+        if not source.is_packed or source.compacted:
             return None
         if memory.kept is not None and (Identity.read(source).recall or 0) != memory.kept.capacity:
             return None
@@ -252,21 +257,41 @@ class Incoming:
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
 
 
-def standing(rows: Iterable[Head]) -> list[Head]:
-    """The rows that something was learned from, compacted ones too, without the retracted ones."""
-    heads = list(rows)
-    retracted = retracted_by(heads)
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
+def _row(contents: Contents, head: Head) -> int | None:
+    """Our row of a touch that both have under one name; None where we have it not."""
+    return contents.find(head.label, head.key)
+
+
+def _refused(incoming: Sequence[Head], contents: Contents) -> Iterator[tuple[Head, str]]:
+    """The touches that are there under another name, or came under another just before, and why they are refused."""
+    came: dict[bytes, str] = {}
+    for head in incoming:
+        if head.kind == MERGE:
+            continue
+        names = contents.names(head.key) or [came.setdefault(head.key, head.label)]
+        if (why := refusal(names, head.label)) is not None:
+            yield head, why
+
+
+def _cannot_be_left_out(
+    theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
+) -> ObservationError:
+    named = {head.sequence: why for head, why in refused}
+    if why := named.get(fixed[0].sequence):
+        more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
+        return ObservationError(f"{why}{more}; {theirs.path} was compacted, and none of them can be left out")
+    return ObservationError(
+        f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be counted "
+        f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
+        'or count them twice, with shared="twice"'
+    )
 
 
 def _descriptions(
-    ours: Store, memory: Memory, theirs: Journal, base: Checkpoint | None, choice: Choice
+    ours: Store, memory: Memory, theirs: MemoryStore, base: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
-    if isinstance(theirs, Partial | Joint):
-        theirs_now = dict(theirs.descriptions)
-    else:
-        theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes.get("descriptions", {})))
+    theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes.get("descriptions", {})))
     for head in theirs.heads(0 if base is None else base.upto):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
@@ -281,7 +306,7 @@ def _descriptions(
     return {name: new[name] for name in new if choice != "ours" or name not in ours_now}
 
 
-def _require_mergeable(ours: Store, memory: Memory, theirs: Journal) -> None:
+def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:
     if same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)
@@ -307,12 +332,11 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: Journal) -> None:
         )
 
 
-def _require_sound(theirs: Journal, heads: Sequence[Head], coming: Set[int]) -> None:
+def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> None:
     """Raise DamageError where what does not come in would not pass the gate when theirs is opened."""
     for wrong in wrong_retractions(theirs.path, heads):
         raise wrong
-    if isinstance(theirs, Store):
-        theirs.latest()
+    theirs.latest()
     for head in heads:
         if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
             theirs.record(head.sequence)

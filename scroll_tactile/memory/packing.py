@@ -1,76 +1,96 @@
-"""Partials are made: of a memory, and of other partials, whose sums add up in any order to the same bytes."""
+"""A memory packed into one file, and what such a file brings to another memory: its sums, and its rows."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection
 from copy import copy
-from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
-from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.buffer import candidates_of
-from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.merge import standing
-from scroll_tactile.memory.partial import Partial, sums_without, write_partial
-from scroll_tactile.memory.rows import MERGE, SOURCE
+from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, standing
 from scroll_tactile.memory.state import Memory
-from store import Store
+from store import DamageError, Store
+from store.archive import write_archive
+from store.exceptions import reported
 
-__all__ = ["pack_memory", "reduce_partials"]
+__all__ = ["pack_memory", "sums_without"]
 
 
 def pack_memory(
     store: Store, memory: Memory, path: Path, *, rows: bool = True, readings: bool = True, source: str | None = None
 ) -> None:
-    """Write all that a memory learned as a partial; the arguments are those of `TactileLearner.pack`."""
+    """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
     found = standing(store.heads())
     heads = [head for head in found if head.kind != MERGE]
-    whole = not memory.base and len(heads) == len(found)
-    with_rows = rows and readings and whole
+    with_rows = rows and readings and not memory.base and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
-    candidates: list[Exemplar] | None = None if with_rows else candidates_of(memory, store)
+    packed = copy(memory)
+    packed.tuned, packed.tuned_upto, packed.retracted, packed.excluded = None, 0, set(), set()
     if not readings:
-        identity, memory, candidates = _without_readings(identity), copy(memory), []
-        memory.kept = memory.exemplars = None
-        memory.capacity = 0
-    with write_partial(path) as partial:
-        for head in heads:
-            said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
-            said |= {} if source is None or SOURCE in said else {SOURCE: source}
-            arrays = store.record(head.sequence).arrays if with_rows else None
-            partial.touch(replace(head, attributes=said), arrays)
-        partial.finish(identity, memory, candidates)
+        identity = {name: value for name, value in identity.items() if name != "recall"} | {"exemplars": [0, None]}
+        packed.kept = packed.exemplars = None
+        packed.capacity = 0
+    with reported(path, "packing a memory"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.", suffix=".partial") as folder,
+            Store.open(folder, identity=identity) as into,
+        ):
+            places = {}
+            with into.batch():
+                for head in heads:
+                    said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
+                    said |= {} if source is None or SOURCE in said else {SOURCE: source}
+                    arrays = store.record(head.sequence).arrays if with_rows else None
+                    row = into.append(head.kind, head.label, head.key, attributes=said, arrays=arrays, time=head.time)
+                    places[head.sequence] = row
+                for material, constituents in memory.descriptions.items():
+                    into.append(DESCRIBE, material, b"", attributes={"constituents": constituents})
+            if with_rows:
+                if packed.exemplars is not None:
+                    packed.exemplars = memory.of_nothing().exemplars
+                    assert packed.exemplars is not None
+                    packed.exemplars.update(
+                        (row.label, row.key, row.sequence) for row in places.values() if "nbytes" in row.attributes
+                    )
+                written, attributes = packed.to_arrays()
+                into.commit(written, upto=into.last, attributes=attributes)
+            else:
+                candidates = candidates_of(memory, store) if readings else []
+                written, attributes = packed.to_arrays(into.last, candidates)
+                into.compact(written, upto=into.last, attributes=attributes)
+            write_archive(Path(folder), path)
 
 
-def _without_readings(identity: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in identity.items() if name != "recall"} | {"exemplars": [0, None]}
+def sums_without(source: MemoryStore, memory: Memory, left_out: Collection[int]) -> Memory | None:
+    """What the touches of a packed memory taught, without some of them, exactly; None where only replaying them tells.
 
-
-def reduce_partials(
-    parts: Sequence[tuple[Path, Collection[int]]], target: Path, memory: Memory, *, thorough: bool = False
-) -> None:
-    """Sum up partials of one making as a partial without rows, exactly, whatever their order.
-
-    parts: each with the numbers of its touches that are left out, since they came before; these need their rows.
-    memory: an empty one of their making, which is filled.
-
-    Raises MismatchError where they are of different makings; DamageError and other StoreErrors.
+    memory: any of that making. Raises DamageError, also where the sums are not those of the touches that it names.
     """
-    identity: dict[str, Any] | None = None
-    exemplars = True
-    with write_partial(target) as joint:
-        for path, left_out in parts:
-            with Partial(path) as partial:
-                partial.read_with(memory.plan, thorough=thorough)
-                if identity is not None and partial.identity != identity:
-                    raise MismatchError(f"{path} was made with other settings than {parts[0][0]}: it cannot be added")
-                identity = dict(partial.identity)
-                exemplars = exemplars and not partial.has_rows
-                memory.join(sums_without(partial, memory, left_out))
-                for head in partial.named:
-                    if head.sequence not in left_out:
-                        joint.touch(head)
-        candidates = [cast(Exemplar, source) for *_, source in memory.exemplars or ()] if exemplars else None
-        joint.finish(identity or {}, memory, candidates)
+    found = source.latest()
+    if not source.is_packed or found is None or source.compacted or found.upto != source.last:
+        return None
+    heads = [head for head in source.heads() if head.kind == OBSERVE]
+    observed = found.arrays["observations"]
+    said = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
+    if len(heads) != sum(1 for head in source.heads() if head.kind != DESCRIBE):
+        return None
+    if observed.ndim != 1 or said != Counter(head.label for head in heads):
+        raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
+    sums = memory.of_sums(found.arrays, found.attributes)
+    if not left_out:
+        return sums
+    gone, rest = memory.of_nothing(), memory.of_nothing()
+    for sequence in left_out:
+        record = source.record(sequence)
+        columns, codes = memory.codes(record)
+        gone.statistics.add(record.label, codes, columns)
+    rest.statistics = sums.statistics - gone.statistics
+    rest.exemplars = None  # the rows have them
+    rest.choose([head for head in heads if head.sequence not in left_out], source, sums)
+    return rest

@@ -35,6 +35,7 @@ __all__ = [
     "retracted_by",
     "row_codes",
     "spans",
+    "standing",
     "unpack_codes",
     "unpack_readings",
     "unpack_windows",
@@ -177,6 +178,13 @@ def _scales(arrays: Arrays, prefix: str) -> list[tuple[str, Scale]]:
 def retracted_by(rows: Iterable[Head]) -> set[int]:
     """The observations that these rows of a journal retracted."""
     return {row for head in rows if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
+
+
+def standing(rows: Iterable[Head]) -> list[Head]:
+    """The rows that something was learned from, compacted ones too, without the retracted ones."""
+    heads = list(rows)
+    retracted = retracted_by(heads)
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
 
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:

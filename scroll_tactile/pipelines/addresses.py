@@ -11,13 +11,13 @@ from typing import TypeVar
 
 from scroll_tactile.pipelines.sources import Refused, find_sources
 from scroll_tactile.recordings.locations import file_system, is_remote
+from store.archive import ARCHIVE_BYTES, is_archive
 from store.layout import CURRENT_FILE, holds_store
-from store.packed import BEGIN
 
 __all__ = ["expand", "is_memory"]
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
-PACKED = (".part", ".partial")  # what is looked for in a remote folder: usual names of packed memories
+PACKED = (".part",)  # what is looked for in a remote folder: usual names of packed memories
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 T = TypeVar("T")
@@ -43,7 +43,7 @@ def _is_local_memory(path: Path) -> bool:
     if not path.is_file():  # a pipe would be waited for
         return False
     with path.open("rb") as file:
-        return file.read(len(BEGIN)) == BEGIN
+        return is_archive(file.read(ARCHIVE_BYTES))
 
 
 def _is_remote_memory(address: str) -> bool:
@@ -53,7 +53,7 @@ def _is_remote_memory(address: str) -> bool:
     if files.isdir(path):
         return bool(files.exists(f"{path.rstrip('/')}/{CURRENT_FILE}"))
     with files.open(path, "rb", cache_type="none") as file:
-        return bool(file.read(len(BEGIN)) == BEGIN)
+        return is_archive(file.read(ARCHIVE_BYTES))
 
 
 def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[str], list[Refused]]:

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait as wait_for
 from typing import Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.pipelines.partials import LearnJob, Made, SumJob, learn_partial
+from scroll_tactile.pipelines.jobs import LearnJob, Made, learn_job
 
 __all__ = ["Engine", "Processes", "engine"]
 
@@ -33,7 +33,7 @@ class Engine:
     def __init__(self, executor: Executor, workers: int) -> None:
         self._executor, self.workers, self.room = executor, workers, 2 * workers
 
-    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+    def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
         """Have a job done; the future raises where it could not be."""
         return self._executor.submit(what, job)
 
@@ -66,9 +66,9 @@ class Processes(Engine):
         method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
         self._context: Any = get_context(method)
         if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
-            self._context.set_forkserver_preload([learn_partial.__module__])
+            self._context.set_forkserver_preload([learn_job.__module__])
 
-    def submit(self, what: Callable[[Any], Made], job: LearnJob | SumJob) -> Future[Made]:
+    def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
         """As `Engine.submit`, by a process that has nothing else to do."""
         for left in range(STARTS, 0, -1):
             pool = self._free.pop() if self._free else self._new()

@@ -1,7 +1,8 @@
-"""A fleet's memory: many recordings and memories, learned by many workers, become one, to the same bytes.
+"""Many recordings and memories become one memory, to the same bytes, whoever learns them and in how many processes.
 
-Each worker learns some sources into a partial memory, a file; partials are summed up at the workers, as a tree; their
-touches and the sum of all become one memory in a folder. Sums of whole numbers are equal in any order, so the digest
+Sources are cut into steps, in their order: some recordings, or a memory. A worker learns the recordings of a step by
+the same loop as one process does, into a packed memory of its own; steps are merged one after another, as they come
+up. With one process the loop writes into the memory itself. Sums of whole numbers are equal in any order, so the digest
 is that of one process which observed each touch once, whatever the workers, their number and their ends.
 
 Who runs the jobs is chosen by what is passed: processes on this machine, or a client of a cluster.
@@ -18,30 +19,29 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
+from scroll_tactile.errors import (
+    CapacityError,
+    InputError,
+    MismatchError,
+    ObservationError,
+    RangeWarning,
+    ScrollTactileError,
+)
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import usual_embedding
-from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.merge import Choice, is_from
 from scroll_tactile.pipelines.addresses import expand, is_memory
-from scroll_tactile.pipelines.choosing import Part
 from scroll_tactile.pipelines.engines import Engine, engine
-from scroll_tactile.pipelines.gathering import FleetReport, Gathering
-from scroll_tactile.pipelines.partials import (
-    Contained,
-    LearnJob,
-    Made,
-    Making,
-    SumJob,
-    learn_partial,
-    packed_path,
-    sum_partials,
-)
+from scroll_tactile.pipelines.jobs import LearnJob, Made, Making, learn_job
+from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.runfile import RunFile, alone_in
-from scroll_tactile.pipelines.sources import Refused, SourceOptions
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches
+from scroll_tactile.recordings.locations import local
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from store import StoreError, StoreFullError
@@ -50,18 +50,41 @@ __all__ = ["FleetReport", "learn"]
 
 logger = logging.getLogger(__name__)
 
-FAN = 16  # partials that are summed up by one job
-MOST_SOURCES = 1024  # of a job: of touches of 6 ms so many cost thirty times what writing and adding their sums does
-MOST_BYTES = 2**26  # of their files, where these are here
-JOBS_A_WORKER = 4  # at least, so that all have something to do to the end
+JOBS_A_WORKER = 4  # at least, so that all have something to do to the end; a merge costs what 50 touches do
+MOST_SOURCES = 1024  # of a job: what is lost with a worker
+MOST_BYTES = 2**28  # of their files, where these are here
 NOTES = "run.json"
-PARTS = (".part", ".partial")
 TRIES = 20  # of a job of one source whose worker died: on a machine that kills a worker a second, nearly all end sooner
 SLOW = 5  # tries that one counts for which took all the patience that there is
 QUEUED = 2  # times its patience, and GRACE seconds: so long may a job be under way, for it may wait behind another, and
 GRACE = 10.0  # a worker takes a moment to begin
 
 Progress = Callable[[str, int, int], object]
+
+
+@dataclass
+class FleetReport:
+    """What a run did.
+
+    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
+    those that had come before, by their names and contents. refused: what was not learned, and why; of touches that
+    came under two names the first counts, of the destination and then of the sources in their order. deaths: jobs whose
+    worker ended before them, or did not answer. seconds: of all, and of merging. processor: seconds of the workers,
+    and of this process. held, digest: of the memory that came out. range_problem: where touches do not fit the
+    sensor's range, what is wrong with the first, and what to do.
+    """
+
+    sources: int = 0
+    observations: int = 0
+    repeated: int = 0
+    refused: list[Refused] = field(default_factory=list)
+    deaths: int = 0
+    seconds: float = 0.0
+    merging: float = 0.0
+    held: int = 0
+    digest: str = ""
+    range_problem: str | None = None
+    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "merging": 0.0})
 
 
 def learn(
@@ -79,26 +102,24 @@ def learn(
     add: bool = False,
     descriptions: Choice = "same",
     patience: float | None = None,
-    fan: int = FAN,
     progress: Progress = lambda what, done, of: None,
 ) -> FleetReport:
-    """Learn recordings and memories into the memory in folder `destination`, each touch once; durable at the end.
+    """Learn recordings and memories into the memory in folder `destination`, each touch once.
 
     sources: files, folders and addresses that fsspec knows, of recordings (as `recordings.read` takes them) and of
     memories, in folders or packed. options: how recordings are cut into touches and named.
     sensor, embedding, augmentation, exemplars, recall: of the memory, as of `TactileLearner`; an existing one knows.
     workers: processes on this machine; as many as it has cores unless given. client: of a `dask.distributed` cluster,
     or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
-    the destination, where partials lie meanwhile.
+    the destination, where packed memories lie until they are merged.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
     destination comes first, then the sources in their order. patience: seconds that a job, or a look at an address,
     may take before it is given up; an answer is waited for little more than twice as long, and from whoever gives none
-    to any job the run ends. fan: how many partials are summed up at once. progress: called with (what is being done,
-    sources done, sources in all).
+    to any job the run ends. progress: called with (what is being done, sources done, sources in all).
 
-    A run that was cut short goes on where it was when it is called again. Sources that cannot be read are listed in
-    the report, and so are those whose workers die again and again; all others are learned. Warns at the end, by a
-    RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
+    What is merged is durable, and a run that was cut short goes on where it was when it is called again. Sources that
+    cannot be read are listed in the report, and so are those whose workers die again and again; all others are learned.
+    Warns at the end, by a RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
     for a destination of another sensor; CapacityError beyond what exact sums hold; LockedError while another fleet is
@@ -110,39 +131,35 @@ def learn(
     found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
     settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "recall": recall}
+    folder = place.with_name(place.name + ".fleet")
     with ExitStack() as stack:
-        stack.enter_context(alone_in(_folder_of(place), place))
+        stack.enter_context(alone_in(folder, place))
         held = None
         if place.exists():
             held = stack.enter_context(TactileLearner.open(place, sensor=sensor, embedding=embedding, **settings))
         making = _making(held, sensor, embedding, settings, options or SourceOptions(), patience)
-        folder = _folder_of(place)
         if held is not None and held.observations() and not (folder / NOTES).exists() and not add:
             raise InputError(
                 f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
                 "add to it"
             )
-        run = _Run(folder, making, report, fan, progress)
+        into = _Destination(place, making, held, stack, report, descriptions)
+        run = _Run(folder, making, report, into, progress)
         run.begin(found)
-        with engine(client, workers) as chosen:
-            sums = run.work(chosen)
-        if held is None:
-            if sums is None and not run.whole:
-                raise InputError(_nothing(report))
-            held = TactileLearner.open(place, sensor=making.sensor, embedding=making.embedding, **settings)
-            stack.enter_context(held)
-        run.merge(held, sums, descriptions)
-        report.held, report.digest = sum(held.materials.values()), held.digest()
-        held.close()
+        if client is None and workers == 1:
+            run.work_here()
+        else:
+            with engine(client, workers) as chosen:
+                run.work(chosen)
+        if into.learner is None:
+            raise InputError(_nothing(report))
+        report.held, report.digest = sum(into.learner.materials.values()), into.learner.digest()
+        into.close()
         run.end()
     report.seconds = time.perf_counter() - begun
     if report.range_problem is not None:
         warnings.warn(report.range_problem, RangeWarning, stacklevel=2)
     return report
-
-
-def _folder_of(place: Path) -> Path:
-    return place.with_name(place.name + ".fleet")
 
 
 def _nothing(report: FleetReport) -> str:
@@ -167,89 +184,171 @@ def _making(
     return Making(sensor, chosen, **settings, options=options, patience=patience)
 
 
-class _Run:
-    """One run: what is to be done, what was done, and the folder where partials lie until they are merged."""
+class _Destination:
+    """The memory that comes out: made when the first touches come in."""
 
-    def __init__(self, folder: Path, making: Making, report: FleetReport, fan: int, progress: Progress) -> None:
-        self.folder, self.making, self.report = folder, making, report
-        self._fan, self._progress = fan, progress
+    def __init__(
+        self,
+        place: Path,
+        making: Making,
+        learner: TactileLearner | None,
+        stack: ExitStack,
+        report: FleetReport,
+        descriptions: Choice,
+    ) -> None:
+        self.learner, self._place, self._making, self._stack = learner, place, making, stack
+        self._report, self._descriptions = report, descriptions
+        if learner is not None:
+            learner._ledger.saves = False
+
+    def opened(self) -> TactileLearner:
+        """The memory, made where there is none."""
+        if self.learner is None:
+            self.learner = self._stack.enter_context(self._making.open(self._place))
+            self.learner._ledger.saves = False  # once, at the end: a checkpoint costs what 100 touches do
+        return self.learner
+
+    def merge(self, path: Path, source: str, progress: Progress) -> list[tuple[str, str]]:
+        """Merge a memory, each touch once; what is refused, and why. Raises StoreError, MismatchError."""
+        begun, processor = time.perf_counter(), time.process_time()
+        try:
+            merged, refused = self.opened()._ledger.merge_sources(path, self._descriptions, progress)
+        finally:
+            self._report.merging += time.perf_counter() - begun
+            self._report.processor["merging"] += time.process_time() - processor
+        self._report.observations += merged.observations
+        self._report.repeated += merged.shared
+        self._report.refused += [Refused(said, why) for said, why in refused]
+        return refused
+
+    def close(self) -> None:
+        """Write a checkpoint, and close it."""
+        if self.learner is not None:
+            self.learner._ledger.saves = True
+            self.learner.close()
+
+
+@dataclass(eq=False)
+class _Step:
+    """Sources that come in together, in the order of the run: recordings, or one memory.
+
+    path: the packed memory that a worker made of recordings, "" of no touch; None before. failed: sources of which
+    something was not learned.
+    """
+
+    sources: tuple[str, ...]
+    memory: bool = False
+    path: str | None = None
+    failed: set[str] = field(default_factory=set)
+    tries: int = 0
+
+
+class _Run:
+    """One run: its steps in order, what was done, and the folder where packed memories lie until they are merged."""
+
+    def __init__(
+        self, folder: Path, making: Making, report: FleetReport, into: _Destination, progress: Progress
+    ) -> None:
+        self.folder, self.making, self.report, self.into, self._progress = folder, making, report, into, progress
         plan = {"run": "fleet", "identity": making.identity.to_json(), "options": repr(making.options)}
         self._notes = RunFile(folder / NOTES, plan)
-        self._waiting: deque[tuple[LearnJob | SumJob, int]] = deque()
-        self._order: dict[str, int] = {}
-        self._seen: set[tuple[str, bytes]] = set()
-        self._parts: list[Part] = []
-        self._ready: list[tuple[str, tuple[int, ...]]] = []
-        self._sums = 0
-        self._outdated = 0  # sums up to this one are of partials that were not what they seemed
         self._begun = time.perf_counter()
         self._answered = -math.inf
-        noted = self._notes.notes.get("learned", [])
-        if not isinstance(noted, list) or not all(isinstance(source, str) for source in noted):
-            raise InputError(f"expected the sources that a run learned in {folder / NOTES}; they are {noted!r:.80}")
-        self._learned: set[str] = set(noted)
-        self.whole: list[Contained] = []
+        self._learned, self._parts = self._noted()
+        self._steps: deque[_Step] = deque()
+        self._waiting: deque[_Step] = deque()
+
+    def _noted(self) -> tuple[set[str], dict[str, Any]]:
+        """The sources that were learned, and of each packed memory that lies in the folder its sources."""
+        learned, parts = self._notes.notes.get("learned", []), self._notes.notes.get("parts", {})
+        sound = isinstance(learned, list) and all(isinstance(source, str) for source in learned)
+        if not sound or not isinstance(parts, dict) or not all(map(_is_noted, parts.values())):
+            raise InputError(
+                f"expected what a run learned in {self.folder / NOTES}; it is {learned!r:.80}, {parts!r:.80}"
+            )
+        return set(learned), parts
 
     def begin(self, found: Sequence[str]) -> None:
-        """Take what an earlier run left behind, and cut the rest into jobs."""
-        self._order = {source: place for place, source in enumerate(found)}
-        learned = self._learned
-        for path in sorted(self.folder.iterdir()):
-            if path.suffix not in PARTS:
-                continue
-            if not path.is_file():
-                raise InputError(f"{path} is no file, and in the way of one that this run writes: move it away")
-            if not path.name.startswith("learned-"):
+        """Cut what an earlier run did not learn into steps."""
+        self.report.sources = len(self._learned & set(found))
+        self._total, self._left = len(found), list[tuple[str, bool]]()
+        for source in found:
+            if source in self._learned:
                 continue
             try:
-                held = Contained.of(path, self.making, thorough=True)
-            except (StoreError, ScrollTactileError) as error:
-                logger.warning("%s; its sources are learned again", error)
-                continue
-            if learned.isdisjoint(held.learned) and set(held.sources) <= set(found):
-                self._take(held)
-        self.report.sources = len(learned & set(found))
-        self._total = len(found)
-        left = [source for source in found if source not in learned]
-        self._left = []
-        for source in left:
-            try:
-                if is_memory(source, self.making.patience):
-                    self._waiting.append((self._job((source,), memory=True), 0))
-                else:
-                    self._left.append(source)
+                self._left.append((source, is_memory(source, self.making.patience)))
             except TimeoutError as error:
                 self.report.refused.append(Refused(source, f"it cannot be looked at: {error!s:.300}"))
 
-    def _job(self, sources: Sequence[str], *, memory: bool = False) -> LearnJob:
-        return LearnJob(self.making, tuple(sources), str(self.folder), memory)
-
     def _cut(self, workers: int) -> None:
-        """Cut the recordings that are left into jobs."""
-        most = max(1, min(MOST_SOURCES, -(-len(self._left) // (JOBS_A_WORKER * workers))))
+        recordings = sum(not memory for _, memory in self._left)
+        most = max(1, min(MOST_SOURCES, -(-recordings // (JOBS_A_WORKER * workers))))
+        there = {part["sources"][0]: self._step_of(name) for name, part in self._parts.items()}
         group: list[str] = []
-        size = 0
-        for source in self._left:
-            own = _bytes_of(source)
-            if group and (len(group) >= most or size + own > MOST_BYTES):
-                self._waiting.append((self._job(group), 0))
+        place = size = 0
+        while place < len(self._left):
+            source, memory = self._left[place]
+            own = 0 if memory else _bytes_of(source)
+            made = there.get(source)
+            whole = made is not None and made.sources == tuple(
+                each for each, _ in self._left[place:][: len(made.sources)]
+            )
+            if group and (memory or whole or len(group) >= most or size + own > MOST_BYTES):
+                self._steps.append(_Step(tuple(group)))
                 group, size = [], 0
-            group.append(source)
-            size += own
+            if made is not None and whole:
+                self._steps.append(made)
+                place += len(made.sources)
+                continue
+            if memory:
+                self._steps.append(_Step((source,), memory=True))
+            else:
+                group.append(source)
+                size += own
+            place += 1
         if group:
-            self._waiting.append((self._job(group), 0))
+            self._steps.append(_Step(tuple(group)))
+        self._waiting = deque(step for step in self._steps if not step.memory and step.path is None)
 
-    def work(self, engine: Engine) -> str | None:
-        """Have all jobs done; returns the sum of all partials with rows."""
+    def _step_of(self, name: str) -> _Step:
+        """The step whose packed memory an earlier run left; it is verified when it is merged."""
+        path, part = self.folder / name, self._parts[name]
+        made = str(path) if path.is_file() and path.name == name else None
+        return _Step(tuple(part["sources"]), path=made, failed=set(part["failed"]))
+
+    def work_here(self) -> None:
+        """Have all steps learned by this process, into the memory itself."""
+        self._cut(1)
+        while self._steps:
+            step = self._steps[0]
+            if not step.memory and step.path is None:
+                self._learn_here(step)
+            self._come_in()
+
+    def _learn_here(self, step: _Step) -> None:
+        making = self.making
+        if self.into.learner is None and not has_touches(making.sensor, step.sources, making.options):
+            learner = TactileLearner(sensor=making.sensor, embedding=making.embedding)  # for what is refused
+        else:
+            learner = self.into.opened()
+        done = learn_sources(learner, step.sources, making.options, self._telling)
+        step.path, step.failed = "", done.failed
+        self.report.observations += done.learned.total()
+        self.report.repeated += done.skipped
+        self.report.refused += done.refused
+
+    def work(self, engine: Engine) -> None:
+        """Have all steps learned, and merge them in their order."""
         self._cut(engine.workers)
-        running: dict[Future[Made], tuple[LearnJob | SumJob, int, float]] = {}
+        running: dict[Future[Made], tuple[_Step, float]] = {}
         try:
-            while self._waiting or running or len(self._ready) > 1 or self._alone():
-                self._sum_up(idle=not self._waiting and not running)
+            while self._steps:
                 while self._waiting and len(running) < engine.room:
-                    job, tries = self._waiting.popleft()
-                    what = learn_partial if isinstance(job, LearnJob) else sum_partials
-                    running[engine.submit(what, job)] = job, tries, time.monotonic()
+                    step = self._waiting.popleft()
+                    job = LearnJob(self.making, step.sources, str(self.folder))
+                    running[engine.submit(learn_job, job)] = step, time.monotonic()
+                if self._come_in():
+                    continue
                 for future in wait(running, self._longest(running), FIRST_COMPLETED).done:
                     self._answered = time.monotonic()
                     self._done(future, *running.pop(future))
@@ -258,7 +357,65 @@ class _Run:
             for future in running:
                 future.cancel()
             raise
-        return self._ready[0][0] if self._ready else None
+
+    def _come_in(self) -> bool:
+        """Merge the first step, where it is ready; whether it was."""
+        step = self._steps[0]
+        if not step.memory and step.path is None:
+            return False
+        if step.memory:
+            self._merge_memory(step)
+        elif step.path and not self._merge_learned(step, Path(step.path)):
+            return True  # it is learned again
+        self._steps.popleft()
+        learned = set(step.sources) - step.failed
+        self._learned |= learned
+        self.report.sources += len(learned)
+        self._notes.note("learned", sorted(self._learned))
+        if step.path and not step.memory:
+            self._parts.pop(Path(step.path).name, None)
+            Path(step.path).unlink(missing_ok=True)
+        self._tell()
+        return True
+
+    def _merge_learned(self, step: _Step, path: Path) -> bool:
+        try:
+            refused = self.into.merge(path, path.name, self._telling)
+        except (StoreError, MismatchError) as error:
+            if isinstance(error, StoreFullError) or not _is_about(error, path):
+                raise
+            logger.warning("%s; its sources are learned again", error)
+            step.path = None
+            self._parts.pop(path.name, None)
+            self._lost(step, 1, error)
+            return False
+        step.failed |= {source for source in step.sources if any(is_from(said, source) for said, _ in refused)}
+        return True
+
+    def _merge_memory(self, step: _Step) -> None:
+        (source,) = step.sources
+        try:
+            with local(source) as place:
+                refused = self.into.merge(place, source, self._telling)
+                step.failed |= {source} if refused else set()
+        except StoreFullError:
+            raise
+        except (ScrollTactileError, StoreError, OSError) as error:
+            if isinstance(error, MismatchError | ObservationError | OSError) or _is_about(error, Path(source)):
+                self.report.refused.append(Refused(source, str(error)))
+                step.failed.add(source)
+                return
+            raise
+
+    def _telling(self, what: str, done: int, of: int) -> None:
+        self._progress(f"{what} {done} of {of} touches", self.report.sources, self._total)
+
+    def _tell(self) -> None:
+        seconds = time.perf_counter() - self._begun
+        count, done = self.report.observations, self.report.sources + len(self.report.refused)
+        left = f", {seconds / done * (self._total - done):.0f} s left" if 0 < done <= self._total else ""
+        failed = f", {len(self.report.refused)} refused" if self.report.refused else ""
+        self._progress(f"{count} touches, {count / seconds:.0f} a second{left}{failed}", done, self._total)
 
     @property
     def _bound(self) -> float:
@@ -266,168 +423,99 @@ class _Run:
         patience = self.making.patience
         return math.inf if patience is None else QUEUED * patience + GRACE
 
-    def _longest(self, running: Mapping[Future[Made], tuple[LearnJob | SumJob, int, float]]) -> float | None:
+    def _longest(self, running: Mapping[Future[Made], tuple[_Step, float]]) -> float | None:
         """Seconds until the first of these jobs is given up; None where nobody has a patience."""
         if math.isinf(self._bound) or not running:
             return None
-        return max(0.0, min(begun for *_, begun in running.values()) + self._bound - time.monotonic())
+        return max(0.0, min(begun for _, begun in running.values()) + self._bound - time.monotonic())
 
-    def _give_up(self, engine: Engine, running: dict[Future[Made], tuple[LearnJob | SumJob, int, float]]) -> None:
+    def _give_up(self, engine: Engine, running: dict[Future[Made], tuple[_Step, float]]) -> None:
         """Hand jobs over again that nobody answers. Raises ScrollTactileError where nobody answers any."""
         before = time.monotonic() - self._bound
-        late = [future for future, (*_, begun) in running.items() if begun <= before and not future.done()]
+        late = [future for future, (_, begun) in running.items() if begun <= before and not future.done()]
         if late and not engine.own and len(late) == len(running) and self._answered <= before:
             raise ScrollTactileError(
                 f"{engine.name} has answered no job for {self._bound:.0f} s: look whether it has workers, and whether "
                 f"they reach {self.folder}. What was learned is kept there: call again to go on"
             )
         for future in late:
-            job, tries, _ = running.pop(future)
+            step, _ = running.pop(future)
             engine.abandon(future)
-            self._lost(job, tries + SLOW, TimeoutError(f"no answer in {self._bound:.0f} s"))
+            self._lost(step, SLOW, TimeoutError(f"no answer in {self._bound:.0f} s"))
 
-    def _alone(self) -> bool:
-        """Whether the one partial that is left has touches to be left out, and is no sum yet."""
-        return len(self._ready) == 1 and bool(self._ready[0][1])
-
-    def _sum_up(self, idle: bool) -> None:
-        """Have partials summed up where there are enough of them, or nothing else is to be done."""
-        while len(self._ready) >= self._fan or (idle and (len(self._ready) > 1 or self._alone())):
-            parts, self._ready = self._ready[: self._fan], self._ready[self._fan :]
-            self._sums += 1
-            target = self.folder / f"sum-{os.getpid()}-{self._sums}.part"
-            self._waiting.appendleft((SumJob(self.making, tuple(parts), str(target), self._sums), 0))
-
-    def _done(self, future: Future[Made], job: LearnJob | SumJob, tries: int, begun: float) -> None:
+    def _done(self, future: Future[Made], step: _Step, begun: float) -> None:
+        job = LearnJob(self.making, step.sources, str(self.folder))
         try:
             made = _sound(future.result(), job)
-            held = self._held_by(job, made) if isinstance(job, LearnJob) and made.path else None
         except (CapacityError, StoreFullError, KeyboardInterrupt):
             raise
         except Exception as error:
             patience = self.making.patience
             slow = patience is not None and time.monotonic() - begun >= patience
-            self._lost(job, tries + (SLOW if slow else 1), error)
+            self._lost(step, SLOW if slow else 1, error)
             return
-        if isinstance(job, SumJob):
-            self._summed(job, made)
-            return
+        step.path, step.failed = made.path, set(made.failed)
         self.report.processor["learning"] += made.processor
         self.report.refused += made.refused
-        if held is not None:
-            self.report.sources += len(held.learned)
-            self._take(held)
-        seconds = time.perf_counter() - self._begun
-        count, done = len(self._seen), self.report.sources + len(self.report.refused)
-        left = f", {seconds / done * (self._total - done):.0f} s left" if 0 < done <= self._total else ""
-        failed = f", {len(self.report.refused)} refused" if self.report.refused else ""
-        self._progress(f"{count} touches, {count / seconds:.0f} a second{left}{failed}", done, self._total)
+        self.report.repeated += made.repeated
+        self.report.range_problem = self.report.range_problem or made.range_problem
+        if made.path:
+            self._parts[Path(made.path).name] = {"sources": list(step.sources), "failed": sorted(step.failed)}
+            self._notes.note("parts", self._parts)
 
-    def _held_by(self, job: LearnJob, made: Made) -> Contained:
-        """What is in the partial that a job made. Raises StoreError, MismatchError where it is not that of the job."""
-        held = Contained.of(Path(made.path), self.making, job.sources[0] if job.memory else None)
-        if held.sources != job.sources:
-            raise MismatchError(f"{made.path} is of other sources than those of its job")
-        return held
-
-    def _take(self, held: Contained) -> None:
-        """Take a partial in: of touches that came before, under their names, the sums have the first."""
-        self._learned.update(held.learned)
-        if not held.has_rows:
-            self.whole.append(held)
-            return
-        out = set()
-        for number, touch in enumerate(held.touches, start=1):
-            if touch in self._seen:
-                out.add(number)
-            self._seen.add(touch)
-        part = Part(held, frozenset(out))
-        self._parts.append(part)
-        if held.touches:
-            self._ready.append(part.summed)
-
-    def _lost(self, job: LearnJob | SumJob, tries: int, error: Exception) -> None:
-        """A job ended without its partial: again, by halves, and in the end without the source that ends workers."""
+    def _lost(self, step: _Step, tries: int, error: Exception) -> None:
+        """A job ended without its memory: again, by halves, and in the end without the source that ends workers."""
         self.report.deaths += 1
-        logger.info("a job of %s ended: %s: %s", job.making.sensor.name, type(error).__name__, error)
-        if isinstance(job, SumJob) and (
-            job.number <= self._outdated or (isinstance(error, StoreError | MismatchError) and self._learn_again())
-        ):
-            return
+        logger.info("a job of %s ended: %s: %s", self.making.sensor.name, type(error).__name__, error)
+        job, place = LearnJob(self.making, step.sources, str(self.folder)), self._steps.index(step)
         if halves := job.halves():
-            self._waiting.extendleft((half, 0) for half in halves)
-        elif tries < TRIES:
-            self._waiting.appendleft((job, tries))
-        elif isinstance(job, LearnJob):
+            steps = [_Step(half.sources) for half in halves]
+            del self._steps[place]
+            for half in reversed(steps):
+                self._steps.insert(place, half)
+                self._waiting.appendleft(half)
+        elif (tries := step.tries + tries) < TRIES:
+            step.tries = tries
+            self._waiting.appendleft(step)
+        else:
             last = f"{type(error).__name__}: {error!s:.200}"
             why = f"workers ended while they learned it, again and again; the last: {last}"
-            self.report.refused.append(Refused(job.sources[0], why))
-        else:  # nobody's data but ours: what is wrong with it is raised here
-            self._summed(job, sum_partials(job))
-
-    def _learn_again(self) -> bool:
-        """Have the sources of partials learned again that are not what they seemed; whether there are any."""
-        sound, spoilt = [], []
-        for part in self._parts:
-            address = part.held.sources[0] if part.held.memory else None
-            try:
-                sound.append(Contained.of(Path(part.held.path), self.making, address, thorough=True))
-            except (StoreError, MismatchError) as error:
-                logger.warning("%s; its sources are learned again", error)
-                spoilt.append(part.held)
-        if not spoilt:
-            return False
-        # All sums are begun anew: a touch that is left out of one partial may have been in another.
-        self._outdated = self._sums
-        self._waiting = deque((job, tries) for job, tries in self._waiting if isinstance(job, LearnJob))
-        self._seen, self._parts, self._ready = set(), [], []
-        for held in sound:
-            self._take(held)
-        for held in spoilt:
-            self._learned.difference_update(held.learned)
-            self.report.sources -= len(held.learned)
-            self._waiting.append((self._job(held.sources, memory=held.memory), 0))
-        return True
-
-    def _summed(self, job: SumJob, made: Made) -> None:
-        self.report.processor["sums"] += made.processor
-        if job.number > self._outdated:
-            self._ready.append((made.path, ()))
-        for path, _ in job.parts:
-            if Path(path).name.startswith("sum-"):
-                Path(path).unlink(missing_ok=True)
-
-    def merge(self, held: TactileLearner, sums: str | None, descriptions: Choice) -> None:
-        """Put everything into the memory; what is there already is left out."""
-
-        def progress(what: str, done: int, of: int) -> None:
-            self._progress(f"{what} {done} of {of} touches", self._total, self._total)
-
-        gathering = Gathering(self.folder, self.making, self.report, self._order, progress)
-        gathering.merge(held, [part.held for part in self._parts], sums, self.whole, descriptions)
-        self._learned -= gathering.refused
+            self.report.refused.append(Refused(step.sources[0], why))
+            step.path, step.failed = "", set(step.sources)
 
     def end(self) -> None:
-        """Note what was learned, and remove the partials."""
-        self._notes.note("learned", sorted(self._learned))
+        """Remove what packed memories are left, and what is noted of them."""
+        self._notes.note("parts", {})
         for path in self.folder.iterdir():
-            if path.suffix in PARTS and path.is_file():
+            if path.suffix == ".part" and path.is_file():
                 path.unlink()
 
 
-def _sound(made: object, job: LearnJob | SumJob) -> Made:
+def _sound(made: object, job: LearnJob) -> Made:
     """What a job gave back, as far as nobody but its worker can know it. Raises MismatchError for anything else."""
     if not isinstance(made, Made):
         raise MismatchError(f"expected what a job made; who runs the jobs gave {type(made).__name__}")
-    own = {str(job.target)}
-    if isinstance(job, LearnJob) and job.memory:
-        own = {str(packed_path(job)), str(Path(job.sources[0])), ""}
-    if made.path not in own:
-        raise MismatchError(f"expected the partial of a job in one of {sorted(own)}; came {made.path!r:.200}")
+    if made.path not in (str(job.target), "") or (made.path and not job.target.is_file()):
+        raise MismatchError(f"expected the packed memory of a job in {job.target}; came {made.path!r:.200}")
     refused = isinstance(made.refused, list) and all(isinstance(each, Refused) for each in made.refused)
-    if not refused or not isinstance(made.processor, float) or (not made.path and not made.refused):
+    failed = isinstance(made.failed, set) and made.failed <= set(job.sources)
+    numbers = isinstance(made.processor, float) and isinstance(made.repeated, int)
+    if not refused or not failed or not numbers or not isinstance(made.range_problem, str | None):
         raise MismatchError(f"expected what a job refused, and what it took; came {made!r:.200}")
     return made
+
+
+def _is_noted(part: Any) -> bool:
+    """Whether this is what a run notes of a packed memory."""
+    lists = [part.get(name) for name in ("sources", "failed")] if isinstance(part, dict) else [None]
+    texts = all(isinstance(found, list) and all(isinstance(each, str) for each in found) for found in lists)
+    return texts and len(lists) == 2 and bool(lists[0])
+
+
+def _is_about(error: Exception, path: Path) -> bool:
+    """Whether an error is about what lies at a path, and not about the memory that it is merged into."""
+    where = getattr(error, "path", None)
+    return isinstance(where, Path) and (where == path or path in where.parents)
 
 
 def _bytes_of(source: str) -> int:

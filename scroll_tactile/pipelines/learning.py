@@ -17,7 +17,7 @@ from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.ranges import all_clipped
 
-__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn"]
+__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources"]
 
 BATCH_TOUCHES = 256  # become durable together: what a kill can cost …
 BATCH_BYTES = 1 << 25  # … unless their readings would be more than this, or the first was read so long ago:
@@ -31,16 +31,17 @@ class Learned:
     """What a pass over sources did.
 
     files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
-    name, by the hash of their content. refused: what was not learned.
+    name, by the hash of their content. refused: what was not learned; failed: the sources of that.
     """
 
     files: int = 0
     learned: Counter[str] = field(default_factory=Counter)
     skipped: int = 0
     refused: list[Refused] = field(default_factory=list)
+    failed: set[str] = field(default_factory=set)
 
 
-def learn(
+def learn_sources(
     learner: TactileLearner,
     sources: Sequence[str],
     options: SourceOptions,
@@ -59,8 +60,9 @@ def learn(
         for touch in source_touches(learner, address, options):
             if isinstance(touch, Refused):
                 done.refused.append(touch)
+                done.failed.add(address)
             else:
-                batch.add(touch, done)
+                batch.add(touch, address, done)
         done.files += 1
     batch.observe(done)
     progress(f"{done.learned.total()} touches", len(sources), len(sources))
@@ -72,14 +74,14 @@ class _Batch:
 
     def __init__(self, learner: TactileLearner) -> None:
         self._learner = learner
-        self._touches: list[SourceTouch] = []
+        self._touches: list[tuple[SourceTouch, str]] = []
         self._bytes = 0
         self._since = 0.0
 
-    def add(self, touch: SourceTouch, done: Learned) -> None:
+    def add(self, touch: SourceTouch, address: str, done: Learned) -> None:
         if not self._touches:
             self._since = monotonic()
-        self._touches.append(touch)
+        self._touches.append((touch, address))
         self._bytes += touch.stream.readings.nbytes
         late = monotonic() - self._since >= BATCH_SECONDS
         if late or len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
@@ -88,7 +90,7 @@ class _Batch:
     def observe(self, done: Learned) -> None:
         touches, self._touches, self._bytes = self._touches, [], 0
         with self._learner.batch():
-            for touch in touches:
+            for touch, address in touches:
                 material = str(touch.material)
                 names = self._learner.names_of(touch.stream)
                 if material in names:
@@ -96,12 +98,14 @@ class _Batch:
                     continue
                 if (why := refusal(names, material, all_clipped(touch.stream))) is not None:
                     done.refused.append(Refused(touch.source, why))
+                    done.failed.add(address)
                     continue
                 try:
                     self._learner.observe(material, touch.stream, source=touch.source)
                     done.learned[material] += 1
                 except InputError as error:  # one that is too long
                     done.refused.append(Refused(touch.source, str(error)))
+                    done.failed.add(address)
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,8 @@ def learn(
     sources: files, folders and addresses that fsspec knows, of recordings (as `recordings.read` takes them) and of
     memories, in folders or packed. options: how recordings are cut into touches and named.
     sensor, embedding, augmentation, exemplars, recall: of the memory, as of `TactileLearner`; an existing one knows.
-    workers: processes on this machine; as many as it has cores unless given. client: of a `dask.distributed` cluster,
+    workers: processes on this machine; as many as it has cores unless given. With one, and no patience, this one
+    learns. client: of a `dask.distributed` cluster,
     or anything whose `get_executor` gives an Executor, or an Executor; its workers must reach the folder beside
     the destination, where packed memories lie until they are merged.
     add: whether a destination that has touches of other sources is added to. descriptions: as of `merge`; the
@@ -146,7 +147,7 @@ def learn(
         into = _Destination(place, making, held, stack, report, descriptions)
         run = _Run(folder, making, report, into, progress)
         run.begin(found)
-        if client is None and workers == 1:
+        if client is None and workers == 1 and patience is None:
             run.work_here()
         else:
             with engine(client, workers) as chosen:

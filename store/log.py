@@ -159,6 +159,7 @@ class LogReader:
 
     payloads: whether `refresh` verifies these, too; where it does not, `read` still does. identity: of a log whose
     first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
+    file: the log, where it is open already.
 
     Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
     """
@@ -166,13 +167,19 @@ class LogReader:
     WRITES = False
 
     def __init__(
-        self, path: Path, *, place: Place | None = None, payloads: bool = True, identity: bytes | None = None
+        self,
+        path: Path,
+        *,
+        place: Place | None = None,
+        payloads: bool = True,
+        identity: bytes | None = None,
+        file: LogFile | None = None,
     ) -> None:
         self.path = path
         self._payloads = payloads
         self.header_damage: DamageError | None = None
         with reported(path, "opening the log"):
-            self._file = LogFile(path, write=self.WRITES)
+            self._file = LogFile(path, write=self.WRITES) if file is None else file
             try:
                 self._window = _Window(self._file)
                 self._torn: Place | None = None
@@ -190,7 +197,8 @@ class LogReader:
                     self._last = self._commit_before(place)
                     self.place = place
             except BaseException:
-                self._file.close()
+                if file is None:
+                    self._file.close()
                 raise
 
     def _read_header(self) -> Frame:
@@ -366,6 +374,13 @@ class LogReader:
         """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
         with reported(self.path, "looking for the log"):
             return not self._file.is_at(self.path)
+
+    def from_its_beginning(self) -> LogReader:
+        """Return another reader, of heads alone, of the same open file, whatever its path names by now.
+
+        That one is not to be closed.
+        """
+        return LogReader(self.path, payloads=False, file=self._file)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -95,7 +95,10 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
             return found
         for _ in range(ATTEMPTS):
             survey = Survey(folder, progress or (lambda *_: None))
-            found = survey.problems() + list(survey.leftovers())
+            try:
+                found = survey.problems() + list(survey.leftovers())
+            finally:
+                survey.log.close()
             if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
                 break
         return found
@@ -222,6 +225,22 @@ class FoundLog:
             fault = Fault.DAMAGED
         self._offsets[sequence] = offset, size
         self.rows.append((sequence, fault))
+
+    @property
+    def is_read(self) -> bool:
+        """Whether anything of it was read."""
+        return self._reader is not None
+
+    def has_place(self, named: NamedCheckpoint) -> bool:
+        """Whether a checkpoint's place is in the log, and no row that it does not contain is before it."""
+        assert self._reader is not None
+        if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.upto):
+            return False
+        try:
+            with LogReader(self.path, place=named.place, identity=self._reader.identity):
+                return True
+        except DamageError:
+            return False
 
     def data(self, sequence: int) -> bytes:
         """Return the bytes of a row, verified once more. Raises DamageError."""
@@ -396,6 +415,10 @@ class Survey:
             if self.current is not None or checkpoint.named is not None:
                 kind: Literal["lost", "spare"] = "spare" if self._is_spare(checkpoint) else "lost"
                 found += [Problem(damage.path, str(damage), kind) for damage in checkpoint.damage]
+        named = None if self.current is None else self.current.newest
+        if named is not None and self.log.is_read and not self.log.has_place(named):
+            what = f"{self.log.path} does not have the place where {self.folder / CURRENT_FILE} has it read on"
+            found.append(Problem(self.log.path, what, "spare"))
         if self.identity is None:
             found.append(Problem(self.folder, f"nothing in {self.folder} tells what the store is for", "lost"))
         return found

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from store import Store, check_store
-from store.framing import COMMIT, FRAME_BYTES, HEADER, NO_CHECKSUM, pack_frame
+from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
 from store.layout import checkpoint_path, log_path, read_current, write_current
 from store.log import LogReader, Place
 from store.row_encoding import ROW, encode_row, row_sequence
@@ -148,7 +148,7 @@ def cut_rows(path, first):
     file.write_bytes(file.read_bytes()[: frames(path)[first].offset])
 
 
-def put_row(path, *, sequence=None, payload=b"ARPL\x02\0\0", size=None, **changed):
+def put_row(path, *, sequence=None, payload=b"ARPL\x01\0\0", size=None, **changed):
     """Add a row with right checksums, of any fields; return its sequence."""
     found = rows(path)
     sequence = max(found, default=0) + 1 if sequence is None else sequence
@@ -186,5 +186,3 @@ def same_arrays(found, given):
     return {name: (array.dtype, array.shape, array.tobytes()) for name, array in found.items()} == {
         name: (array.dtype, array.shape, array.tobytes()) for name, array in given.items()
     }
-
-

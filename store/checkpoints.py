@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
@@ -29,7 +29,7 @@ from store.layout import (
 from store.log import LogReader, Place
 from store.log_writer import create_log
 from store.records import Checkpoint, to_json
-from store.row_encoding import HEAD_BYTES, ROW, decode_head, head_without_arrays, row_sequence
+from store.row_encoding import HEAD_BYTES, ROW, row_sequence
 
 __all__ = ["Checkpoints", "place_in"]
 
@@ -100,11 +100,15 @@ class Checkpoints:
             return named.number
 
     def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:
-        number = 1 + max(numbers(self._folder, unfinished=True), default=0)
-        if number >= 10**MOST_DIGITS:
-            raise DamageError(f"{self._folder} has a checkpoint of number {number - 1}", path=self._folder)
+        number = self._next(numbers(self._folder, unfinished=True))
         sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
         return NamedCheckpoint(number, draft.upto, sha256, place)
+
+    def _next(self, numbers: list[int]) -> int:
+        number = 1 + max(numbers, default=0)
+        if number >= 10**MOST_DIGITS:
+            raise DamageError(f"{self._folder} has a log or a checkpoint of number {number - 1}", path=self._folder)
+        return number
 
     def _commit(self, current: Current) -> None:
         # When this fails all folders stay, for the next commit or open to remove: what could not be synced may be on
@@ -112,20 +116,20 @@ class Checkpoints:
         with reported(self._folder, "committing"):
             try:
                 write_current(self._folder, current)
-            finally:
-                found = self._files.current()
-                if found.log == self._journal.current().log:
-                    self._journal.committed(found)
+            except BaseException:
+                self._journal.unsettle()
+                raise
+        self._journal.committed(current)
 
     def compact(self, draft: Draft, newest: Draft | None) -> None:
         """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
         with self._committing:
             with self._journal.switching():
-                number = 1 + max(log_numbers(self._folder, unfinished=True))
+                number = self._next(log_numbers(self._folder, unfinished=True))
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
                 try:
-                    create_log(path, header, self._rows(draft.upto, self._journal.last()))
+                    create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
                     drafts = [draft] if newest is None else [draft, newest]
                     named = [self._write(each, place_in(path, each.upto)[1]) for each in drafts]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
@@ -133,19 +137,10 @@ class Checkpoints:
                 except BaseException:
                     remove_tree(path)
                     raise
-                self._commit(Current(number, place_in(path, 0)[0], newest=named[-1], base=named[0]))
+                identity = place_in(path, 0)[0]
+                with reported(self._folder, "committing"):
+                    write_current(self._folder, Current(number, identity, newest=named[-1], base=named[0]))
             self.remove_unnamed()
-
-    def _rows(self, upto: int, last: int) -> Iterator[tuple[int, bytes]]:
-        for sequence, data in self._journal.payloads(last):
-            try:
-                yield ROW, head_without_arrays(decode_head(data, len(data))) if sequence <= upto else data
-            except ValueError as error:
-                raise DamageError(
-                    f"row {sequence} of {self._folder} was never written so: {error}",
-                    path=self._folder,
-                    sequence=sequence,
-                ) from error
 
     def commit_later(self, draft: Draft) -> None:
         """Do `commit` in a background thread; a newer one takes the place of one that still waits.

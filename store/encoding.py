@@ -47,7 +47,7 @@ LAST_CODE_POINT = 0x10FFFF
 MOST_AXES = 64  # NumPy's own limit
 LARGEST_SIZE = 2**63 - 1
 
-# The names are folders in a generation: portable to every file system, never zarr's reserved "__…".
+# The names are folders in a checkpoint: portable to every file system, never zarr's reserved "__…".
 NAME = re.compile(r"(?!__)[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,98}[A-Za-z0-9_-])?")
 
 
@@ -158,7 +158,7 @@ def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
     size = sum(array.nbytes for array in arrays.values())
     if size > LARGEST_PAYLOAD:
         raise RecordError(
-            f"the arrays of one record hold {size} bytes, more than {LARGEST_PAYLOAD}: keep them in a generation"
+            f"the arrays of one record hold {size} bytes, more than {LARGEST_PAYLOAD}: keep them in a checkpoint"
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from store.archive import Files
 from store.encoding import decode_payload
@@ -18,7 +18,16 @@ from store.layout import CURRENT_FILE, Current, log_path
 from store.log import LogReader, Place
 from store.log_writer import LogWriter
 from store.records import JSON, Head, Record, from_json
-from store.row_encoding import HEAD_BYTES, ROW, decode_head, decode_row, encode_row, head_size, row_sequence
+from store.row_encoding import (
+    HEAD_BYTES,
+    ROW,
+    decode_head,
+    decode_row,
+    encode_row,
+    head_size,
+    head_without_arrays,
+    row_sequence,
+)
 
 __all__ = ["Journal", "Rows"]
 
@@ -71,8 +80,12 @@ class Rows:
                     yield log.place
                 return
             except DamageError as damage:
-                self.damage.setdefault(len(self), []).append(damage)
-                log.resume()
+                noted = self.damage.setdefault(len(self), [])
+                if damage.offset in [earlier.offset for earlier in noted]:
+                    return  # nothing can be read behind it
+                noted.append(damage)
+                with suppress(DamageError):
+                    log.resume()
 
     def _take(self, log: LogReader, frame: Frame) -> None:
         try:
@@ -118,8 +131,10 @@ class _OpenLog:
         try:
             return LogReader(self.path, place=place, file=self._files.open_log(self.path))
         except DamageError as damage:
-            if write or place is None:
+            if place is None:
                 raise
+            if write:
+                raise DamageError(f"{damage}: repair the store (repair_store)", path=self.path) from damage
             logger.warning("%s; reading all of it", damage)
             return LogReader(self.path, file=self._files.open_log(self.path))
 
@@ -136,6 +151,8 @@ class _OpenLog:
             )
         self.log.close()
         self.log = LogWriter(self.path, place=self.log.place)
+        # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
+        sync_folder(self.path.parent)
 
     def catch_up(self) -> None:
         """Take in what was committed since."""
@@ -167,11 +184,8 @@ class _OpenLog:
 
     def _read_before(self) -> None:
         earlier, until = Rows(), self.places[0][1].offset
-        with LogReader(self.path, payloads=False, file=self._files.open_log(self.path)) as reader:
-            if reader.identity != self.log.identity:
-                raise StoreError(f"{self.path} was replaced while it was read: call again")
-            for _ in earlier.take(reader, until):
-                pass
+        for _ in earlier.take(self.log.from_its_beginning(), until):
+            pass
         earlier.extend(self.rows)
         self.rows, self.read_all = earlier, True
 
@@ -224,7 +238,25 @@ class Journal:
         with self._guard, reported(self.folder, doing):
             if self._open is None:
                 raise StoreClosedError(f"the store in {self.folder} is closed")
+            if self._unsettled:
+                self._settle(self._open)
             yield self._open
+
+    def _settle(self, at: _OpenLog) -> None:
+        """Find out what `CURRENT` names, and make it durable: what wrote it failed, or has put another log in place."""
+        current = self._files.current()
+        if current.log == at.current.log:
+            at.current = current
+            sync_folder(self.folder)
+        else:
+            self._open = self._opened()
+            at.log.close()
+        self._unsettled = False
+
+    def unsettle(self) -> None:
+        """Take note that `CURRENT` may be another than before, or only in the system's memory."""
+        with self._guard:
+            self._unsettled = True
 
     @contextmanager
     def _looking(self, doing: str) -> Iterator[_OpenLog]:
@@ -234,7 +266,7 @@ class Journal:
 
     def _renewed(self, at: _OpenLog) -> _OpenLog:
         current = self._files.current()
-        if current.log == at.current.log:
+        if (current.log, current.log_identity) == (at.current.log, at.current.log_identity):
             at.current = current
             try:
                 at.catch_up()
@@ -277,7 +309,6 @@ class Journal:
         with self._guard:
             self.refuse_in_batch("beginning a batch")
             at, writer = self._writing("beginning a batch")
-            count = len(at.rows)
             self._batch, self._failed = True, False
             try:
                 yield
@@ -286,7 +317,7 @@ class Journal:
                 writer.commit()
                 at.note_place(writer.place)
             except BaseException:
-                self._undo(at, writer, count)
+                self._undo(at, writer)
                 raise
             finally:
                 self._batch = False
@@ -300,10 +331,6 @@ class Journal:
     def _writing(self, doing: str) -> tuple[_OpenLog, LogWriter]:
         with self._using(doing) as at:
             assert isinstance(at.log, LogWriter), "a store that is read refuses before"
-            if self._unsettled:
-                # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
-                sync_folder(self.folder)
-                self._unsettled = False
             return at, at.log
 
     def insert(self, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes) -> int:
@@ -313,7 +340,6 @@ class Journal:
         """
         with self._guard:
             at, writer = self._writing("appending a row")
-            count = len(at.rows)
             if self._batch and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.folder} in this batch: a row of it failed")
             if (sequence := at.last + 1) > LAST_SEQUENCE:
@@ -326,18 +352,15 @@ class Journal:
                     at.note_place(writer.place)
             except BaseException:
                 self._failed = True
-                self._undo(at, writer, count)
+                self._undo(at, writer)
                 raise
             return sequence
 
     @staticmethod
-    def _undo(at: _OpenLog, writer: LogWriter, count: int) -> None:
+    def _undo(at: _OpenLog, writer: LogWriter) -> None:
         """Take back what is not durable; what was committed before an interruption stays, and is known."""
         writer.rollback()
-        offsets = at.rows.offsets
-        while count < len(at.rows) and offsets[count] < writer.place.offset:
-            count += 1
-        at.rows.cut(count)
+        at.rows.cut(bisect_left(at.rows.offsets, writer.place.offset))
         at.note_place(writer.place)
 
     def place(self, upto: int) -> Place:
@@ -374,11 +397,12 @@ class Journal:
                 yield head
 
     def _require_no_gap(self, at: _OpenLog, after: int, through: int, index: int) -> None:
-        first = max(after, at.current.compacted) + 1  # before that a repair may have left some out
+        why = at.rows.damage.get(index)
+        # Up to the base a repair may have left some out.
+        first = 1 + (after if why is not None else max(after, at.current.compacted))
         if first > through:
             return
         missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
-        why = at.rows.damage.get(index)
         raise self._damage(at, f"{missing}{'' if why is None else f' ({why[0]})'} from", through)
 
     def _head(self, at: _OpenLog, index: int) -> Head:
@@ -425,35 +449,33 @@ class Journal:
             sequence=sequence,
         )
 
-    def payloads(self, last: int) -> Iterator[tuple[int, bytes]]:
-        """Yield the sequence and the bytes of each row up to `last`, in order; heads that are lost are left out.
+    def payloads(self, upto: int) -> Iterator[bytes]:
+        """Yield the bytes of each row, in order, those up to `upto` without their arrays, which are not read.
 
         Raises DamageError. Nothing can be appended meanwhile.
         """
         with self._using("reading rows") as at:
-            for index in range(at.find(0), len(at.rows)):
-                sequence = at.rows.sequences[index]
-                if sequence > last:
-                    return
+            at.find(0)
+            for damage in at.rows.damage.values():
+                raise DamageError(f"{damage[0]}: repair the store (repair_store)", path=at.path)
+            for index, sequence in enumerate(at.rows.sequences):
+                head = self._head(at, index)
                 try:
-                    data = at.data(index)
+                    yield head_without_arrays(head) if sequence <= upto else at.data(index)
                 except DamageError as error:
                     raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
-                yield sequence, data
 
     @contextmanager
     def switching(self) -> Iterator[None]:
         """In the block another log takes the place of this one, and nothing is appended; afterwards that is used."""
-        with self._using("putting another log in place") as at:
+        with self._using("putting another log in place"):
             try:
                 yield
             finally:
                 # A sync that failed leaves it open which of the two is named.
-                if self._files.current().log != at.current.log:
-                    self._unsettled = True
-                    self._open = self._opened()
-                    at.log.close()
-            self._writing("putting another log in place")
+                self._unsettled = True
+            with self._using("putting another log in place"):
+                pass
 
     def size(self) -> int:
         """Return the bytes of the log."""

@@ -166,7 +166,7 @@ class LogReader:
 
     payloads: whether `refresh` verifies these, too; where it does not, `read` still does. identity: of a log whose
     first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
-    file: the log, opened already.
+    file: the log, where it is open already.
 
     Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
     """
@@ -204,7 +204,8 @@ class LogReader:
                     self._last = self._commit_before(place)
                     self.place = place
             except BaseException:
-                self._file.close()
+                if file is None:
+                    self._file.close()
                 raise
 
     def _read_header(self) -> Frame:
@@ -386,6 +387,13 @@ class LogReader:
         """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
         with reported(self.path, "looking for the log"):
             return not self._file.is_at(self.path)
+
+    def from_its_beginning(self) -> LogReader:
+        """Return another reader, of heads alone, of the same open file, whatever its path names by now.
+
+        That one is not to be closed.
+        """
+        return LogReader(self.path, payloads=False, file=self._file)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -6,6 +6,7 @@ import enum
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -99,8 +100,10 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
         with closing(files):
             for _ in range(ATTEMPTS):
                 survey = Survey(files, progress or (lambda *_: None))
-                survey.log.close()
-                found = survey.problems() + list(survey.leftovers())
+                try:
+                    found = survey.problems() + list(survey.leftovers())
+                finally:
+                    survey.log.close()
                 if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
                     break
         return found
@@ -149,6 +152,7 @@ class FoundLog:
 
     def __init__(self, files: Files, path: Path, identity: bytes | None, progress: Progress) -> None:
         self.path, self.damage = path, list[str]()
+        self._open = partial(files.open_log, path)
         self.identity: dict[str, JSON] | None = None
         self.rows: list[tuple[int, Fault | None]] = []
         self.torn: set[int] = set()
@@ -156,8 +160,8 @@ class FoundLog:
         self._offsets: dict[int, tuple[int, int]] = {}
         self._reader: LogReader | None = None
         try:
-            known = find_identity(files.open_log(path)) if identity is None else identity
-            self._reader = LogReader(path, identity=known, file=files.open_log(path))
+            known = find_identity(self._open()) if identity is None else identity
+            self._reader = LogReader(path, identity=known, file=self._open())
         except FileNotFoundError:
             self.damage.append(f"{path} is gone")
             return
@@ -228,6 +232,22 @@ class FoundLog:
             fault = Fault.DAMAGED
         self._offsets[sequence] = offset, size
         self.rows.append((sequence, fault))
+
+    @property
+    def is_read(self) -> bool:
+        """Whether anything of it was read."""
+        return self._reader is not None
+
+    def has_place(self, named: NamedCheckpoint) -> bool:
+        """Whether a checkpoint's place is in the log, and no row that it does not contain is before it."""
+        assert self._reader is not None
+        if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.upto):
+            return False
+        try:
+            with LogReader(self.path, place=named.place, identity=self._reader.identity, file=self._open()):
+                return True
+        except DamageError:
+            return False
 
     def data(self, sequence: int) -> bytes:
         """Return the bytes of a row, verified once more. Raises DamageError."""
@@ -403,6 +423,10 @@ class Survey:
             if self.current is not None or checkpoint.named is not None:
                 kind: Literal["lost", "spare"] = "spare" if self._is_spare(checkpoint) else "lost"
                 found += [Problem(damage.path, str(damage), kind) for damage in checkpoint.damage]
+        named = None if self.current is None else self.current.newest
+        if named is not None and self.log.is_read and not self.log.has_place(named):
+            what = f"{self.log.path} does not have the place where {self.folder / CURRENT_FILE} has it read on"
+            found.append(Problem(self.log.path, what, "spare"))
         if self.identity is None:
             found.append(Problem(self.folder, f"nothing in {self.folder} tells what the store is for", "lost"))
         return found

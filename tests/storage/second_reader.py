@@ -119,13 +119,14 @@ def frames(data):
 
 def row(payload):
     sequence, time, size, kept, *lengths = ROW.unpack_from(payload)
-    parts, at = [], ROW.size
+    parts, at = [], ROW.size + 16
     for length in lengths:
         parts.append(payload[at : at + length])
         at += length
     key, kind, label, attributes = parts
     assert sequence >= 1 and math.isfinite(time) and len(key) <= 64
     assert len(payload) == at + (size if kept else 0)
+    assert digest(payload[: ROW.size] + b"".join(parts)) == payload[ROW.size : ROW.size + 16]
     arrays = payload[at:] if kept else None
     return Row(sequence, time, key, kind.decode(), label.decode(), json.loads(attributes), arrays, size)
 

@@ -14,6 +14,7 @@ from store import DamageError
 from store.encoding import decode_payload, encode_payload
 from store.log import LogReader
 from store.log_writer import LogWriter, create_log
+from store.records import payload_digest
 from store.row_encoding import ROW, Row, decode_row, encode_row
 
 ARRAYS = {"codes": np.arange(700, dtype=np.int16), "none": np.zeros((0, 3), np.float32)}
@@ -116,9 +117,13 @@ def test_it_reads_nothing_of_the_store():
     assert not any("store" in line for line in imports) and len(lines) <= 175
 
 
-def changed(offset, part):
+def changed(offset, part, *, digest=True):
+    """The bytes of a row, some of them others, with the right digest of its head."""
     data = encoded(*FIELDS[0])
-    return data[:offset] + part + data[offset + len(part) :]
+    data = data[:offset] + part + data[offset + len(part) :]
+    texts = len(data) - 54 - len(PAYLOAD)
+    right = payload_digest(data[:38] + data[54 : 54 + texts])
+    return data[:38] + right + data[54:] if digest else data
 
 
 @pytest.mark.parametrize(
@@ -133,8 +138,10 @@ def changed(offset, part):
         changed(16, b"\xff" * 8),
         changed(24, b"\2"),
         changed(26, b"\xff" * 4),
-        changed(38 + 32, b"\0"),
-        changed(38 + 32, b"\xff"),
+        changed(54 + 32, b"\0"),
+        changed(54, b"\0", digest=False),
+        changed(40, b"\0\0", digest=False),
+        changed(54 + 32, b"\xff"),
         encode_row(1, "", "", b"\0" * 65, 0.0, "{}", b"", 0),
         encode_row(1, "", "", b"", 0.0, "[]", b"", 0),
         encode_row(1, "", "", b"", 0.0, '{"a":NaN}', b"", 0),

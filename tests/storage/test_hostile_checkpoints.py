@@ -1,0 +1,272 @@
+"""A checkpoint from elsewhere, however forged, is damage at its place."""
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from forged import describe_again, in_a_process
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from store_builds import flip, known_current, newest, put_current, put_row
+
+from store import DamageError, RecordError, Store, StoreError, VersionError, check_store
+from store import chunks as store_chunks
+from store import records as store_records
+from store.checkpoint_files import CheckpointReader
+
+ARRAYS = {
+    "rows": np.arange(4000.0).reshape(1000, 4),
+    "long": np.arange(1_200_000, dtype=np.int32).reshape(1_200, 1_000) % 1000,
+    "names": np.array([["wool", "silk ü"]]),
+    "flags": np.arange(300) % 3 == 0,
+    "none": np.zeros((0, 3), np.float32),
+    "one": np.array(1.5),
+}
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A store with one row and a checkpoint, not to be changed."""
+    path = tmp_path_factory.mktemp("kept") / "s"
+    with Store.open(path, identity={}) as opened:
+        opened.append("a", "b", b"")
+        opened.commit(ARRAYS, upto=1)
+    return path
+
+
+@pytest.fixture
+def path(kept, tmp_path):
+    return shutil.copytree(kept, tmp_path / "s")
+
+
+def same(found):
+    return found is not None and all(
+        (found.arrays[name].dtype, found.arrays[name].shape) == (array.dtype, array.shape)
+        and found.arrays[name].tobytes() == array.tobytes()
+        for name, array in ARRAYS.items()
+    )
+
+
+def require_damage(path):
+    """The checkpoint is passed over, and `check_store` names it."""
+    with Store.open(path, mode="read") as opened:
+        assert opened.latest() is None
+        assert len(list(opened.records())) == 1
+    problems = check_store(path)
+    assert any("checkpoint" in problem.what for problem in problems)
+
+
+def test_zarr_reads_what_is_written_without_a_warning(path):
+    import zarr
+
+    group = zarr.open_group(newest(path), mode="r")
+    for name, array in ARRAYS.items():
+        found = np.asarray(group[name][...])
+        assert found.tobytes() == array.tobytes()
+        assert found.shape[: array.ndim] == array.shape
+        assert group[name].attrs["dtype"] == array.dtype.str
+
+
+def test_a_checkpoint_is_read_without_zarr(path):
+    code = (
+        "import sys, store\n"
+        "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(opened.latest().arrays))\n"
+        "print({'zarr', 'numcodecs.blosc'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert run.stdout.split("\n")[0] == str(len(ARRAYS))
+    assert "zarr" not in run.stdout
+
+
+def test_what_is_stored_is_verified_before_it_is_decompressed(path, monkeypatch):
+    flip(newest(path) / "rows" / "c" / "0" / "0")
+
+    def reached(*_):
+        pytest.fail("damaged bytes were decompressed")
+
+    monkeypatch.setattr(store_chunks, "decompress_zstd", reached)
+    with pytest.raises(DamageError, match="sha256 differs"):
+        CheckpointReader(newest(path)).arrays(["rows"])
+
+
+def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(path, monkeypatch):
+    monkeypatch.setattr(store_chunks, "SPARE", 2**20)
+    zeros = np.zeros(5 * 2**20, np.uint8)
+    with Store.open(path) as opened:
+        opened.commit({"zeros": zeros}, upto=1)
+        assert opened.latest().arrays["zeros"].tobytes() == zeros.tobytes()
+    assert check_store(path) == []
+
+
+@pytest.mark.parametrize("shape", [[2**29], [2**29, 2], [2**37], [2**40, 2**20], [2**62]])
+@pytest.mark.parametrize("chunk", [[2**29], [1]])
+def test_a_shape_that_no_file_stands_for_takes_no_memory_and_no_time(path, shape, chunk):
+    """The checkpoint claims another shape of its rows everywhere, and as many files as it would have."""
+    header = newest(path) / "rows" / "zarr.json"
+    grid = {"name": "regular", "configuration": {"chunk_shape": chunk}}
+    header.write_text(json.dumps(json.loads(header.read_text()) | {"shape": shape, "chunk_grid": grid}))
+    arrays = json.loads((newest(path) / "zarr.json").read_text())["attributes"]["arrays"]
+    files = ["0" * 64] * min(-(-8 * math.prod(shape) // 2**22), 2**18)
+    describe_again(path, arrays=arrays | {"rows": arrays["rows"] | {"shape": shape, "files": files}})
+    run = in_a_process(
+        """
+        with store.Store.open(sys.argv[1], mode="read") as opened:
+            print(opened.latest())
+        print(len(store.check_store(sys.argv[1])) > 0)
+        """,
+        path,
+        memory=200 * 2**20,
+        seconds=20,
+    )
+    assert (run.returncode, run.stdout) == (0, "None\nTrue\n"), run.stderr
+
+
+def linked(place):
+    place.unlink()
+    place.symlink_to("/dev/zero")
+
+
+def piped(place):
+    place.unlink()
+    os.mkfifo(place)
+
+
+def moved(place):
+    real = place.parent.parent / "elsewhere"
+    place.parent.rename(real)
+    place.parent.symlink_to(real)
+
+
+@pytest.mark.parametrize("do", [linked, piped, moved])
+@pytest.mark.parametrize("place", ["zarr.json", "rows/zarr.json", "rows/c/0/0"])
+def test_only_regular_files_in_real_folders_are_read(path, do, place):
+    if do is moved and place == "zarr.json":
+        pytest.skip("the folder of a checkpoint is looked at elsewhere")
+    do(newest(path) / place)
+    require_damage(path)
+
+
+@pytest.mark.parametrize("place", ["zarr.json", "rows/zarr.json", "rows/c/0/0"])
+def test_a_file_larger_than_any_that_is_written_is_not_read(path, place):
+    with (newest(path) / place).open("r+b") as file:
+        file.truncate(2**34)
+    require_damage(path)
+
+
+DEEP = "[" * 100_000 + "]" * 100_000
+ROWS = {"dtype": "<f8", "shape": [1000, 4], "sha256": "0" * 64, "files": ["0" * 64]}
+ARRAYS_SAID = {
+    "none": None,
+    "a list": [1],
+    "an array in a list": {"rows": [1]},
+    "a name that leads out": {"../rows": ROWS},
+    "a name in two cases": {"rows": ROWS, "Rows": ROWS},
+    "objects": {"rows": ROWS | {"dtype": "|O"}},
+    "no dtype": {"rows": {"shape": [1], "sha256": "0" * 64}},
+    "a dtype of fields": {"rows": ROWS | {"dtype": [["a", "<i4"]]}},
+    "a shape in words": {"rows": ROWS | {"shape": "4"}},
+    "a negative length": {"rows": ROWS | {"shape": [-1]}},
+    "a length that is true": {"rows": ROWS | {"shape": [True]}},
+    "a length of 4.0": {"rows": ROWS | {"shape": [4.0]}},
+    "a length above any": {"rows": ROWS | {"shape": [2**63]}},
+    "lengths whose product overflows": {"rows": ROWS | {"shape": [2**40, 2**40]}},
+    "a hundred axes": {"rows": ROWS | {"shape": [1] * 100}},
+    "no sha256": {"rows": ROWS | {"sha256": None}},
+    "a short sha256": {"rows": ROWS | {"sha256": "00"}},
+    "no files": {"rows": ROWS | {"files": None}},
+    "files in words": {"rows": ROWS | {"files": "x"}},
+    "too many files": {"rows": ROWS | {"files": ["0" * 64] * 2}},
+    "a file that is none": {"rows": ROWS | {"files": [1]}},
+}
+OWN = {
+    "a number in words": {"number": "1"},
+    "a number below 0": {"number": -1},
+    "another number": {"number": 2},
+    "no upto": {"upto": None},
+    "an upto above any": {"upto": 2**63},
+    "another upto": {"upto": 0},
+    "attributes in a list": {"attributes": [1]},
+    "an identity in words": {"identity": "x"},
+    "another identity": {"identity": {"of": "another"}},
+    "no format": {"format": None},
+    "a format in words": {"format": "x"},
+    "format 0": {"format": 0},
+    "a format that is true": {"format": True},
+}
+SAID = {name: {"arrays": arrays} for name, arrays in ARRAYS_SAID.items()} | OWN
+
+
+@pytest.mark.parametrize("is_base", [False, True])
+@pytest.mark.parametrize("said", SAID.values(), ids=SAID)
+def test_what_a_checkpoint_never_says_of_itself_is_damage(path, said, is_base):
+    describe_again(path, **said)
+    if is_base:
+        put_current(path, base=known_current(path)["newest"])
+    with Store.open(path, mode="read") as opened:
+        assert opened.latest() is None
+        assert opened.latest(only=()) is None
+        if is_base:
+            with pytest.raises(DamageError, match="checkpoint"):
+                opened.base()
+    assert check_store(path)
+
+
+TEXTS = ["", "[1, 2]", "{", DEEP, f'{{"attributes":{DEEP}}}', '{"a":NaN}', '{"a":1e999}', f'{{"a":{"9" * 5000}}}']
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_text_that_was_never_written_is_damage(path, text):
+    describe_again(path, text=text)
+    put_row(path, attributes=text)
+    with Store.open(path, mode="read") as opened:
+        assert opened.latest() is None
+        with pytest.raises(DamageError) as refused:
+            list(opened.heads())
+    assert refused.value.sequence == 2
+
+
+def test_more_attributes_than_are_read_are_not_written(opened, monkeypatch):
+    monkeypatch.setattr(store_records, "MOST_VALUES", 2**10)
+    monkeypatch.setattr(store_records, "LARGEST_JSON", 2**14)
+    for many in ({"many": [0] * 2**10}, {"long": "x" * 2**14}):
+        with pytest.raises(RecordError, match="attributes"):
+            opened.append("a", "b", b"", attributes=many)
+        with pytest.raises(RecordError, match="attributes"):
+            opened.commit({}, upto=0, attributes=many)
+
+
+@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_harmed_checkpoint_is_damage_or_what_it_was(kept, tmp_path_factory, seed):
+    rng = np.random.default_rng(seed)
+    folder = tmp_path_factory.getbasetemp() / "harmed" / "00000001"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(newest(kept), folder)
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    file = files[int(rng.integers(len(files)))]
+    data = bytearray(file.read_bytes())
+    for _ in range(rng.integers(1, 4)):
+        data[int(rng.integers(len(data) if rng.random() < 0.5 else min(len(data), 64)))] = int(rng.integers(256))
+    if rng.random() < 0.2:
+        del data[int(rng.integers(len(data))) :]
+    file.write_bytes(data)
+    try:
+        found = CheckpointReader(folder).arrays()
+    except (DamageError, VersionError):
+        return
+    assert all(found[name].tobytes() == ARRAYS[name].tobytes() for name in found)
+
+
+def test_memory_that_is_short_is_no_damage(path, monkeypatch):
+    def starve(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(store_chunks, "decompress_zstd", starve)
+    with Store.open(path, mode="read") as opened, pytest.raises(StoreError) as refused:
+        opened.latest()
+    assert not isinstance(refused.value, DamageError)

@@ -45,7 +45,7 @@ def pack_memory(
 
 
 def _without_readings(identity: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in identity.items() if name != "recall"} | {"exemplars": [0, None]}
+    return identity | {"exemplars": 0, "recall": 0}
 
 
 def reduce_partials(

@@ -73,7 +73,7 @@ class PartialWriter:
         be said of the file, in JSON's types.
         """
         arrays, attributes = memory.to_arrays(0, candidates or [])
-        arrays |= {field: np.zeros(0, np.int64) for field in ("withdrawn", "excluded")}
+        arrays |= {field: np.zeros(0, np.int64) for field in ("retracted", "excluded")}
         gone = ("tuned", "exemplar") if candidates is None else ("tuned",)
         arrays = {field: values for field, values in arrays.items() if not field.startswith(gone)}
         attributes = {field: value for field, value in attributes.items() if not field.startswith(gone)}
@@ -187,11 +187,7 @@ class Partial:
 
         Raises MismatchError where these are a step of a fleet's run, which leaves exemplars to the rows.
         """
-        if (
-            not self.has_rows
-            and self.made_with.exemplars not in (None, (0, None))
-            and "exemplars" not in self._attributes
-        ):
+        if not self.has_rows and self.made_with.exemplars and "exemplars" not in self._attributes:
             raise MismatchError(f"{self.path} is a step of a fleet's run: merge the partials that it was made of")
         return None if self.has_rows else self.sums()
 

@@ -82,7 +82,7 @@ class Making:
             return extractor.codes(extractor.image(touch), touch.key)
 
         exact = encode if capabilities_of(self.embedding).exact else None
-        keeping = Keeping(self.sensor, self.identity.recall or 0)
+        keeping = Keeping(self.sensor, self.identity.recall)
         return Memory(self.embedding.dimension, plan, exemplars, exact, keeping)
 
     def extractor(self) -> FeatureExtractor:
@@ -279,7 +279,7 @@ def _learn(job: LearnJob) -> Made:
     making, refused = job.making, []
     learner, extractor, memory = making.learner(), making.extractor(), making.memory()
     identity = making.identity
-    reads = bool(identity.exemplars and identity.exemplars[0]) or bool(identity.recall) or identity.embedding.bare
+    reads = bool(identity.exemplars or identity.recall) or identity.embedding.bare
     failed: set[str] = set()
     seen: set[tuple[str, bytes]] = set()
     read: list[tuple[str, int]] = []
@@ -344,9 +344,7 @@ def _pack(job: LearnJob, address: str) -> Made:
 def sum_partials(job: SumJob) -> Made:
     """Sum up partials of one making as one without rows. Raises StoreError, MismatchError."""
     begun = time.perf_counter(), time.process_time()
-    identity = job.making.identity
-    exemplars = (identity.exemplars or (0, None))[0] or 0
     with _within(job.making.patience):
         parts = [(Path(path), frozenset(left_out)) for path, left_out in job.parts]
-        reduce_partials(parts, Path(job.target), job.making.memory(exemplars))
+        reduce_partials(parts, Path(job.target), job.making.memory(job.making.identity.exemplars))
     return Made(job.target, seconds=time.perf_counter() - begun[0], processor=time.process_time() - begun[1])

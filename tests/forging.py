@@ -1,15 +1,14 @@
-"""Rows, identities and generations with right checksums, such as anyone can make: nothing in a checksum is secret."""
+"""Rows, identities and checkpoints with right checksums, such as anyone can make: nothing in a checksum is secret."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
-import sqlite3
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +16,14 @@ import numpy as np
 
 from store import Store
 from store.encoding import array_digest, check_arrays, encode_payload
-from store.records import checksum, payload_digest
+from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
+from store.layout import CURRENT_FILE, checkpoint_path, log_path
+from store.log import LogReader, Place
+from store.records import payload_digest
+from store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
 
-HEADER = struct.Struct("<4sBH")
+PAYLOAD = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
-
-
-@contextmanager
-def connected(path: Path) -> Iterator[sqlite3.Connection]:
-    """The journal of a memory, opened by SQLite and nothing else; each statement is its own transaction."""
-    with closing(sqlite3.connect(path / "journal.sqlite", isolation_level=None)) as connection:
-        connection.execute("PRAGMA synchronous = OFF")
-        yield connection
 
 
 def as_text(value: Any) -> str:
@@ -36,20 +31,94 @@ def as_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
-def _checksum(table: str, *fields: Any) -> bytes:
-    """The right checksum; any where a field is of a type that no checksum takes."""
-    try:
-        return checksum(table, *(field.encode() if isinstance(field, str) else field for field in fields))
-    except (TypeError, struct.error, UnicodeEncodeError):
-        return bytes(16)
+def sealed(known: Mapping[str, Any]) -> dict[str, Any]:
+    """What `CURRENT`, or a checkpoint's group, says, with the sha256 of it."""
+    known = {name: value for name, value in known.items() if name != "sha256"}
+    return {**known, "sha256": hashlib.sha256(as_text(known).encode("ascii")).hexdigest()}
+
+
+def get_current(path: Path) -> dict[str, Any]:
+    """What `CURRENT` says."""
+    return dict(json.loads((path / CURRENT_FILE).read_text(encoding="ascii")))
+
+
+def set_current(path: Path, **changes: Any) -> None:
+    """Have `CURRENT` say other things, with the right sha256."""
+    (path / CURRENT_FILE).write_text(as_text(sealed(get_current(path) | changes)) + "\n", encoding="ascii")
+
+
+def log_of(path: Path) -> Path:
+    """The log that `CURRENT` names."""
+    return log_path(path, get_current(path)["log"][0])
+
+
+def read_log(path: Path) -> tuple[bytes, list[bytes]]:
+    """The payload of a store's first frame, and the bytes of each of its rows."""
+    with LogReader(log_of(path)) as log:
+        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
+        return log.header, [log.read(frame.offset, frame.size)[1] for frame in frames]
+
+
+def log_bytes(
+    identity: bytes, header: bytes, batches: Iterable[Sequence[tuple[int, bytes]]]
+) -> tuple[bytes, list[Place]]:
+    """The bytes of a log, and the place behind its first frame and behind each batch of kinds and payloads."""
+    data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)
+    parts, places, at = [data], [Place.behind(frame)], Place.behind(frame)
+    for batch in batches:
+        for kind, payload in [*batch, (COMMIT, b"")]:
+            data, frame = pack_frame(identity, at.offset, at.number, at.batch, kind, payload, at.previous)
+            parts.append(data)
+            at = Place.behind(frame)
+        places.append(at)
+    return b"".join(parts), places
+
+
+def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) -> None:
+    """Put a log of these rows, each in a batch of its own, in the place of the one there is.
+
+    `CURRENT` then names the checkpoints' places in it.
+    """
+    current = get_current(path)
+    header = read_log(path)[0] if header is None else header
+    data, places = log_bytes(bytes.fromhex(current["log"][1]), header, [[(ROW, row)] for row in rows])
+    log_of(path).write_bytes(data)
+    sequences = [int.from_bytes(row[:8], "little") for row in rows]
+    for named in filter(None, (current["newest"], current["base"])):
+        behind = [i for i, sequence in enumerate(sequences) if sequence > named["upto"]]
+        named["place"] = as_place(places[min(behind, default=len(rows))])
+    set_current(path, **current)
+
+
+def as_place(place: Place) -> list[Any]:
+    """A place as `CURRENT` has it."""
+    return [place.offset, place.number, place.previous.hex()]
+
+
+def as_row(
+    sequence: int,
+    kind: str,
+    label: str,
+    key: bytes,
+    time: float,
+    attributes: str,
+    payload: bytes | None,
+    size: int,
+    kept: int | None = None,
+) -> bytes:
+    """The bytes of a row of which anything may be said."""
+    texts = (key[:255], *(text.encode("utf-8", "surrogatepass") for text in (kind, label, attributes)))
+    kept = payload is not None if kept is None else kept
+    fields = FIELDS.pack(sequence % 2**64, time, size % 2**64, kept, *map(len, texts))
+    return b"".join((fields, payload_digest(b"".join((fields, *texts))), *texts, payload or b""))
 
 
 def observation(path: Path) -> tuple[dict[str, Any], bytes]:
     """The attributes and the payload of the first observation of a memory whose arrays are there."""
-    query = "SELECT attributes, bytes FROM record JOIN payload USING (sequence) WHERE kind = 'observe' ORDER BY 1"
-    with connected(path) as connection:
-        attributes, payload = connection.execute(query).fetchone()
-    return json.loads(attributes), payload
+    for row in map(decode_row, read_log(path)[1]):
+        if row.head.kind == "observe" and row.payload is not None:
+            return dict(row.head.attributes), row.payload
+    raise ValueError(f"{path} has no observation with its arrays")
 
 
 def put_row(
@@ -60,53 +129,38 @@ def put_row(
     key: bytes = b"k" * 32,
     attributes: Any = None,
     payload: bytes | Mapping[str, np.ndarray] | None = None,
-    time: Any = 0.0,
+    time: float = 0.0,
     sequence: int | None = None,
-    **columns: Any,
+    size: int | None = None,
+    kept: int | None = None,
 ) -> int:
-    """Put a row into a journal, in place of any that has its sequence, and return that: by default the next one.
+    """Put a row into a log, in place of any that has its sequence, and return that: by default the next one.
 
-    payload: bytes, or arrays by name. columns: size, digest or checksum, where they are to be others than the right
-    ones.
+    payload: bytes, or arrays by name. size, kept: where they are to be others than the right ones.
     """
     body = payload if isinstance(payload, bytes) else encode_payload(check_arrays(payload or {}))
-    with connected(path) as connection:
-        if sequence is None:
-            (last,) = connection.execute("SELECT coalesce(max(sequence), 0) FROM record").fetchone()
-            sequence = last + 1
-        row = {"sequence": sequence, "kind": kind, "label": label, "key": key, "time": time}
-        row |= {"attributes": as_text({} if attributes is None else attributes)}
-        row |= {"size": len(body), "digest": payload_digest(body)} | columns
-        row.setdefault("checksum", _checksum("record", *row.values()))
-        connection.execute("BEGIN")
-        connection.execute("INSERT OR REPLACE INTO record VALUES (?,?,?,?,?,?,?,?,?)", tuple(row.values()))
-        connection.execute("INSERT OR REPLACE INTO payload VALUES (?,?)", (sequence, body))
-        connection.execute("COMMIT")
-    return int(sequence)
-
-
-def get_meta(path: Path, key: str) -> str:
-    """What table meta holds."""
-    with connected(path) as connection:
-        found: str = connection.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()[0]
-        return found
-
-
-def set_meta(path: Path, key: str, value: str) -> None:
-    """Write into table meta."""
-    with connected(path) as connection:
-        row = (key, value, _checksum("meta", key, value))
-        connection.execute("INSERT OR REPLACE INTO meta VALUES (?,?,?)", row)
+    rows = {row_sequence(row): row for row in read_log(path)[1]}
+    if sequence is None:
+        sequence = 1 + max([*rows, *(named["upto"] for named in named_in(path))], default=0)
+    text = as_text({} if attributes is None else attributes)
+    size = len(body) if size is None else size
+    rows[sequence % 2**64] = as_row(sequence, kind, label, key, time, text, body, size, kept)
+    write_log(path, [rows[number] for number in sorted(rows)])
+    return sequence
 
 
 def get_identity(path: Path) -> dict[str, Any]:
     """The identity of a memory."""
-    return dict(json.loads(get_meta(path, "identity")))
+    return dict(json.loads(read_log(path)[0]))
 
 
 def set_identity(path: Path, identity: Any) -> None:
-    """Give a memory another identity: a JSON value, or a text."""
-    set_meta(path, "identity", as_text(identity))
+    """Give a memory another identity, a JSON value or a text, and its checkpoints, too, where it is JSON."""
+    write_log(path, read_log(path)[1], as_text(identity).encode("utf-8", "surrogatepass"))
+    with suppress(ValueError, RecursionError):
+        known = json.loads(as_text(identity))
+        for named in named_in(path):
+            seal(path, named["number"], described(path, named["number"]) | {"identity": known})
 
 
 @dataclass(frozen=True)
@@ -124,7 +178,7 @@ class Packed:
 
 def pack(arrays: Sequence[Packed], version: int = 1, count: int | None = None) -> bytes:
     """A payload as FORMAT.md says it is, of arrays of which anything may be said."""
-    head, buffers = [HEADER.pack(b"ARPL", version, len(arrays) if count is None else count)], []
+    head, buffers = [PAYLOAD.pack(b"ARPL", version, len(arrays) if count is None else count)], []
     for array in arrays:
         for text in (array.name.encode("latin-1"), array.dtype.encode("latin-1")):
             head.append(struct.pack("<B", len(text) % 256) + text)
@@ -138,8 +192,8 @@ def pack(arrays: Sequence[Packed], version: int = 1, count: int | None = None) -
 
 def unpack(payload: bytes) -> tuple[int, list[Packed]]:
     """The version of a sound payload, and its arrays."""
-    _, version, count = HEADER.unpack_from(payload)
-    start, arrays = HEADER.size, []
+    _, version, count = PAYLOAD.unpack_from(payload)
+    start, arrays = PAYLOAD.size, []
     for _ in range(count):
         texts = []
         for _ in ("name", "dtype"):
@@ -162,83 +216,66 @@ def raw(name: str, array: np.ndarray) -> Packed:
     return Packed(name, array.dtype.str, array.shape, 0, array.nbytes, array.tobytes())
 
 
-@dataclass(frozen=True)
-class Named:
-    """A row of table generation without its checksum."""
-
-    number: int
-    upto: int
-    base: int
-    time: Any
-    attributes: str
-    content: str
+def named_in(path: Path) -> list[dict[str, Any]]:
+    """The newest checkpoint and the base, as `CURRENT` names them, each once."""
+    current = get_current(path)
+    newest, base = current["newest"], current["base"]
+    return [named for named in (newest, None if base == newest else base) if named is not None]
 
 
-def generations(path: Path) -> list[Named]:
-    """The generations that a journal names, the newest first."""
-    with connected(path) as connection:
-        query = "SELECT number, upto, base, time, attributes, content FROM generation ORDER BY upto DESC, number DESC"
-        return [Named(*row) for row in connection.execute(query)]
+def group_of(path: Path, number: int) -> Path:
+    """The folder of a checkpoint."""
+    return checkpoint_path(path, number)
 
 
-def name_generation(path: Path, row: Named) -> None:
-    """Have the journal name a generation, in place of any of its number."""
-    with connected(path) as connection:
-        values = (*astuple(row), _checksum("generation", *astuple(row)))
-        connection.execute("INSERT OR REPLACE INTO generation VALUES (?,?,?,?,?,?,?)", values)
+def described(path: Path, number: int) -> dict[str, Any]:
+    """What a checkpoint says of itself, but for its sha256."""
+    group = json.loads((group_of(path, number) / "zarr.json").read_text(encoding="utf-8"))
+    return {name: value for name, value in group["attributes"].items() if name != "sha256"}
 
 
-def group_of(path: Path, row: Named) -> Path:
-    """The folder of a generation."""
-    return path / "generations" / f"{row.number:08d}"
-
-
-def seal(path: Path, row: Named, identity: Any = None) -> None:
-    """Write a generation's row, and the same into its group, with the right sha256."""
-    name_generation(path, row)
-    header = group_of(path, row) / "zarr.json"
-    group = json.loads(header.read_text(encoding="utf-8"))
-    known = {"number": row.number, "upto": row.upto, "identity": get_identity(path) if identity is None else identity}
-    try:
-        content = json.loads(row.content)
-        known |= {"attributes": json.loads(row.attributes)} | (content if isinstance(content, Mapping) else {})
-    except (ValueError, RecursionError):
-        return  # no JSON: the group stays as it was
-    group["attributes"] = sealed(known)
+def seal(path: Path, number: int, known: Mapping[str, Any]) -> None:
+    """Have a checkpoint say this of itself, with the right sha256, and `CURRENT` of it."""
+    header = group_of(path, number) / "zarr.json"
+    known = sealed(known)
+    group = json.loads(header.read_text(encoding="utf-8")) | {"attributes": known}
     header.write_text(json.dumps(group), encoding="utf-8")
+    current = get_current(path)
+    for named in filter(None, (current["newest"], current["base"])):
+        if named["number"] == number:
+            named |= {name: known.get(name) for name in ("number", "upto", "sha256")}
+    set_current(path, **current)
 
 
-def sealed(known: Mapping[str, Any]) -> dict[str, Any]:
-    """What a generation's group says of itself, with the sha256 of it."""
-    return {**known, "sha256": hashlib.sha256(as_text(dict(known)).encode("ascii")).hexdigest()}
-
-
-def put_arrays(path: Path, row: Named, arrays: Mapping[str, np.ndarray]) -> Named:
-    """Write arrays into a generation's group, in place of those of their names; the row that names all of it.
+def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Write arrays into a checkpoint's group, in place of those of their names; what it then has to say of itself.
 
     They are written without any codec but that for bytes, in one chunk each, as anyone may.
     """
-    content = json.loads(row.content)
+    known = described(path, number)
     for name, array in arrays.items():
-        folder = group_of(path, row) / name
-        put_array(folder, array)
-        described = {"dtype": array.dtype.str, "shape": list(array.shape), "sha256": array_digest(array)}
-        content["arrays"][name] = described
-    return replace(row, content=as_text(content))
+        known["arrays"][name] = {
+            "dtype": array.dtype.str,
+            "shape": list(array.shape),
+            "sha256": array_digest(array),
+            "files": put_array(group_of(path, number) / name, array),
+        }
+    return known
 
 
-def put_array(folder: Path, array: np.ndarray) -> None:
-    """Write one array as a zarr array of one chunk; text as its code points, as the store does."""
+def put_array(folder: Path, array: np.ndarray) -> list[str]:
+    """Write one array as a zarr array of one chunk, text as its code points as the store does; sha256 of its files."""
     plain = array
     if array.dtype.kind == "U":
         plain = np.frombuffer(array.tobytes(), "<u4").reshape(*array.shape, array.dtype.itemsize // 4)
+    codec = {"name": "bytes"} | ({"configuration": {"endian": "little"}} if plain.dtype.itemsize > 1 else {})
     meta = {
         "shape": list(plain.shape),
         "data_type": "bool" if plain.dtype.kind == "b" else plain.dtype.name,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [max(n, 1) for n in plain.shape]}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
         "fill_value": False if plain.dtype.kind == "b" else 0,
-        "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}],
+        "codecs": [codec],
         "attributes": {"dtype": array.dtype.str},
         "zarr_format": 3,
         "node_type": "array",
@@ -247,8 +284,25 @@ def put_array(folder: Path, array: np.ndarray) -> None:
     chunk = folder.joinpath("c", *["0"] * plain.ndim)
     chunk.parent.mkdir(parents=True, exist_ok=True)
     (folder / "zarr.json").write_text(json.dumps(meta), encoding="utf-8")
-    if plain.size:
-        chunk.write_bytes(np.ascontiguousarray(plain).tobytes())
+    data = np.ascontiguousarray(plain).tobytes()
+    if not plain.size:
+        return []
+    chunk.write_bytes(data)
+    return [hashlib.sha256(data).hexdigest()]
+
+
+def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
+    """Change a bit of a row's arrays, or of its head, on the disk; 0: of all rows."""
+    with LogReader(log_of(path), payloads=False) as log:
+        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
+        frames = [frame for frame in frames if sequence in (0, row_sequence(log.peek(frame.offset, frame.size)))]
+    with log_of(path).open("r+b") as file:
+        for frame in frames:
+            at = frame.payload_offset + HEAD_BYTES if head else frame.end - 1
+            file.seek(at)
+            byte = file.read(1)[0] ^ 1
+            file.seek(at)
+            file.write(bytes([byte]))
 
 
 def row_of(path: Path, sequence: int = 1) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -258,19 +312,20 @@ def row_of(path: Path, sequence: int = 1) -> tuple[dict[str, Any], dict[str, np.
         return dict(record.attributes), dict(record.arrays)
 
 
-def generation_of(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The attributes and arrays of the newest generation, the caller's to change."""
+def checkpoint_of(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The attributes and arrays of the newest checkpoint, the caller's to change."""
     with Store.open(path, mode="read") as store:
         newest = store.latest()
         return dict(newest.attributes), dict(newest.arrays)
 
 
-def put_generation(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray], *, base: bool = False) -> None:
-    """Make this the newest generation, or the base of all rows."""
+def put_checkpoint(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray], *, base: bool = False) -> None:
+    """Make this the newest checkpoint, or the base of all rows."""
     with Store.open(path) as store:
-        store.commit(arrays, upto=store.last, attributes=attributes)
         if base:
             store.compact(arrays, upto=store.last, attributes=attributes)
+        else:
+            store.commit(arrays, upto=store.last, attributes=attributes)
 
 
 def copied(source: Path, target: Path) -> Path:

@@ -93,6 +93,6 @@ def _expected(observed, described, exemplars, settings):
 
 
 def spoil(path, number):
-    """Damage a generation's array on the disk."""
-    array = path / "generations" / f"{number:08d}" / "observations" / "c"
+    """Damage a checkpoint's array on the disk."""
+    array = path / "checkpoints" / f"{number:08d}" / "observations" / "c"
     next(file for file in array.rglob("*") if file.is_file()).unlink()

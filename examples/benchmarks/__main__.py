@@ -225,7 +225,7 @@ def log(
     seed: Annotated[int, typer.Option(min=0, help="Draws the rows.")] = 0,
     json: Json = None,
 ) -> None:
-    """Time a durable row of 4.3 kB, and count the bytes it makes the disk write: the log beside SQLite's journal."""
+    """Time a durable row of 4.3 kB, and count the bytes it makes the disk write: the log beside a table of SQLite."""
     require_folders(json)
     with progress_bar() as progress, TemporaryDirectory(dir=folder) as scratch:
         result = run_appending(Path(scratch), rounds=rounds, seed=seed, note=lambda what: progress(what, 0, 1))

@@ -1,4 +1,4 @@
-"""What an acknowledged row costs: the append-only log beside SQLite's journal, in turns on one disk.
+"""What an acknowledged row costs: the log beside a table of SQLite, in turns on one disk.
 
 Beside them stands the least that a durable row can cost: its bytes written to the end of a file, and fdatasync. Bytes
 are those that the disk counts, the file system's own journal among them, so other programs must leave the disk alone:
@@ -8,20 +8,19 @@ the median over rounds passes over what they do now and then.
 from __future__ import annotations
 
 import os
+import sqlite3
 import statistics
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
-from store.schema import JOURNAL_FILE, create_journal
 
 from examples.benchmarks.timing import Timing, circumstances, timed
 from scroll_tactile.cli.terminal import console
-from store.journal import Journal
 from store.log_writer import LogWriter, create_log
 from store.row_encoding import ROW, encode_row
 
@@ -59,24 +58,28 @@ def run_appending(folder: Path, *, rounds: int, seed: int, note: Callable[[str],
 
 
 def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
-    create_journal(folder, "{}")
-    journal = Journal(folder / JOURNAL_FILE, write=True)
-    opened.callback(journal.close)
+    database = opened.enter_context(closing(sqlite3.connect(folder / "rows.sqlite", isolation_level=None)))
+    for statement in ("PRAGMA journal_mode = WAL", "PRAGMA synchronous = FULL"):
+        database.execute(statement)
+    database.execute("CREATE TABLE row (sequence INTEGER PRIMARY KEY, bytes BLOB) STRICT")
     create_log(folder / "log", b"{}")
     log = opened.enter_context(LogWriter(folder / "log"))
     bare = os.open(folder / "bare", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     opened.callback(os.close, bare)
     about = ("add", "material", bytes(32), time.time(), "{}")
 
+    def as_row(sequence: int, payload: bytes) -> bytes:
+        return encode_row(sequence, *about, payload=payload, size=len(payload))
+
     def to_bare(_: int, payload: bytes) -> None:
         os.write(bare, payload)
         os.fdatasync(bare)
 
     return {
-        "SQLite, WAL, synchronous=FULL": lambda _, payload: journal.insert(*about, payload),
-        "the log": lambda sequence, payload: log.append(
-            ROW, encode_row(sequence, *about, payload=payload, size=len(payload))
+        "SQLite, WAL, synchronous=FULL": lambda *row: database.execute(
+            "INSERT INTO row VALUES (?, ?)", (row[0], as_row(*row))
         ),
+        "the log": lambda *row: log.append(ROW, as_row(*row)),
         "a bare file that grows, fdatasync": to_bare,
     }
 

@@ -14,11 +14,11 @@ def test_a_small_run_keeps_the_rows_each_way_and_fills_its_table(tmp_path, monke
     cases = [record["case"].split(",")[0] for record in result["records"]]
     assert cases == ["SQLite", "the log", "a bare file that grows"]
     assert result["rows"] == 15 and result["records"][0]["times_sqlite"] == 1.0
-    with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as journal:
-        kept = journal.execute("SELECT sequence, bytes FROM payload ORDER BY sequence").fetchall()
+    with closing(sqlite3.connect(tmp_path / "rows.sqlite")) as database:
+        kept = [data for (data,) in database.execute("SELECT bytes FROM row ORDER BY sequence")]
     with LogReader(tmp_path / "log") as log:
-        rows = [decode_row(log.read(frame.offset, frame.size)[1]) for batch in log.refresh() for frame in batch]
-    assert kept == [(row.head.sequence, row.payload) for row in rows] and len(rows) == 15
+        rows = [log.read(frame.offset, frame.size)[1] for batch in log.refresh() for frame in batch]
+    assert kept == rows and [decode_row(row).head.sequence for row in rows] == list(range(1, 16))
     assert (tmp_path / "bare").stat().st_size == 15 * appending.ROW_BYTES
     appending.show_appending(result)
     assert "the log" in capsys.readouterr().out

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, run
+from forging import log_of
 from touches import PAD, SETTINGS, fed, require_same, stream
 
 from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
@@ -38,13 +39,13 @@ def words(result):
 
 
 def damage(path):
-    """Change a character of a material's name in the journal; its file."""
-    journal = path / "journal.sqlite"
-    data = bytearray(journal.read_bytes())
+    """Change a character of a material's name in the log; its file."""
+    log = log_of(path)
+    data = bytearray(log.read_bytes())
     at = data.rindex("b/ü".encode())
     data[at] ^= 1
-    journal.write_bytes(data)
-    return journal
+    log.write_bytes(data)
+    return log
 
 
 class TestCheckAndRepair:
@@ -54,28 +55,28 @@ class TestCheckAndRepair:
         assert "nothing was damaged; rows 1 to 12 verify" in words(run("memory", "repair", path))
 
     def test_damage_is_named_and_mended(self, path):
-        damage(path)
+        log = damage(path)
         result = run("memory", "check", path)
         assert result.exit_code == 1
         assert "row" in result.output
-        assert "1 damaged" in result.output
+        assert "2 damaged" in result.output  # a frame, and so a row
         assert f"scroll-tactile memory repair {path}" in " ".join(result.output.split())
         found = json.loads(run("memory", "check", path, "--json").output)
         assert not found["sound"]
-        assert found["problems"][0]["path"] == str(path / "journal.sqlite")
+        assert found["problems"][0]["path"] == str(log)
         repaired = words(run("memory", "repair", path))
         assert "lost:" in repaired
         assert "damaged journal was put aside" in repaired
         assert run("memory", "check", path).exit_code == 0
         with TactileLearner.open(path, **SETTINGS) as learner:
-            # The generation holds what the row had; readings, and so exemplars, are in rows alone.
+            # The checkpoint holds what the row had; readings, and so exemplars, are in rows alone.
             require_same(learner, OBSERVED, exemplars=False)
 
-    def test_what_no_generation_holds_is_lost_up_to_there(self, tmp_path):
+    def test_what_no_checkpoint_holds_is_lost_up_to_there(self, tmp_path):
         learner = TactileLearner.open(tmp_path / "m", **SETTINGS)
         for name, touch in OBSERVED:
             learner.observe(name, stream(touch))
-        learner._ledger.store.close()  # as if the power failed: no generation is written
+        learner._ledger.store.close()  # as if the power failed: no checkpoint is written
         damage(tmp_path / "m")
         result = words(run("memory", "repair", tmp_path / "m"))
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:

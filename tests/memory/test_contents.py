@@ -2,17 +2,18 @@
 
 import copy
 import pickle
-import sqlite3
 import threading
 
 import pytest
+from forging import spoil_row
 from touches import SETTINGS, SmallSample, contents, fed, filled, require_same, stream
 
 import scroll_tactile.memory.state
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.memory.contents import Contents
-from store import StoreClosedError, StoreError
+from store import StoreClosedError, StoreError, StoreFullError
+from store.log_writer import LogWriter
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
 MANY = [*OBSERVED, *OBSERVED, *OBSERVED[::2], *OBSERVED[1::3]]
@@ -182,7 +183,7 @@ class TestChanges:
         learner.compact()
         learner.observe("a", stream((50, 60)))
         learner.close()
-        spoil_row(tmp_path / "m", len(OBSERVED) + 1, "kind")
+        spoil_row(tmp_path / "m", len(OBSERVED) + 1, head=True)
         with TactileLearner.open(tmp_path / "m") as learner:
             assert learner.names_of(stream((1, 60))) == []
             assert not learner.observe(*_given(OBSERVED[1])).repeated
@@ -200,13 +201,20 @@ class TestChanges:
             assert all(learner.observe(*_given(touch)).repeated for touch in OBSERVED[3:])
             assert [learner.names_of(stream((i, 60))) for i in range(4)] == [["z"], ["z"], ["z"], ["a"]]
 
-    def test_a_batch_that_is_lost_has_nothing_there(self, tmp_path):
+    def test_a_batch_that_is_lost_has_nothing_there(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:4])
+
+        def full(*_):
+            raise StoreFullError("no space left")
+
         with learner:
             with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
                 first = learner.observe(*_given(OBSERVED[5]))
                 assert learner.observe(*_given(OBSERVED[5])).repeated and not first.durable
-                learner._ledger.store._journal._connection.rollback()
+                monkeypatch.setattr(LogWriter, "stage", full)
+                with pytest.raises(StoreFullError):
+                    learner.observe(*_given(OBSERVED[6]))
+            monkeypatch.undo()
             assert not learner.observe(*_given(OBSERVED[5])).repeated
 
     def test_a_merge_brings_what_the_other_has(self, tmp_path):
@@ -219,7 +227,7 @@ class TestChanges:
 
     def test_damaged_rows_keep_nothing_from_being_learned(self, tmp_path):
         filled(tmp_path / "m", OBSERVED)[0].close()
-        spoil_row(tmp_path / "m", 4, "label")
+        spoil_row(tmp_path / "m", 4, head=True)
         with TactileLearner.open(tmp_path / "m") as learner:
             assert not learner.observe("d", stream((70, 60))).repeated
             assert learner.observe(*_given(OBSERVED[4])).repeated
@@ -318,13 +326,6 @@ def test_a_row_that_is_not_there_is_no_error():
     held.remove("a", b"1", 2)
     held.remove("b", b"2", 1)
     assert held.names(b"1") == ["a"] and held.find("a", b"1") == 1 and held.find("a", b"3") is None
-
-
-def spoil_row(path, sequence, column):
-    """Damage a row of a journal, whose checksum then fails."""
-    with sqlite3.connect(path / "journal.sqlite") as journal:
-        journal.execute(f"UPDATE record SET {column} = 'x' WHERE sequence = ?", (sequence,))
-    journal.close()
 
 
 def _given(pair):

@@ -44,7 +44,7 @@ def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
     learner._ledger._snapshot()
     base = store.base().number
     store.close()  # as if the power failed
-    for folder in (path / "generations").iterdir():
+    for folder in (path / "checkpoints").iterdir():
         if int(folder.name) != base:
             spoil(path, int(folder.name))
     with TactileLearner.open(path, **SETTINGS) as again:

@@ -1,11 +1,11 @@
-"""Folders from somebody else: rows, identities and generations that verify, and are none of a memory's."""
+"""Folders from somebody else: rows, identities and checkpoints that verify, and are none of a memory's."""
 
 import json
 import math
 
 import numpy as np
 import pytest
-from forging import copied, generation_of, get_identity, put_generation, put_row, row_of, set_identity
+from forging import checkpoint_of, copied, get_identity, put_checkpoint, put_row, row_of, set_identity
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from touches import PAD, SETTINGS, contents, filled, stream
@@ -188,16 +188,16 @@ def test_a_row_of_a_kind_that_nobody_knows_is_of_a_newer_version(path, others, k
 
 
 def test_a_generation_that_opening_refuses_is_not_merged(path, others):
-    attributes, arrays = generation_of(path)
-    put_generation(path, attributes | {"sample": ["nobody"] * len(attributes["sample"])}, arrays)
+    attributes, arrays = checkpoint_of(path)
+    put_checkpoint(path, attributes | {"sample": ["nobody"] * len(attributes["sample"])}, arrays)
     require_refused(path, "sample: expected materials that were observed", others=others)
 
 
 def test_an_exemplar_under_the_key_of_another_touch_is_damage(made, tmp_path, others):
     path = copied(made / "compacted", tmp_path / "m")
-    attributes, arrays = generation_of(path)
+    attributes, arrays = checkpoint_of(path)
     arrays["exemplar-keys"] = arrays["exemplar-keys"][::-1].copy()
-    put_generation(path, attributes, arrays, base=True)
+    put_checkpoint(path, attributes, arrays, base=True)
     require_refused(path, "exemplar-keys: expected the content hashes of their readings", others=others)
 
 
@@ -398,9 +398,9 @@ SUMS = {
 
 @pytest.mark.parametrize(("field", "place"), [(field, i) for field, spoils in SUMS.items() for i in range(len(spoils))])
 def test_arrays_of_a_generation_must_be_those_of_touches(path, field, place):
-    attributes, arrays = generation_of(path)
+    attributes, arrays = checkpoint_of(path)
     changed = SUMS[field][place](arrays.pop(field))
-    put_generation(path, attributes, arrays | ({} if changed is None else {field: changed}))
+    put_checkpoint(path, attributes, arrays | ({} if changed is None else {field: changed}))
     require_refused(
         path, "generation 2 .*: (observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded)"
     )
@@ -424,8 +424,8 @@ ABOUT = {
     ("field", "place"), [(field, i) for field, values in ABOUT.items() for i in range(len(values))]
 )
 def test_attributes_of_a_generation_must_be_those_of_touches(path, field, place):
-    attributes, arrays = generation_of(path)
-    put_generation(path, attributes | {field: ABOUT[field][place]}, arrays)
+    attributes, arrays = checkpoint_of(path)
+    put_checkpoint(path, attributes | {field: ABOUT[field][place]}, arrays)
     require_refused(path, f"generation 2 .*({field}|tuned|exemplar)")
 
 
@@ -443,15 +443,15 @@ def hollow(attributes, arrays):
 @pytest.mark.parametrize("changed", [{"descriptions": 1}, {"descriptions": {"a": {"x": 2.0}}}, {"tuned": 1}])
 def test_what_a_merge_leaves_out_is_looked_at_where_it_is_there(made, tmp_path, changed):
     path = copied(made / "whole", tmp_path / "m")
-    attributes, arrays = generation_of(made / "compacted")
+    attributes, arrays = checkpoint_of(made / "compacted")
     put_row(path, kind="merge", attributes=attributes | changed, payload=arrays)
     require_refused(path, next(iter(changed)))
 
 
 def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
-    attributes, arrays = generation_of(path)
-    put_generation(path, attributes, hollow(attributes, arrays), base=True)
+    attributes, arrays = checkpoint_of(path)
+    put_checkpoint(path, attributes, hollow(attributes, arrays), base=True)
     others = copied(made / "other", tmp_path / "other")
     with opened(others) as target:
         before = contents(target)
@@ -465,10 +465,10 @@ def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
 
 def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
-    attributes, arrays = generation_of(path)
+    attributes, arrays = checkpoint_of(path)
     arrays["observations"] = arrays["observations"] + 1
     arrays["lengths"][0, 1] += len(arrays["observations"])
-    put_generation(path, attributes, arrays, base=True)
+    put_checkpoint(path, attributes, arrays, base=True)
     assert any("its journal names 4" in found for found in check_memory(path))
     with opened(copied(made / "other", tmp_path / "other")) as target, pytest.raises(DamageError, match="names 4"):
         target.merge(path, shared="twice")
@@ -568,8 +568,8 @@ def test_a_row_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_fa
 def test_a_generation_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
     source = data.draw(st.sampled_from(["whole", "compacted"]))
     path = copied(made / source, tmp_path_factory.mktemp("generation") / "m")
-    attributes, arrays = data.draw(changed(*generation_of(path)))
-    put_generation(path, attributes, arrays, base=source == "compacted")
+    attributes, arrays = data.draw(changed(*checkpoint_of(path)))
+    put_checkpoint(path, attributes, arrays, base=source == "compacted")
     require_typed_or_equal(path)
 
 

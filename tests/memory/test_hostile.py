@@ -4,7 +4,7 @@ import contextlib
 
 import numpy as np
 import pytest
-from forging import get_identity, observation, pack, put_row, set_identity, unpack
+from forging import get_identity, log_of, observation, pack, put_row, set_identity, unpack
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from touches import OBSERVED, filled
@@ -27,12 +27,20 @@ cheap = settings(max_examples=150, deadline=None, suppress_health_check=list(Hea
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    """A memory of a few rows, and the bytes of its journal."""
+    """A memory of a few rows, and the bytes of its log and of what names it."""
     path = tmp_path_factory.mktemp("sound") / "m"
     learner, _ = filled(path, OBSERVED[:4])
-    learner._ledger._saved = learner.memory.sequence  # no generation
+    learner._ledger._saved = learner.memory.sequence  # no checkpoint
     learner.close()
-    return path, (path / "journal.sqlite").read_bytes()
+    return path, {file: file.read_bytes() for file in (path / "CURRENT", log_of(path))}
+
+
+def restored(sound):
+    """The folder of the memory, as it was."""
+    path, files = sound
+    for file, data in files.items():
+        file.write_bytes(data)
+    return path
 
 
 def received(path):
@@ -53,8 +61,7 @@ def received(path):
     fields=st.dictionaries(st.sampled_from(["columns", "nbytes", "sequences", "constituents", "x"]), json_values),
 )
 def test_rows_that_are_made_up_are_refused_by_name(sound, kind, label, key, fields):
-    path, journal = sound
-    (path / "journal.sqlite").write_bytes(journal)
+    path = restored(sound)
     attributes, payload = observation(path)
     put_row(path, kind=kind, label=label, key=key, attributes=attributes | fields, payload=payload)
     received(path)
@@ -66,8 +73,7 @@ def test_rows_that_are_made_up_are_refused_by_name(sound, kind, label, key, fiel
     data=st.data(),
 )
 def test_identities_that_are_made_up_are_refused_by_name(sound, place, data):
-    path, journal = sound
-    (path / "journal.sqlite").write_bytes(journal)
+    path = restored(sound)
     identity = get_identity(path)
     part = identity.get(place)
     if isinstance(part, dict):

@@ -39,7 +39,7 @@ class TestMerging:
         with TactileLearner.open(tmp_path / "m") as again:
             require_same(again, OBSERVED)
 
-    def test_rows_can_be_retracted_where_they_were_merged_and_after_a_generation_was_lost(self, tmp_path):
+    def test_rows_can_be_retracted_where_they_were_merged_and_after_a_checkpoint_was_lost(self, tmp_path):
         file = packed(tmp_path, OBSERVED)
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
             learner.merge(file, shared="once")

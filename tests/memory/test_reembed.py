@@ -71,7 +71,7 @@ def test_it_is_what_the_other_embedding_would_have_made(path, other):
 
 
 def arrays_of(learner):
-    """All that a generation of this memory would hold, to the byte."""
+    """All that a checkpoint of this memory would hold, to the byte."""
     arrays, attributes = learner.memory.to_arrays()
     return {name: (array.dtype, array.shape, array.tobytes()) for name, array in arrays.items()}, attributes
 
@@ -120,7 +120,7 @@ def test_replayed_it_is_the_same(path, other):
     learner, _ = eventful(path)
     with learner:
         learner.reembed(other)
-    shutil.rmtree(path / "generations")
+    shutil.rmtree(path / "checkpoints")
     with TactileLearner.open(path) as again:
         require_carried(again, other)
 
@@ -205,7 +205,7 @@ def test_what_is_observed_meanwhile_is_in_it(path, other, monkeypatch):
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
 
 
-def test_rows_that_are_not_those_of_the_generation_are_not_carried_over(path):
+def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):
     filled(path)[0].close()
     put_row(path, kind="describe", label="a", attributes={"constituents": {"wool": 1.0}}, sequence=3)
     before = rows(path)

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from commands import run
+from forging import spoil_row
 from touches import OBSERVED, PAD, stream, without
 
 from scroll_tactile import Augmented, Capabilities, Joined, Kernels, Maps, TactileLearner
@@ -63,7 +64,7 @@ def test_replayed_retracted_merged_and_compacted_it_is_what_observing_gives(made
     with TactileLearner.open(tmp_path / "m", **made) as learner:
         receipts = observe(learner, OBSERVED[:8])
         learner.retract(receipts[2])
-    shutil.rmtree(tmp_path / "m" / "generations")
+    shutil.rmtree(tmp_path / "m" / "checkpoints")
     with TactileLearner.open(tmp_path / "m", **made) as learner:
         learner.retract(receipts[5])
         with TactileLearner.open(tmp_path / "other", **made) as other:
@@ -89,7 +90,7 @@ def test_a_merged_base_counts_as_what_it_observed(made, tmp_path):
         learner.merge(tmp_path / "other", shared="once")
         learner.retract(receipts[0])
         assert held(learner) == fresh(made, without(0))
-    shutil.rmtree(tmp_path / "m" / "generations")
+    shutil.rmtree(tmp_path / "m" / "checkpoints")
     with TactileLearner.open(tmp_path / "m", **made) as learner:
         assert held(learner) == fresh(made, without(0))
 
@@ -134,8 +135,7 @@ def test_a_reader_stays_as_it_was_where_a_row_is_damaged(tmp_path):
         observe(writer, OBSERVED[:4])
         with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
             observe(writer, OBSERVED[4:])
-            connection = writer._ledger.store._journal._connection
-            connection.execute("UPDATE payload SET bytes = x'00' WHERE sequence = 8")
+            spoil_row(tmp_path / "m", 8)
             for _ in range(2):
                 with pytest.raises(DamageError):
                     reader.refresh()
@@ -156,7 +156,7 @@ def test_a_reader_takes_an_f_star_where_it_is_another_one(tmp_path):
             assert reader.refresh()
             assert reader.memory.tuned is tuned
             writer.fine_tune(epochs=1)
-            writer.retract(receipts[0])  # behind the generation that has it
+            writer.retract(receipts[0])  # behind the checkpoint that has it
             assert reader.refresh()
             assert reader.tuned_digest() is writer.tuned_digest() is None
 
@@ -173,11 +173,11 @@ def test_rows_hold_readings_alone_where_the_memory_can_embed_them_again(made, tm
 def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_path):
     learner = TactileLearner.open(tmp_path / "m", **made)
     observe(learner, OBSERVED)
-    learner._ledger.store.close()  # as if the power failed: the rows are in no generation
+    learner._ledger.store.close()  # as if the power failed: the rows are in no checkpoint
     assert json.loads(run("inspect", tmp_path / "m", "--json").stdout)["digest"] == learner.digest()
 
 
-def test_a_generation_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
+def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
     monkeypatch.setattr(ledger, "SNAPSHOT_EVERY", 5)
     killed = TactileLearner.open(tmp_path / "m", **made)
     observe(killed, OBSERVED)

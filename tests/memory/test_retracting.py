@@ -1,10 +1,9 @@
 """What was observed is retracted, brought together, made small and made durable in bulk: exactly."""
 
-import sqlite3
 import threading
-from contextlib import closing
 
 import pytest
+from forging import spoil_row
 from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_same, spoil, stream, without
 
 from scroll_tactile import Capabilities, Kernels, Sensor, TactileLearner
@@ -26,6 +25,7 @@ from store import (
     StoreFullError,
     repair_store,
 )
+from store.log_writer import LogWriter
 
 
 @pytest.fixture
@@ -184,18 +184,17 @@ class TestBatch:
     def test_one_that_cannot_be_made_durable_never_was(self, path, monkeypatch):
         learner, _ = filled(path, OBSERVED[:3])
         with learner:
-            journal = learner._ledger.store._journal
-            insert, calls = journal.insert, []
+            stage, calls = LogWriter.stage, []
 
-            def full(*row):
-                calls.append(row)
+            def full(log, *frame):
+                calls.append(frame)
                 if len(calls) == 3:
-                    journal._connection.execute("ROLLBACK")  # as SQLite does when the disk is full
+                    log.rollback()
                     raise StoreFullError("no space left")
-                return insert(*row)
+                return stage(log, *frame)
 
             with monkeypatch.context() as broken:
-                broken.setattr(journal, "insert", full)
+                broken.setattr(LogWriter, "stage", full)
                 with pytest.raises(StoreError), learner.batch():
                     for name, touch in OBSERVED[3:]:
                         learner.observe(name, stream(touch))
@@ -203,7 +202,7 @@ class TestBatch:
             learner.observe(*[OBSERVED[3][0], stream(OBSERVED[3][1])])
             require_same(learner, OBSERVED[:4])
 
-    def test_within_it_nothing_that_needs_a_generation(self, path):
+    def test_within_it_nothing_that_needs_a_checkpoint(self, path):
         learner, _ = filled(path)
         with learner:
             with learner.batch():
@@ -419,11 +418,8 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     learner.close()
     learner = TactileLearner.open(path, **SETTINGS)
     learner.retract(1)
-    learner._ledger.store.close()  # as if the power failed: the row is there, a generation without it is not
-    journal = path / "journal.sqlite"
-    data = bytearray(journal.read_bytes())
-    data[data.index(bytes(OBSERVED[4][0], "ascii") + learner_key(OBSERVED[4]))] ^= 1
-    journal.write_bytes(data)
+    learner._ledger.store.close()  # as if the power failed: the row is there, a checkpoint without it is not
+    spoil_row(path, 5)
     repaired = repair_store(path)
     assert repaired.kept == 13
     with TactileLearner.open(path, **SETTINGS) as again:
@@ -463,7 +459,7 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
             raise KeyboardInterrupt
 
         with monkeypatch.context() as broken:
-            broken.setattr(type(learner._ledger.store._journal), "shrink", interrupted)
+            broken.setattr(type(learner._ledger.store._checkpoints), "remove_unnamed", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 learner.compact(keep=2)
         require_same(learner, OBSERVED)
@@ -559,16 +555,16 @@ def test_with_another_row_damaged_a_retraction_is_whole_or_never_was(path, i, mo
     felt = [("abc"[seed % 3], (seed, 60)) for seed in range(24)]
     learner, receipts = filled(path, felt)
     with learner:
-        with closing(sqlite3.connect(path / "journal.sqlite")) as connection, connection:
-            connection.execute("UPDATE payload SET bytes = x'00' WHERE sequence > 12")
+        for sequence in range(13, 25):
+            spoil_row(path, sequence)
         left = felt
         try:
             learner.retract(receipts[i])
             left = felt[:i] + felt[i + 1 :]
         except DamageError as damage:
-            assert "fail their checksum" in str(damage)
+            assert "not as it was written" in str(damage)
         require_same(learner, left, exemplars=False)
     with TactileLearner.open(path, **SETTINGS) as again:
         require_same(again, left, exemplars=False)
-        with pytest.raises(DamageError, match="fail their checksum"):
+        with pytest.raises(DamageError, match="not as it was written"):
             again.exemplars  # noqa: B018

@@ -34,8 +34,8 @@ def test_a_row_that_verifies_and_that_no_touch_could_have_made_is_found(path):
 def test_it_finds_what_the_check_here_finds_and_says_how_far_it_is(path):
     told = []
     assert check_memory_apart(path, progress=lambda *step: told.append(step)) == []
-    assert {what for what, _, _ in told} >= {"generations"}
-    next((path / "generations").glob("*/sums-*/zarr.json")).write_text("{}")
+    assert {what for what, _, _ in told} >= {"checkpoints"}
+    next((path / "checkpoints").glob("*/sums-*/zarr.json")).write_text("{}")
     found = check_memory_apart(str(path))
     assert [(problem.path, problem.kind) for problem in found] == [
         (problem.path, problem.kind) for problem in check_store(path)

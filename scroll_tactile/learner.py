@@ -141,9 +141,9 @@ class TactileLearner:
         ships with scroll-tactile. Nothing is embedded before the first touch.
         mode: "read" shows what was committed when it was opened, also while another process writes the memory.
 
-        Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, with what
-        only earlier versions have, or with a user's own embedding that is not passed; InputError where a new memory is
-        given no sensor; StoreError (locked, damaged, not a store, a newer version …).
+        Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, or with a
+        user's own embedding that is not passed; InputError where a new memory is given no sensor; StoreError (locked,
+        damaged, not a store, a newer version, or one of 0.x …).
         """
         made_with = {"sensor": sensor, "embedding": embedding, "augmentation": augmentation}
         require_arguments({"path": path, "mode": mode}, made_with)
@@ -154,8 +154,7 @@ class TactileLearner:
         store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.recall, mode)
         try:
             identity = Identity.read(store)
-            identity.require_current(store.path, embedding, mode)
-            identity.require(store.path, sensor, augmentation)
+            identity.require(store.path, sensor, augmentation, chosen.exemplars, chosen.recall)
             if embedding is None:
                 found = identity.own_embedding(store.path)
                 identity.require_plan(store.path, found)
@@ -163,10 +162,9 @@ class TactileLearner:
                 found = embedding
                 identity.require_embedding(store.path, found)
             store.read_with(window_plan(identity.sensor, found))
-            exemplars = identity.exemplar_count(store, chosen.exemplars)
+            exemplars, keeping = identity.exemplars, Keeping(identity.sensor, identity.recall)
             learner = cls.__new__(cls)
-            keeping = identity.keeping(store.path, found, chosen.recall)
-            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars, keeping.capacity)
+            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars, identity.recall)
             learner._unverified = (identity, store.path) if embedding is None else None
             bare = identity.embedding.bare
             plan, encode = learner._plan, learner._codes_of if bare or capabilities_of(found).exact else None
@@ -447,8 +445,7 @@ class TactileLearner:
         The memory is whole and can be used until the new one takes its place; returns the folder in which it lies from
         then on, to be removed once nobody needs it. A call that was cut short is resumed by the next. Observations
         keep their receipts, retractions and descriptions stay; an f* is gone. Other calls that wait meanwhile raise
-        StoreClosedError. `reembed_memory` does this with a memory that does not open. A memory that a version up to 0.6
-        embedded again has lost its kept touches: embedding it again brings them back.
+        StoreClosedError. `reembed_memory` does this with a memory that does not open.
 
         Raises MismatchError where readings are missing, as in a compacted memory; InputError in a memory without a
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.

@@ -10,19 +10,11 @@ Five sensors come with the project; one's own is one more, made in one line:
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from scroll_tactile.errors import InputError
 
@@ -61,15 +53,6 @@ class Sensor(BaseModel):
     layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     camera: bool = False
     non_finite: Literal["refused", "missing"] = "refused"
-
-    @model_serializer(mode="wrap")
-    def _as_before(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Memories are compared with the sensors they were made with, byte for byte: those made before the field was
-        # have none.
-        fields: dict[str, Any] = serialize(self)
-        if fields.get("non_finite") == "refused":
-            del fields["non_finite"]
-        return fields
 
     @model_validator(mode="after")
     def _one_for_all_or_one_each(self) -> Self:

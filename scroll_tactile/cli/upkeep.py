@@ -31,7 +31,7 @@ def reembed(
     folder: MemoryFolder,
     default: Annotated[bool, typer.Option("--default", help="With the default embedding of its sensor.")] = False,
 ) -> None:
-    """Embed all readings again, with the memory's own embedding as it is now, or the default where that is gone.
+    """Embed all readings again, with the memory's own embedding as it is now.
 
     Interrupted, start it again to go on.
     """

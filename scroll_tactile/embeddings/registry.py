@@ -11,8 +11,7 @@ import base64
 import binascii
 import math
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
@@ -21,10 +20,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
-from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES, Kernels
+from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import EmbeddingError, WeightsError
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.errors import EmbeddingError
 
 if TYPE_CHECKING:
     from scroll_tactile.embeddings.frames import Frames
@@ -35,13 +33,11 @@ __all__ = [
     "MOST_PARTS",
     "configuration_of",
     "from_configuration",
-    "guess",
     "picture_to_json",
     "require_configuration",
 ]
 
 MOST_DEPTH: Final = 16  # mappings and lists within each other
-LIKELY_SEEDS = 8  # of kernels, a few milliseconds each
 MOST_PARTS: Final = 8  # of a Joined
 MOST_COSINES = 2**14
 MOST_WEIGHTS = 2**27  # of all cosines together: 1 GiB
@@ -185,24 +181,6 @@ def require_configuration(configuration: Mapping[str, Any]) -> None:
     _validated(configuration)
 
 
-def guess(name: str, dimension: int, fingerprint: str, sensor: Sensor) -> Embedding | None:
-    """Find the embedding of a memory that was made before configurations were kept, among those in common use.
-
-    Tried are those of that name and dimension with default settings; None where none has the fingerprint. Nothing is
-    fetched: published weights count where the cache has them.
-    """
-    if isinstance(dimension, bool) or not isinstance(dimension, int) or not 1 <= dimension <= MOST_COSINES:
-        return None
-    for make in _candidates(name, dimension, sensor):
-        try:
-            embedding = make()
-            if (embedding.name, embedding.dimension) == (name, dimension) and embedding.fingerprint == fingerprint:
-                return embedding
-        except (ValueError, WeightsError):  # no such dimension, or weights that are damaged
-            continue
-    return None
-
-
 def picture_to_json(picture: npt.NDArray[np.float32]) -> dict[str, Any]:
     """A resting picture (height, width, 3) in JSON's types, to the bit."""
     deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
@@ -297,36 +275,3 @@ def _source(held: WeightsConfiguration, kind: str) -> str | Path:
         f"expected the weights of a {kind} that came from {came} and whose tensors have the SHA-256 "
         f"{held.sha256[:12]}…; they are not at hand. Pass embedding={kind}(weights=…) with them{put}"
     )
-
-
-def _candidates(name: str, dimension: int, sensor: Sensor) -> Iterator[Callable[[], Embedding]]:
-    """Ways to make the embeddings of a name in common use, the likely first."""
-    from scroll_tactile.embeddings.frames import Frames
-    from scroll_tactile.embeddings.maps import Maps
-
-    if name == "kernels":
-        yield lambda: Kernels(dimension=dimension)
-        yield from (partial(Kernels, dimension=dimension, seed=seed) for seed in range(LIKELY_SEEDS))
-    elif name == "frames":
-        yield Frames
-        yield lambda: Frames(rest=None)
-        yield lambda: Frames(cosines=dimension)
-        yield lambda: Frames(rest=None, cosines=dimension)
-    elif name == "maps":
-        layout = sensor.layout if sensor.layout is not None and len(sensor.layout) < 3 else (sensor.channels,)
-        yield lambda: Maps(layout=layout)
-        yield lambda: Maps(layout=layout, cosines=dimension)
-    elif name in ("vision", "kernels+vision"):
-        from scroll_tactile.embeddings.weights import cached_weights
-
-        for weights in cached_weights():
-            yield partial(_vision, weights, 0 if name == "vision" else dimension)
-
-
-def _vision(weights: str, beside: int) -> Embedding:
-    """A published network with default settings; beside kernels, where there are to be so many features in all."""
-    from scroll_tactile.embeddings.joined import Joined
-    from scroll_tactile.embeddings.vision import Vision
-
-    vision = Vision(weights)
-    return Joined(Kernels(dimension=beside - vision.dimension), vision) if beside else vision

@@ -28,7 +28,6 @@ __all__ = [
     "CACHE_VARIABLE",
     "PUBLISHED",
     "cache_folder",
-    "cached_weights",
     "digest_of",
     "hash_tensors",
     "load_network",
@@ -150,11 +149,6 @@ def cache_folder() -> Path:
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen).expanduser() / "weights"
     return Path(_pooch().os_cache("scroll-tactile")) / "weights"
-
-
-def cached_weights() -> list[str]:
-    """The published names whose files the cache has."""
-    return [name for name, url in PUBLISHED.items() if weights_file(url.rsplit("/", 1)[1])[1] is not None]
 
 
 def weights_file(name: str | None) -> tuple[Path | None, Path | None]:

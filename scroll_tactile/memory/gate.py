@@ -46,10 +46,10 @@ class Gate:
 
     def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
         self._path, self._thorough = path, thorough
-        copies = None if identity.gone_copies else identity.augmentation.copies if identity.augmentation else 0
+        copies = identity.augmentation.copies if identity.augmentation else 0
         made_with = identity.sensor, identity.embedding.dimension, plan
         self._rows = RowChecks(*made_with, copies)
-        self._generations = GenerationChecks(*made_with)
+        self._generations = GenerationChecks(*made_with, keeps=bool(identity.recall))
 
     def head(self, head: Head) -> Head:
         """This row, which is what its kind must be but for its arrays. Raises as `record`."""
@@ -175,8 +175,7 @@ def require_counted(path: Path, generation: Checkpoint, heads: Sequence[Head]) -
     if heads and len(heads) < heads[-1].sequence:
         return
     named = Counter(head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= generation.upto)
-    observations = generation.arrays["observations"]
-    touches = (observations if observations.ndim == 1 else observations.sum(axis=1)).tolist()
+    touches = generation.arrays["observations"].tolist()
     for material, count in zip(cast("list[str]", generation.attributes["materials"]), touches, strict=True):
         if count > named[material]:
             raise DamageError(
@@ -197,7 +196,7 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
             identity = Identity.read(store)
             plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
             store.read_with(plan, thorough=True)
-            if identity.embedding.configuration is not None and not identity.embedding.gone:
+            if identity.embedding.configuration is not None:
                 require_configuration(identity.embedding.configuration)
         except (DamageError, EmbeddingError, MismatchError) as error:
             return [str(error)]

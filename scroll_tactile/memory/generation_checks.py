@@ -22,13 +22,12 @@ from scroll_tactile.memory.row_checks import check_description, check_readings
 from scroll_tactile.memory.rows import Arrays
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
-from scroll_tactile.signals.windows import VIEWS, Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, one_thread, within_scatter
 
 __all__ = ["GenerationChecks"]
 
-FOLDS = 3  # of statistics on disk before version 0.3
 MOST_STAGES = 2**10  # and scales that judge at one
 MODES = ("head", "adapters", "network")
 JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
@@ -36,10 +35,13 @@ IntArray = npt.NDArray[np.int64]
 
 
 class GenerationChecks:
-    """The checks of generations of one sensor, dimension and plan of windows; each raises Unexpected."""
+    """The checks of generations of one sensor, dimension and plan of windows; each raises Unexpected.
 
-    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan) -> None:
-        self._sensor, self._dimension, self._plan = sensor, dimension, plan
+    keeps: whether touches are kept for recall.
+    """
+
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, keeps: bool) -> None:
+        self._sensor, self._dimension, self._plan, self._keeps = sensor, dimension, plan, keeps
 
     def check(self, arrays: Arrays, attributes: Mapping[str, Any], upto: int | None, *, thorough: bool) -> None:
         """Check all that a memory takes from a generation.
@@ -47,43 +49,38 @@ class GenerationChecks:
         upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some.
         """
         whole("dimension", attributes.get("dimension"), self._dimension, self._dimension)
-        scales = _numbers("scales", attributes.get("scales"), max(VIEWS.values()))
-        own = [scale for scale in self._plan.scales if f"rows-{scale}" in arrays]
-        named = [scale for scale in self._plan.scales if int(scale) in scales]
-        whole_plan = set(self._plan.windows) <= set(own) and own == named and len(set(scales)) == len(scales)
-        expect(whole_plan, "scales", f"{list(map(int, self._plan.scales))}, each with its arrays", scales)
+        own, scales = list(map(int, self._plan.scales)), attributes.get("scales")
+        # 1.0 and True are equal to 1, and are not what is written there.
+        expect(scales == own and all(type(scale) is int for scale in scales), "scales", f"{own}", scales)
         materials = _names("materials", attributes.get("materials"))
         expect(len(set(materials)) == len(materials), "materials", "different names", materials)
         touches = self._check_touches(arrays, len(materials))
-        totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in own}
+        totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in self._plan.scales}
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
         expect(all(touches), "observations", "a touch or more of each material", touches)
-        sampled = _names("pool", attributes.get("pool"), materials)
+        sampled = _names("sample", attributes.get("sample"), materials)
         self._check_sample(arrays, sampled)
-        if "copies" in attributes:  # before 0.7 there was nothing said of them
-            copies = attributes["copies"]
-            expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of pool", copies)
-            for each in copies:
-                whole("copies", each, 1, MOST_ROWS)
-        if "kept" in attributes:
-            self._check_kept(arrays, _names("kept", attributes["kept"], materials))
+        copies: Any = attributes.get("copies")
+        expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of sample", copies)
+        for each in copies:
+            whole("copies", each, 1, MOST_ROWS)
+        if self._keeps or "kept" in attributes:
+            self._check_kept(arrays, _names("kept", attributes.get("kept"), materials))
         if "exemplars" in attributes:
             self._check_exemplars(arrays, attributes["exemplars"], rows, upto)
-        for field in ("withdrawn", "excluded"):
+        for field in ("retracted", "excluded"):
             sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, upto or 2**63 - 1)
             expect(len(np.unique(sequences)) == len(sequences), field, "different rows", sequences)
-        _check_descriptions(attributes.get("descriptions", {}))
-        if upto is not None:
-            _check_capacity(attributes.get("capacity"))
+        if upto is not None or "descriptions" in attributes:  # to a merge they are rows of their own
+            _check_descriptions(attributes.get("descriptions"))
         if upto is not None or "tuned" in attributes:  # a merge leaves f* where it is
             whole("tuned_upto", attributes.get("tuned_upto"), 0, upto or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
 
     def _check_touches(self, arrays: Arrays, count: int) -> list[int]:
-        observations = array(arrays, "observations", ("int64",), _folded(arrays, "observations", (count,)))
-        counts("observations", observations, 0, MOST_ROWS)
-        touches: list[int] = (observations if observations.ndim == 1 else observations.sum(axis=1)).tolist()
+        observations = array(arrays, "observations", ("int64",), (count,))
+        touches: list[int] = counts("observations", observations, 0, MOST_ROWS).tolist()
         lengths = array(arrays, "lengths", ("int64",), (None, 2))
         counts("lengths", lengths[:, 0], 0, MOST_COLUMNS)
         counts("lengths", lengths[:, 1], 1, MOST_ROWS)
@@ -95,31 +92,17 @@ class GenerationChecks:
     def _check_sums(self, arrays: Arrays, scale: Scale, count: int, thorough: bool) -> IntArray:
         """The rows of each material at a scale, whose sums and second moment could be of so many."""
         field = f"rows-{scale}"
-        rows = array(arrays, field, ("int64",), _folded(arrays, field, (count,)))
-        counts(field, rows, 0, MOST_ROWS)
-        total = int(rows.sum())
-        whole(field, total, 0, MOST_ROWS)
+        rows = counts(field, array(arrays, field, ("int64",), (count,)), 0, MOST_ROWS)
+        total = whole(field, int(rows.sum()), 0, MOST_ROWS)
         field = f"sums-{scale}"
-        sums = array(arrays, field, ("int64",), (*rows.shape, self._dimension))
-        codes(field, sums, rows[..., None])
-        folds = [f"second-{scale}"] if rows.ndim == 1 else [f"second-{scale}-{fold}" for fold in range(FOLDS)]
-        moments = [
-            self._second(arrays, field, int(of.sum()))
-            for field, of in zip(folds, rows.reshape(count, len(folds)).T, strict=True)
-            if field in arrays or of.any()
-        ]
-        stray = {f"second-{scale}", *(f"second-{scale}-{fold}" for fold in range(FOLDS))} - set(folds)
-        expect(not stray & set(arrays), f"second-{scale}", f"{folds}", stray)
-        rows, sums = (rows, sums) if rows.ndim == 1 else (rows.sum(axis=1), sums.sum(axis=1))
-        if moments:
-            packed = moments[0] if len(moments) == 1 else np.sum(moments, axis=0)
-            self._check_moment(f"second-{scale}", packed, rows, sums, thorough)
+        sums = array(arrays, field, ("int64",), (count, self._dimension))
+        codes(field, sums, rows[:, None])
+        field = f"second-{scale}"
+        if total:
+            size, most = self._dimension * (self._dimension + 1) // 2, total << 2 * BITS
+            packed = counts(field, array(arrays, field, ("int64",), (size,)), -most, most)
+            self._check_moment(field, packed, rows, sums, thorough)
         return rows
-
-    def _second(self, arrays: Arrays, field: str, rows: int) -> IntArray:
-        size = self._dimension * (self._dimension + 1) // 2
-        most = rows << 2 * BITS
-        return counts(field, array(arrays, field, ("int64",), (size,)), -most, most)
 
     def _check_moment(self, field: str, packed: IntArray, rows: IntArray, sums: IntArray, thorough: bool) -> None:
         """Raise Unexpected where a variance within the materials is negative; thorough: where any is, in any direction.
@@ -142,17 +125,17 @@ class GenerationChecks:
         expect(sound, field, "a second moment of rows with these sums", "one that no rows have")
 
     def _check_sample(self, arrays: Arrays, materials: list[str]) -> None:
-        keys(arrays, "pool-keys", materials)
-        sizes = counts("pool-sizes", array(arrays, "pool-sizes", ("int64",), (len(materials),)), 1, MOST_STAGES**2)
-        pairs = array(arrays, "pool-pairs", ("int64",), (int(sizes.sum()), 3))
-        counts("pool-pairs", pairs[:, :2], 0, MOST_STAGES - 1)
-        counts("pool-pairs", pairs[:, 2], 1, MOST_ROWS)
+        keys(arrays, "sample-keys", materials)
+        sizes = array(arrays, "sample-sizes", ("int64",), (len(materials),))
+        counts("sample-sizes", sizes, 1, MOST_STAGES**2)
+        pairs = array(arrays, "sample-pairs", ("int64",), (int(sizes.sum()), 3))
+        counts("sample-pairs", pairs[:, :2], 0, MOST_STAGES - 1)
+        counts("sample-pairs", pairs[:, 2], 1, MOST_ROWS)
         order = np.diff(pairs[:, 0] * MOST_STAGES + pairs[:, 1])
         order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
-        expect(bool((order > 0).all()), "pool-pairs", "stages and scales in order", pairs)
-        field, most = ("pool-sums", pairs[:, 2:]) if "pool-sums" in arrays else ("pool-rows", 1)
-        rows = array(arrays, field, ("int32",), (len(pairs), self._dimension if len(pairs) else None))
-        codes(field, rows, most)
+        expect(bool((order > 0).all()), "sample-pairs", "stages and scales in order", pairs)
+        rows = array(arrays, "sample-rows", ("int32",), (len(pairs), self._dimension if len(pairs) else None))
+        codes("sample-rows", rows)
 
     def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:
         keys(arrays, "kept-keys", materials)
@@ -207,12 +190,6 @@ class GenerationChecks:
             _check_finite(field, array(arrays, field, ("float32",), arrays[field].shape))
 
 
-def _folded(arrays: Arrays, field: str, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape of a count, which before version 0.3 was apart for each fold."""
-    found = arrays.get(field)
-    return (*shape, FOLDS) if found is not None and found.ndim > len(shape) else shape
-
-
 def _check_finite(field: str, values: npt.NDArray[np.floating]) -> None:
     expect(bool(np.isfinite(values).all()), field, "finite weights", "others")
 
@@ -223,19 +200,6 @@ def _names(field: str, values: Any, among: list[str] | None = None) -> list[str]
     strange = [] if among is None else sorted(set(names) - set(among))
     expect(not strange, field, "materials that were observed", strange)
     return names
-
-
-def _numbers(field: str, values: Any, most: int) -> list[int]:
-    expect(isinstance(values, list), field, "numbers", values)
-    return [whole(field, value, 0, most) for value in values]
-
-
-def _check_capacity(capacity: Any) -> None:
-    pair = isinstance(capacity, list) and len(capacity) == 2
-    expect(pair, "capacity", "exemplars, and a limit in bytes that is no longer used", capacity)
-    for limit in capacity:
-        if limit is not None:
-            whole("capacity", limit, 0, 2**63 - 1)
 
 
 def _check_descriptions(descriptions: Any) -> None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self, cast
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Capabilities, Embedding, embed_windows, require_rest, window_plan
-from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, from_configuration, guess
+from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, from_configuration
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
-from scroll_tactile.memory.earlier import gone_copies, gone_embedding, is_gone, split_copies
-from scroll_tactile.memory.kept import Keeping, usual_kept
+from scroll_tactile.memory.kept import usual_kept
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.statistics.grid import BITS
-from store import DamageError, Store
+from store import DamageError
 
 __all__ = [
     "AbsentEmbedding",
@@ -35,7 +34,6 @@ __all__ = [
 ]
 
 USUAL_EXEMPLARS = 400  # streams
-LIKELY_EXACT = "kernels"  # in memories made before configurations were kept
 MOST_FEATURES = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
 MOST_STREAMS = 2**31
 MOST_VALUES = 2**31  # of a sensor at once, or in one channel of a touch
@@ -58,7 +56,7 @@ class EmbeddingIdentity(_Kept):
     dimension: Annotated[int, Field(ge=1, le=MOST_FEATURES)]
     bound: Annotated[FiniteFloat, Field(gt=0)]
     fingerprint: _Text
-    configuration: dict[str, Any] | None = None
+    configuration: dict[str, Any] | None
 
     @model_validator(mode="after")
     def _of_its_configuration(self) -> Self:
@@ -83,11 +81,6 @@ class EmbeddingIdentity(_Kept):
         """Whether rows of observations hold readings alone: the memory can make the embedding again, to the bit."""
         return self.configuration is not None and _is_exact(self.configuration)
 
-    @property
-    def gone(self) -> bool:
-        """Whether only an earlier version can make it; a user's own of that name is told by its fingerprint."""
-        return is_gone(self.name, self.configuration)
-
     def __str__(self) -> str:
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
@@ -109,28 +102,24 @@ class Grid(_Kept):
 
     bits: Annotated[int, Field(ge=1, le=BITS)]
     scales: Annotated[tuple[_Width, ...], Field(min_length=1, max_length=64)]
-    frames: bool = False
+    frames: bool
 
 
 class Identity(_Kept):
     """Everything that a memory is made with and that never changes.
 
-    reading: whether wide windows may be partial, and which scales judge; None in memories of the first versions.
-    exemplars: streams in the buffer, and a limit in bytes that is no longer used; None in the first versions, too.
-    views: whether whole touches are read beside windows; earlier versions, whose kernels do so from now on, had none.
-    recall: touches kept for recall; None where none are, and in memories older than that.
-    gone_copies: the settings of copies that only an earlier version can make; of no new memory.
+    reading: whether wide windows may be partial, and which scales judge. views: whether whole touches are read beside
+    windows. exemplars: streams in the buffer. recall: touches kept for recall.
     """
 
     sensor: Sensor
     embedding: EmbeddingIdentity
     grid: Grid
-    reading: tuple[bool, Literal["all", "widest"]] | None = None
-    exemplars: tuple[_Streams | None, _Streams | None] | None = None
-    augmentation: Augmented | None = None
-    views: bool = False
-    recall: _Streams | None = None
-    gone_copies: dict[str, Any] = Field(default_factory=dict, exclude=True)
+    reading: tuple[bool, Literal["all", "widest"]]
+    views: bool
+    augmentation: Augmented | None
+    exemplars: _Streams
+    recall: _Streams
 
     @model_validator(mode="after")
     def _of_a_sensor_that_can_be(self) -> Self:
@@ -160,10 +149,10 @@ class Identity(_Kept):
                 embedding=made,
                 grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
                 reading=(plan.partial, plan.judged),
-                exemplars=(usual_exemplars(sensor) if exemplars is None else exemplars, None),
-                augmentation=augmentation,
                 views=bool(plan.whole),
-                recall=(usual_recall(sensor, embedding) if recall is None else recall) or None,
+                augmentation=augmentation,
+                exemplars=usual_exemplars(sensor) if exemplars is None else exemplars,
+                recall=usual_recall(sensor, embedding) if recall is None else recall,
             )
         except ValidationError as error:
             raise InputError(f"no memory can be made with {_first(error)}") from None
@@ -184,104 +173,35 @@ class Identity(_Kept):
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> Self:
-        """The identity of fields that `to_json` gave, now or in an earlier version: of JSON's types, none converted."""
-        kept = fields.get("augmentation")
-        kept, gone = split_copies(kept) if isinstance(kept, Mapping) else (kept, {})
-        text = json.dumps({**fields, "augmentation": kept, "gone_copies": gone})
-        return cls.model_validate_json(text, strict=True)
+        """The identity of fields that `to_json` gave: of JSON's types, none converted."""
+        return cls.model_validate_json(json.dumps(dict(fields)), strict=True)
 
     def to_json(self) -> dict[str, Any]:
-        """Its fields in JSON's types, as a store keeps them; absent ones are left out, as earlier versions did."""
-        kept = self.model_dump(
-            mode="json", exclude_none=True, exclude={"grid", "augmentation", "exemplars", "views", "recall"}
-        )
-        kept["grid"] = self.grid.model_dump(mode="json", exclude={"frames"} if not self.grid.frames else None)
-        if self.exemplars is not None:
-            kept["exemplars"] = list(self.exemplars)
-        if self.augmentation is not None:
-            kept["augmentation"] = self.augmentation.model_dump(mode="json")
-        if self.views:
-            kept["views"] = True
-        if self.recall:
-            kept["recall"] = self.recall
-        kept["sensor"] = self.sensor.model_dump(mode="json")  # with its empty fields
-        return kept
-
-    def exemplar_count(self, store: Store, asked: int | None) -> int:
-        """Streams in the buffer, as the memory was made. Raises MismatchError where `asked` is another number.
-
-        A memory older than exemplars takes `asked`, and keeps exemplars of what it observes from then on. One that was
-        made with a limit in bytes takes the usual number.
-        """
-        kept = self.exemplars
-        if kept is None and (generation := store.latest()) is not None:
-            kept = cast("tuple[int | None, int | None] | None", generation.attributes.get("capacity"))
-        if kept is None:
-            return usual_exemplars(self.sensor) if asked is None else asked
-        count = usual_exemplars(self.sensor) if kept[0] is None else kept[0]
-        if asked not in (None, count):
-            raise MismatchError(
-                f"{store.path} was made with exemplars={count}; it was opened with {asked}. Readings that were not "
-                "kept are gone: leave exemplars out"
-            )
-        return count
-
-    def keeping(self, path: Path, embedding: Embedding, asked: int | None) -> Keeping:
-        """Which touches are kept for recall, as the memory was made; one older than that keeps the usual number.
-
-        Raises MismatchError where `asked` is another number.
-        """
-        made = self.recall
-        if made is None:
-            # Where it has views it keeps none; without, it is older or has no use for any.
-            made = 0 if self.views else usual_recall(self.sensor, embedding)
-        if asked not in (None, made):
-            raise MismatchError(
-                f"{path} was made with recall={made}; it was opened with {asked}. Which touches are kept is a function "
-                "of all that were observed: leave recall out"
-            )
-        return Keeping(self.sensor, made)
+        """Its fields in JSON's types, as a store keeps them."""
+        return self.model_dump(mode="json")
 
     def own_embedding(self, path: Path) -> Embedding:
         """The memory's embedding, made again from its configuration; nothing is embedded.
 
-        Raises EmbeddingMismatchError for a user's own embedding, which has no configuration, and for one that is gone.
+        Raises EmbeddingMismatchError for a user's own embedding, which has no configuration.
         """
-        made = self.embedding
-        if made.gone:
-            raise gone_embedding(path, made)
-        if made.configuration is not None:
-            return from_configuration(made.configuration)
-        found = guess(made.name, made.dimension, made.fingerprint, self.sensor)
-        if found is None:
+        if self.embedding.configuration is None:
             raise EmbeddingMismatchError(
-                f"{path} was made with embedding {made}, which does not ship with scroll-tactile: pass the one that "
-                "made it, TactileLearner.open(path, embedding=...), or carry the memory over to the default one: "
-                f"scroll-tactile memory reembed {path} --default"
+                f"{path} was made with embedding {self.embedding}, which does not ship with scroll-tactile: pass the "
+                "one that made it, TactileLearner.open(path, embedding=...), or carry the memory over to the default "
+                f"one: scroll-tactile memory reembed {path} --default"
             )
-        return found
+        return from_configuration(self.embedding.configuration)
 
-    def require_current(self, path: Path, embedding: Embedding | None, mode: Literal["write", "read"]) -> None:
-        """Raise EmbeddingMismatchError or MismatchError for a memory made with what this version cannot make.
-
-        embedding: that it is opened with, if any: one that has the memory's fingerprint is the user's own. With an
-        AbsentEmbedding it can be read, and not written.
-        """
-        absent = isinstance(embedding, AbsentEmbedding)
-        if absent and mode == "read":
-            return
-        own = embedding is not None and not absent and embedding.fingerprint == self.embedding.fingerprint
-        if self.embedding.gone and not own:
-            raise gone_embedding(path, self.embedding)
-        self.require_copies(path)
-
-    def require_copies(self, path: Path) -> None:
-        """Raise MismatchError for a memory made with copies that this version cannot make."""
-        if self.gone_copies:
-            raise gone_copies(path, self.gone_copies)
-
-    def require(self, path: Path, sensor: Sensor | None, augmentation: Augmented | None) -> None:
-        """Raise MismatchError for a sensor or an augmentation, if given, that the memory was not made with."""
+    def require(
+        self,
+        path: Path,
+        sensor: Sensor | None,
+        augmentation: Augmented | None,
+        exemplars: int | None,
+        recall: int | None,
+    ) -> None:
+        """Raise MismatchError for anything, where it is given, that the memory was not made with."""
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -297,6 +217,16 @@ class Identity(_Kept):
             raise MismatchError(
                 f"{path} was made with {made}; it was opened with {augmentation!r}. "
                 "Its touches were not observed with those copies: leave the augmentation out, or take another path"
+            )
+        if exemplars not in (None, self.exemplars):
+            raise MismatchError(
+                f"{path} was made with exemplars={self.exemplars}; it was opened with {exemplars}. Readings that were "
+                "not kept are gone: leave exemplars out"
+            )
+        if recall not in (None, self.recall):
+            raise MismatchError(
+                f"{path} was made with recall={self.recall}; it was opened with {recall}. Which touches are kept is a "
+                "function of all that were observed: leave recall out"
             )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
@@ -314,10 +244,11 @@ class Identity(_Kept):
     def require_plan(self, path: Path, embedding: Embedding) -> None:
         """Raise MismatchError for an embedding that reads other windows, or a memory of another grid."""
         plan = window_plan(self.sensor, embedding)
-        if self.reading is not None and self.reading != (plan.partial, plan.judged):
+        made, reads = [*self.reading, self.views], [plan.partial, plan.judged, bool(plan.whole)]
+        if made != reads:
             raise EmbeddingMismatchError(
-                f"{path} was made with an embedding whose partial_windows and judged_scales are {list(self.reading)}; "
-                f"it was opened with one whose are {[plan.partial, plan.judged]}. Open it with those"
+                f"{path} was made with an embedding whose partial_windows, judged_scales and reads_whole_touches are "
+                f"{made}; it was opened with one whose are {reads}. Open it with those"
             )
         grid = Grid(bits=BITS, scales=plan.widths, frames=plan.frames)
         if self.grid != grid:
@@ -335,19 +266,17 @@ class AbsentEmbedding:
         self.name, self.dimension, self.bound = made.name, made.dimension, made.bound
         self.fingerprint = made.fingerprint
         self._identity, self._path = identity, path
-        partial, judged = identity.reading or (True, "all")
-        kernels = made.bare or (made.configuration is None and made.name == LIKELY_EXACT)
+        partial, judged = identity.reading
         self.capabilities = Capabilities(
             partial_windows=partial,
             judged_scales=judged,
-            reads_whole_touches=identity.views or (kernels and not identity.gone_copies),
+            reads_whole_touches=identity.views,
             embeds_windows=True,
-            exact=kernels or made.gone,  # mostly; where its readings alone are there, `_made` says what to do
+            exact=made.bare,
         )
 
     @cached_property
     def _made(self) -> Embedding:
-        self._identity.require_copies(self._path)
         made = self._identity.own_embedding(self._path)
         self._identity.require_embedding(self._path, made)
         return made

@@ -237,7 +237,7 @@ class Incoming:
         source = self.source
         if not source.is_packed or source.compacted:
             return None
-        if memory.kept is not None and (Identity.read(source).recall or 0) != memory.kept.capacity:
+        if memory.kept is not None and Identity.read(source).recall != memory.kept.capacity:
             return None
         return sums_without(source, memory, {head.sequence for head in self.left_out})
 
@@ -291,7 +291,7 @@ def _descriptions(
     ours: Store, memory: Memory, theirs: MemoryStore, base: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
-    theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes.get("descriptions", {})))
+    theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes["descriptions"]))
     for head in theirs.heads(0 if base is None else base.upto):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
@@ -310,25 +310,23 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
     if same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)
-    for part in ("sensor", "embedding", "reading", "grid", "augmentation"):
+    for part in ("sensor", "embedding", "reading", "views", "grid", "augmentation"):
         own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
         if own != incoming:
             raise MismatchError(
-                f"{theirs.path} cannot be merged into {ours.path}: their {part}s differ. Here it is "
+                f"{theirs.path} cannot be merged into {ours.path}: their {part.removesuffix('s')}s differ. Here it is "
                 f"{_formatted(own)}, there {_formatted(incoming)}. Merge memories of one sensor and one embedding"
             )
-    other.require_copies(theirs.path)
     whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
     if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
         raise MismatchError(
             f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
             f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
         )
-    older = other.recall is None and not other.views  # than recall: what it compacted is of no kept touch
-    if whole and memory.kept is not None and not older and (other.recall or 0) != memory.kept.capacity:
+    if whole and memory.kept is not None and mine.recall != other.recall:
         raise MismatchError(
-            f"{theirs.path} was compacted and keeps {other.recall or 0} touches for recall; {ours.path} keeps "
-            f"{memory.kept.capacity}, and the readings for the others are gone"
+            f"{theirs.path} was compacted and keeps {other.recall} touches for recall; {ours.path} keeps "
+            f"{mine.recall}, and the readings for the others are gone"
         )
 
 
@@ -343,7 +341,7 @@ def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int])
 
 
 def _without_configuration(part: Any) -> Any:
-    """The part of an identity, of an embedding without its configuration: older memories have none."""
+    """The part of an identity, of an embedding without its configuration: its weights' file may have any name."""
     return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from copy import copy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from scroll_tactile.memory.buffer import candidates_of
+from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, standing
 from scroll_tactile.memory.state import Memory
-from store import DamageError, Store
+from store import DamageError, Head, Store
 from store.archive import write_archive
 from store.exceptions import reported
 
@@ -32,39 +33,43 @@ def pack_memory(
     packed = copy(memory)
     packed.tuned, packed.tuned_upto, packed.retracted, packed.excluded = None, 0, set(), set()
     if not readings:
-        identity = {name: value for name, value in identity.items() if name != "recall"} | {"exemplars": [0, None]}
+        identity |= {"exemplars": 0, "recall": 0}
         packed.kept = packed.exemplars = None
         packed.capacity = 0
     with reported(path, "packing a memory"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.", suffix=".partial") as folder,
-            Store.open(folder, identity=identity) as into,
-        ):
-            places = {}
+        made = TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.", suffix=".partial")
+    with made as folder:
+        with Store.open(folder, identity=identity) as into:
             with into.batch():
-                for head in heads:
-                    said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
-                    said |= {} if source is None or SOURCE in said else {SOURCE: source}
-                    arrays = store.record(head.sequence).arrays if with_rows else None
-                    row = into.append(head.kind, head.label, head.key, attributes=said, arrays=arrays, time=head.time)
-                    places[head.sequence] = row
+                touches = [_append(into, store, head, source, arrays=with_rows, readings=readings) for head in heads]
                 for material, constituents in memory.descriptions.items():
                     into.append(DESCRIBE, material, b"", attributes={"constituents": constituents})
             if with_rows:
                 if packed.exemplars is not None:
-                    packed.exemplars = memory.of_nothing().exemplars
-                    assert packed.exemplars is not None
-                    packed.exemplars.update(
-                        (row.label, row.key, row.sequence) for row in places.values() if "nbytes" in row.attributes
-                    )
+                    packed.exemplars = _among(touches, memory)
                 written, attributes = packed.to_arrays()
                 into.commit(written, upto=into.last, attributes=attributes)
             else:
-                candidates = candidates_of(memory, store) if readings else []
-                written, attributes = packed.to_arrays(into.last, candidates)
+                written, attributes = packed.to_arrays(into.last, candidates_of(memory, store) if readings else [])
                 into.compact(written, upto=into.last, attributes=attributes)
-            write_archive(Path(folder), path)
+        write_archive(Path(folder), path)
+
+
+def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
+    """Append a touch to a packed memory; its row there. Raises StoreError."""
+    said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
+    said |= {} if source is None or SOURCE in said else {SOURCE: source}
+    own = store.record(head.sequence).arrays if arrays else None
+    return into.append(head.kind, head.label, head.key, attributes=said, arrays=own, time=head.time)
+
+
+def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
+    """The exemplars among some touches, as a memory of this making has them."""
+    exemplars = memory.of_nothing().exemplars
+    if exemplars is not None:
+        exemplars.update((head.label, head.key, head.sequence) for head in touches if "nbytes" in head.attributes)
+    return exemplars
 
 
 def sums_without(source: MemoryStore, memory: Memory, left_out: Collection[int]) -> Memory | None:

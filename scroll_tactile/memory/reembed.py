@@ -116,7 +116,7 @@ class Reembedding:
         self._snapshot()
         folder, upto = self._source.path.resolve(), self._draft.last  # resolved: a link goes on leading to the memory
         for store in (self._draft, self._source):
-            store.close()  # SQLite removes files by their names when it closes
+            store.close()
         whole, before, count = _named(folder, "reembedded"), _named(folder, "before"), 1
         while before.exists():
             before, count = _named(folder, f"before-{count + 1}"), count + 1
@@ -170,5 +170,5 @@ def _require_readings(store: Store) -> None:
         return
     raise MismatchError(
         f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "
-        "the embedding that made it, where that is gone with the version that had it, or touch again what it knows"
+        "the embedding that made it, or touch again what it knows"
     )

@@ -24,6 +24,7 @@ from scroll_tactile.memory.expected import (
     whole,
 )
 from scroll_tactile.memory.rows import (
+    CODES,
     DESCRIBE,
     KINDS,
     LARGEST,
@@ -42,7 +43,7 @@ from scroll_tactile.memory.rows import (
 )
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
-from scroll_tactile.signals.windows import EARLIER, MOST_WINDOWS, WindowPlan
+from scroll_tactile.signals.windows import MOST_WINDOWS, WindowPlan
 from store import Head, Record
 
 __all__ = ["RowChecks", "check_description", "check_readings"]
@@ -50,18 +51,18 @@ __all__ = ["RowChecks", "check_description", "check_readings"]
 ITEM = np.dtype(np.float32).itemsize
 SMALLEST = -149  # the exponent of the smallest float32
 POWER = re.compile(rf"{WHOLE}(-?[0-9]{{1,3}})")
-WINDOWS = re.compile(r"(stages|codes|values|places)-([0-9]{1,9})")
+SCALE = re.compile(rf"{CODES}([1-9][0-9]{{0,8}})")
 
 
 class RowChecks:
     """The checks of journal rows of one sensor, dimension and plan of windows.
 
-    copies: of each touch, whose rows lie behind its own; None where nobody knows how many.
+    copies: of each touch, whose rows lie behind its own.
 
     Each raises Unexpected; MismatchError for kinds and arrays that this version does not know.
     """
 
-    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, copies: int | None) -> None:
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, copies: int) -> None:
         self._sensor, self._dimension, self._plan, self._copies = sensor, dimension, plan, copies
         self._expected = lru_cache(256)(self._rows_of)
 
@@ -114,57 +115,30 @@ class RowChecks:
             expect(same, "key", "the content hash of its readings", record.key)
 
     def _check_codes(self, arrays: Arrays, columns: int) -> None:
-        found: dict[str, dict[int, int]] = {"stages": {}, "codes": {}}
-        for field in arrays:
-            match = WINDOWS.fullmatch(field)
-            if match is not None and match[1] != "places":
-                layout, number = ("codes" if match[1] == "values" else match[1]), int(match[2])
-                expect(number not in found[layout], field, "one array for each scale", field)
-                found[layout][number] = self._check_scale(arrays, match[1], number)
-        expect(not (found["stages"] and found["codes"]), "stages", "one way of packing", sorted(arrays))
-        expect(bool(any(found.values()) or only_readings(arrays)), "arrays", "codes or readings", sorted(arrays))
-        if not any(found.values()):
+        found = {int(match[1]): field for field in arrays if (match := SCALE.fullmatch(field))}
+        expect(bool(found or only_readings(arrays)), "arrays", "codes or readings", sorted(arrays))
+        if not found:
             return
-        staged, windows = self._expected(columns)
-        own, rows = (staged, found["stages"]) if found["stages"] else (windows, found["codes"])
-        for number, count in rows.items():
-            if number in EARLIER:  # passed over
-                continue
-            expect(number in own, f"scale {number}", f"scales {sorted(own)} of a touch of {columns} columns", number)
-            more = count if self._copies is None else self._copies * MOST_WINDOWS * len(self._plan.milestones())
-            fits = own[number] <= count <= own[number] + more
-            expect(fits, f"scale {number}", f"{own[number]} rows of {columns} columns, and those of copies", count)
-        views = {int(view) for view in self._plan.views}  # which earlier versions had none of
-        needed = set(own) - (set() if views & set(rows) else views)
-        expect(needed <= set(rows), "scales", f"all of {sorted(needed)}", sorted(rows))
-
-    def _check_scale(self, arrays: Arrays, layout: str, number: int) -> int:
-        """The rows of a scale whose codes are within the grid."""
-        field = f"{layout}-{number}"
-        if layout != "values":
+        own = self._expected(columns)
+        expect(set(found) == set(own), "scales", f"{sorted(own)} of a touch of {columns} columns", sorted(found))
+        copies = self._copies * MOST_WINDOWS * len(self._plan.milestones())
+        for number, field in found.items():
             rows = array(arrays, field, ("int32",), (None, self._dimension))
             codes(field, rows)
-            return len(rows)
-        values = array(arrays, field, ("int32",), (None,))
-        codes(field, values)
-        kinds = ("uint8", "uint16", "uint32", "int64")
-        places = array(arrays, f"places-{number}", kinds, (self._dimension, None))
-        inside = not places.size or (places.min() >= 0 and places.max() < len(values))
-        expect(inside, f"places-{number}", f"places among {len(values)} values", "others")
-        return int(places.shape[1])
+            fits = own[number] <= len(rows) <= own[number] + copies
+            expect(fits, field, f"{own[number]} rows of {columns} columns, and those of copies", len(rows))
 
-    def _rows_of(self, columns: int) -> tuple[dict[int, int], dict[int, int]]:
-        """Of a touch of so many columns, by the number of the scale: its rows of stages, and its windows."""
-        staged: dict[int, int] = {}
+    def _rows_of(self, columns: int) -> dict[int, int]:
+        """How many rows a touch of so many columns has, by the number of the scale."""
+        found: dict[int, int] = {}
         for stage in self._plan.scored_stages(columns):
             for scale, groups in stage.items():
-                staged[int(scale)] = staged.get(int(scale), 0) + len(groups)
-        return staged, {int(width): len(starts) for width, starts in self._plan.extent(columns).items()}
+                found[int(scale)] = found.get(int(scale), 0) + len(groups)
+        return found
 
 
 def _is_known(field: str) -> bool:
-    plain = field in ("readings", SHAPE, ZERO, REST)
-    return plain or POWER.fullmatch(field) is not None or WINDOWS.fullmatch(field) is not None
+    return field in (SHAPE, ZERO, REST) or any(pattern.fullmatch(field) for pattern in (POWER, SCALE))
 
 
 def _check_spans(pairs: Any, sequence: int, most_rows: int) -> None:
@@ -194,12 +168,10 @@ def _unpacked(packed: Arrays, size: int, sensor: Sensor) -> npt.NDArray[np.float
     """The readings of a row, whose arrays are looked at before anything is made of them."""
     count = size // (ITEM * sensor.channels)
     shape = (count, *sensor.shape)
-    powers = [field for field in packed if field not in ("readings", SHAPE, ZERO, REST)]
-    one_way = len(packed) == 1 if "readings" in packed or powers else set(packed) == {SHAPE, ZERO, REST}
+    powers = [field for field in packed if field not in (SHAPE, ZERO, REST)]
+    one_way = len(packed) == 1 if powers else set(packed) == {SHAPE, ZERO, REST}
     expect(one_way, "readings", "one way of packing", sorted(packed))
-    if "readings" in packed:
-        array(packed, "readings", ("float32",), shape)
-    elif powers:
+    if powers:
         power = int(powers[0].removeprefix(WHOLE))
         whole(powers[0], power, SMALLEST, LARGEST)
         array(packed, powers[0], ("uint8", "int8", "int16"), (*shape[1:], count))

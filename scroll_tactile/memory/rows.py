@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError, StreamError
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import EARLIER, Scale, WindowPlan
-from scroll_tactile.statistics.sample import stage_rows
+from scroll_tactile.signals.windows import Scale
 from store import Head
 
 __all__ = [
@@ -38,14 +37,13 @@ __all__ = [
     "standing",
     "unpack_codes",
     "unpack_readings",
-    "unpack_windows",
     "unspanned",
 ]
 
 OBSERVE = "observe"  # a stream was observed; see below
 RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
 MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
-MEMBER = "felt"  # a stream that such a memory had observed: its name and hash alone ("felt" is the word on disk)
+MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
@@ -60,7 +58,7 @@ Added = tuple[str, Codes, int]
 """A material, the rows of codes of a touch of it by scale, and 1 where they came or −1 where they were retracted."""
 
 MOST_BYTES = 2**28  # of the readings of a touch as float32: a row is read into memory whole
-CODES = "stages-"  # and a scale
+CODES = "codes-"  # and a scale
 WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
 SHAPE, ZERO, REST = "readings-shape", "readings-zero", "readings-rest"
 MANTISSA, LARGEST = 24, 128  # bits of a float32's mantissa, and its largest exponent
@@ -106,7 +104,7 @@ def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
 
 
 def unpack_readings(arrays: Arrays) -> Readings | None:
-    """The readings that `pack_readings` packed, or that an earlier version kept as they are; None without any."""
+    """The readings that `pack_readings` packed, or that lie in a base as they are; None without any."""
     if "readings" in arrays:
         return arrays["readings"]
     if REST in arrays:
@@ -131,48 +129,25 @@ def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:
 
 
 def unpack_codes(arrays: Arrays) -> Codes:
-    """The codes that `pack_codes` packed; none where the row has readings alone, or is an earlier version's."""
-    return {scale: arrays[name] for name, scale in _scales(arrays, CODES)}
+    """The codes that `pack_codes` packed; none where the row has readings alone."""
+    numbers = {name: int(name.removeprefix(CODES)) for name in arrays if name.startswith(CODES)}
+    return {Scale.numbered(number): arrays[name] for name, number in numbers.items()}
 
 
-def unpack_windows(arrays: Arrays) -> Codes:
-    """The codes of all windows by scale, which rows of earlier versions hold: as they are, or places among values."""
-    plain = {scale: arrays[name] for name, scale in _scales(arrays, "codes-")}
-    placed = {
-        scale: np.ascontiguousarray(arrays[name][arrays[f"places-{scale}"].T]).astype(np.int32)
-        for name, scale in _scales(arrays, "values-")
-    }
-    return dict(sorted((plain | placed).items()))
+def row_codes(arrays: Arrays, encode: Encode | None) -> Codes:
+    """The rows of codes that a touch added, by scale, from the arrays of its journal row.
 
-
-def row_codes(arrays: Arrays, columns: int, plan: WindowPlan, encode: Encode | None) -> Codes:
-    """The rows of codes that a touch of so many columns added, by scale, from the arrays of its journal row.
-
-    encode: embeds readings where the row has nothing else. Where it holds the windows of an earlier version, and copies
-    or views belong beside them, the readings are embedded again; where that cannot be, the touch counts without those.
-
-    Raises MismatchError where the row cannot be read without its embedding.
+    encode: embeds readings where the row has nothing else; None raises MismatchError there.
     """
     if codes := unpack_codes(arrays):
         return codes
-    windows, readings = unpack_windows(arrays), unpack_readings(arrays)
-    own = {Scale("window", width): len(starts) for width, starts in plan.extent(columns).items()}
-    alone = all(len(windows[scale]) == count for scale, count in own.items() if scale in windows)
-    if readings is not None and encode is not None and not (windows and alone and not plan.views):
-        return encode(readings)
-    if not windows:
+    readings = unpack_readings(arrays)
+    if readings is None or encode is None:
         raise MismatchError(
             "a row of the journal holds readings alone, and they can be embedded only by the embedding that made the "
             "memory: open it with TactileLearner.open(path, embedding=...)"
         )
-    judging = {scale: windows[scale][:count] for scale, count in own.items()}
-    return {**windows, **stage_rows(plan.scored_stages(columns), judging)}
-
-
-def _scales(arrays: Arrays, prefix: str) -> list[tuple[str, Scale]]:
-    """The names of the arrays with this prefix, each with its scale; not those of scales that are gone."""
-    numbers = {name: int(name.removeprefix(prefix)) for name in arrays if name.startswith(prefix)}
-    return [(name, Scale.numbered(number)) for name, number in numbers.items() if number not in EARLIER]
+    return encode(readings)
 
 
 def retracted_by(rows: Iterable[Head]) -> set[int]:

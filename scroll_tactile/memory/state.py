@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.earlier import sample_of_windows
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import (
@@ -311,7 +310,7 @@ class Memory:
                 fresh.exemplars.update(item for item in self.exemplars if item[:2] in compacted)
             return fresh
         if base is not None:
-            fresh._take_from(base, store)
+            fresh._take(base.arrays, base.attributes, 0)
         return fresh
 
     def _counted(self, store: Store, upto: int) -> Counter[tuple[str, bytes]]:
@@ -324,28 +323,11 @@ class Memory:
         )
 
     def gone(self, retractions: Iterable[Head], upto: int) -> set[int]:
-        """The observations that count no more at a row, by the journal: a base of version 0.6 may not know all of them.
+        """The observations that count no more at a row, by the journal and by the memory itself.
 
-        What the memory itself knows counts, too: a retraction may have been lost to damage since.
+        The base was made without what a later row retracts of it, and a retraction may have been lost to damage since.
         """
-        found = list(retractions)
-        # The base was made without whatever any row retracts of it: `compact` may keep the row that does.
-        of_base = {row for row in retracted_by(found) if row <= self.base}
-        return retracted_by(head for head in found if head.sequence <= upto) | of_base | self.retracted | self.excluded
-
-    def _take_from(self, generation: Checkpoint, store: Store) -> None:
-        """Take in a generation of a store; what an earlier version wrote does not say how often a touch is there."""
-        self._take(generation.arrays, generation.attributes, 0)
-        if "copies" in generation.attributes or not len(self.sample):
-            return
-        try:
-            counted = self._counted(store, generation.upto)
-        except DamageError as damage:
-            logger.warning("%s; what was observed several times counts once in the calibration", damage)
-            return
-        for name, key, touch in self.sample:
-            if (more := counted[name, key] - touch.copies) > 0:
-                self.sample.add(name, key, replace(touch, copies=more))
+        return retracted_by(head for head in retractions if head.sequence <= upto) | self.retracted | self.excluded
 
     def require_base(self, store: Store) -> None:
         """Raise CompactedError where the store was compacted since this memory was read."""
@@ -355,7 +337,7 @@ class Memory:
     def codes(self, record: Record) -> tuple[int, Codes]:
         """The columns of an observation, and its rows of codes by scale."""
         columns = cast(int, record.attributes["columns"])
-        return columns, row_codes(record.arrays, columns, self.plan, self.encode)
+        return columns, row_codes(record.arrays, self.encode)
 
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes)
@@ -387,8 +369,7 @@ class Memory:
         """Arrays and attributes of a generation.
 
         base_at: of a base, whose rows can no longer be retracted. candidates: those for exemplars, with their readings,
-        for a base and for what leaves the journal behind. "pool" (the sample) and "withdrawn" (`retracted`) are the
-        names that memories on disk have always had.
+        for a base and for what leaves the journal behind.
         """
         arrays, names = self.statistics.to_arrays()
         sampled, materials = self.sample.to_arrays()
@@ -396,9 +377,8 @@ class Memory:
             "dimension": self.statistics.dimension,
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
-            "pool": materials,
+            "sample": materials,
             "copies": [touch.copies for *_, touch in self.sample],
-            "capacity": [self.capacity, None],  # version 0.1 had a limit in bytes beside it
             "tuned_upto": self.tuned_upto,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
@@ -410,7 +390,7 @@ class Memory:
         retracted = sorted(self.retracted if base_at is None else ())
         base = self.base if base_at is None else base_at
         excluded = sorted(row for row in self.retracted | self.excluded if row <= base)
-        arrays["withdrawn"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
+        arrays["retracted"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         if self.exemplars is not None:
             own, attributes["exemplars"] = (
                 self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
@@ -447,27 +427,14 @@ class Memory:
         self.base = store.compacted
         # Without a sound generation the base raises what is lost; without a base the journal has every row.
         newest = store.latest()
-        # What an earlier version wrote counts windows, where a row that is retracted takes out what stages count, or
-        # has no views or kept touches, which the rows give that hold readings.
-        current = newest is None or (
-            "pool-sums" not in newest.arrays
-            and all(int(scale) in cast("list[int]", newest.attributes["scales"]) for scale in self.plan.scales)
-            and (self.kept is None or "kept" in newest.attributes)
-        )
-        earlier = None if current else newest
-        start = store.base() if newest is None or earlier is not None else newest
+        start = store.base() if newest is None else newest
         if start is not None:
-            self._take_from(start, store)
+            self._take(start.arrays, start.attributes, 0)
             self.sequence = start.upto
         self.generation = None if newest is None else newest.number
-        self.saved = self.sequence if earlier is None else 0
+        self.saved = self.sequence
         for record in store.records(after=self.sequence):
-            if earlier is not None and record.sequence > earlier.upto:
-                self.take_tuned(earlier)
-                earlier = None
             self.replay(record, store)
-        if earlier is not None:
-            self.take_tuned(earlier)
         self.refill(store)
         logger.info("%s: generation %s, and rows up to %d", store.path, self.generation, self.sequence)
         return self
@@ -494,14 +461,13 @@ class Memory:
     def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
         names, scales = attributes["materials"], self.plan.scales
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        sample = TouchSample.from_arrays(arrays, attributes["pool"], attributes.get("copies"))
-        self.sample = sample_of_windows(sample, attributes["scales"], self.plan)
-        if self.kept is not None and "kept" in attributes:
+        self.sample = TouchSample.from_arrays(arrays, attributes["sample"], attributes["copies"])
+        if self.kept is not None:
             self.kept.fill(arrays, attributes["kept"])
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity, source)
-        self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("withdrawn", "excluded"))
-        self.descriptions = dict(attributes.get("descriptions", {}))  # made before there were any
+        self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("retracted", "excluded"))
+        self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
         self._take_tuned(arrays, attributes)
 
     def take_tuned(self, generation: Checkpoint) -> None:

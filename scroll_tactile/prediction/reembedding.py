@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.identity import Identity, usual_embedding, usual_recall
+from scroll_tactile.memory.identity import Identity, usual_recall
 from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
@@ -29,16 +29,10 @@ def reembed_memory(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Path:
-    """As `TactileLearner.reembed`, with the memory in a folder, also where the embedding that made it is gone.
-
-    A memory whose embedding only an earlier version can make has then the default one, unless another is given. One
-    with copies that only an earlier version can make has none.
-    """
+    """As `TactileLearner.reembed`, with the memory in a folder, also where its own embedding is not at hand."""
     finish_interrupted(Path(path))
     with MemoryStore.open(path) as store:
-        made, chosen = Identity.read(store), embedding
-        if chosen is None:
-            chosen = usual_embedding(made.sensor) if made.embedding.gone else made.own_embedding(store.path)
+        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
         carried = reembedding(store, chosen)
         try:
             carried.copy(progress or (lambda what, done, of: None))
@@ -50,11 +44,10 @@ def reembed_memory(
 def reembedding(store: Store, embedding: Embedding) -> Reembedding:
     """What carries the memory in a store over to another embedding."""
     made = Identity.read(store)
-    exemplars = made.exemplar_count(store, None)
-    kept, usual = made.recall or 0, usual_kept(made.sensor) if made.views else 0
+    usual = usual_kept(made.sensor) if made.views else 0
     # As many as were asked for, none too; where nobody asked, as many as are usual with the embedding that it gets.
-    recall = usual_recall(made.sensor, embedding) if kept == usual else kept
-    identity = Identity.of(made.sensor, embedding, exemplars, made.augmentation, recall)
+    recall = usual_recall(made.sensor, embedding) if made.recall == usual else made.recall
+    identity = Identity.of(made.sensor, embedding, made.exemplars, made.augmentation, recall)
     keeping = Keeping(made.sensor, recall)
     plan = window_plan(made.sensor, embedding)
     extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
@@ -65,6 +58,8 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
         return image.shape[1], extractor.codes(image, touch.key)
 
     def load(draft: Store) -> Memory:
-        return Memory.load(draft, embedding.dimension, plan, exemplars, lambda readings: encode(readings)[1], keeping)
+        return Memory.load(
+            draft, embedding.dimension, plan, made.exemplars, lambda readings: encode(readings)[1], keeping
+        )
 
     return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)

@@ -10,8 +10,8 @@ so that all of its scores follow from products with K⁻¹ of its rows and of th
 covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
 matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
 
-A touch of which the statistics hold more rows than the sample (copies; windows, in a memory that an earlier version
-compacted) leaves with as many of its own: one that was observed several times leaves with all of them.
+A touch of which the statistics hold more rows than the sample (copies) leaves with as many of its own: one that was
+observed several times leaves with all of them.
 """
 
 from __future__ import annotations

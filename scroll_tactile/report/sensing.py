@@ -70,7 +70,7 @@ def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> s
     if not kept:
         return note(
             "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
-            "made with recall=0, or compacted before version 0.3."
+            "made with recall=0."
         )
     found = _channels(sensor, kept, ordered)
     means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)

@@ -18,7 +18,6 @@ import numpy as np
 from scroll_tactile.sensors import Sensor
 
 __all__ = [
-    "EARLIER",
     "ENOUGH",
     "FRAMES",
     "MOST_WINDOWS",
@@ -47,11 +46,6 @@ FRAMES = 160  # columns of a camera's frame in its tactile image, at most
 
 Extent = dict[int, list[int]]  # width of windows → their first columns
 
-EARLIER = frozenset(range(4))
-"""Numbers of scales on disk that only versions up to 0.3 wrote, and no other may have: of noisy copies (0 and 3), of
-beginnings (1) and of sampled readings (2)."""
-
-
 VIEWS = {"whole": 2**20, "shape": 2**20 + 1}  # their numbers on disk: no window is as wide
 
 
@@ -70,7 +64,7 @@ class Scale:
 
     @classmethod
     def numbered(cls, number: int) -> Scale:
-        """The scale of a number on disk, which is none of `EARLIER`."""
+        """The scale of a number on disk."""
         return {int(view): view for view in (WHOLE, SHAPE)}.get(number) or cls("window", number)
 
     def __hash__(self) -> int:

@@ -79,12 +79,6 @@ class SampledTouch:
                 pairs.append((stage, place, len(codes[scale])))
         return cls(np.stack(rows).astype(np.int32), np.array(pairs))
 
-    @classmethod
-    def of_sums(cls, sums: npt.NDArray[np.int32], pairs: npt.NDArray[np.int64]) -> SampledTouch:
-        """The sampled touch that an earlier version kept: sums of windows, and how many in the third column."""
-        rows = [mean_code(total, windows) for total, windows in zip(sums, pairs[:, 2].tolist(), strict=True)]
-        return cls(np.array(rows, dtype=np.int32).reshape(sums.shape), pairs)
-
 
 class Sample(Generic[T]):
     """At most `capacity` items of all materials: a function of the set observed.
@@ -202,24 +196,20 @@ class TouchSample(Sample[SampledTouch]):
         """What a store keeps: arrays by name, and the material of each touch."""
         touches = [touch for *_, touch in self]
         return {
-            "pool-keys": np.array([list(key) for _, key, _ in self] or [[]], np.uint8)[: len(self)],
-            "pool-sizes": np.array([len(touch.pairs) for touch in touches], dtype=np.int64),
-            "pool-pairs": np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)]),
-            "pool-rows": np.concatenate([t.rows for t in touches]) if touches else np.zeros((0, 0), np.int32),
+            "sample-keys": np.array([list(key) for _, key, _ in self] or [[]], np.uint8)[: len(self)],
+            "sample-sizes": np.array([len(touch.pairs) for touch in touches], dtype=np.int64),
+            "sample-pairs": np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)]),
+            "sample-rows": np.concatenate([t.rows for t in touches]) if touches else np.zeros((0, 0), np.int32),
         }, [material for material, *_ in self]
 
     @classmethod
     def from_arrays(
-        cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str], copies: Sequence[int] | None = None
+        cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str], copies: Sequence[int]
     ) -> TouchSample:
-        """The sample that `to_arrays` described, of this version or an earlier one; copies: of each touch, else one."""
+        """The sample that `to_arrays` described; copies: of each touch."""
         sample = cls()
-        edges = np.cumsum(arrays["pool-sizes"])[:-1]
-        summed = "pool-sums" in arrays
-        rows = np.split(arrays["pool-sums" if summed else "pool-rows"], edges)
-        pairs = np.split(arrays["pool-pairs"], edges)
-        made = SampledTouch.of_sums if summed else SampledTouch
+        edges = np.cumsum(arrays["sample-sizes"])[:-1]
+        rows, pairs = np.split(arrays["sample-rows"], edges), np.split(arrays["sample-pairs"], edges)
         for i, material in enumerate(materials):
-            touch = replace(made(rows[i], pairs[i]), copies=1 if copies is None else copies[i])
-            sample.add(material, arrays["pool-keys"][i].tobytes(), touch)
+            sample.add(material, arrays["sample-keys"][i].tobytes(), SampledTouch(rows[i], pairs[i], copies[i]))
         return sample

@@ -276,28 +276,15 @@ class Statistics:
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
     ) -> Statistics:
-        """The statistics that `to_arrays` described, of this version or an earlier one; the arrays are taken over.
-
-        Earlier ones kept three folds apart: second moments of their own, and an axis more of the others. They add up.
-        They have none of some scales.
-        """
+        """The statistics that `to_arrays` described; the arrays are taken over."""
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
-        statistics._observations = _joined(arrays["observations"], 1)
+        statistics._observations = arrays["observations"]
         statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
         for scale in statistics.scales:
-            if f"rows-{scale}" not in arrays:
-                statistics._rows[scale] = np.zeros(len(names), dtype=np.int64)
-                statistics._sums[scale] = np.zeros((len(names), dimension), dtype=np.int64)
-                continue
-            statistics._rows[scale] = _joined(arrays[f"rows-{scale}"], 1)
-            statistics._sums[scale] = _joined(arrays[f"sums-{scale}"], 2)
-            found = [f"second-{scale}", *(f"second-{scale}-{fold}" for fold in range(3))]
-            moments = [arrays[name] for name in found if name in arrays]
-            if moments:
-                rows = int(statistics._rows[scale].sum())
-                packed = moments[0] if len(moments) == 1 else np.sum(moments, axis=0)
-                statistics._seconds[scale] = SecondMoment.of(packed, rows, dimension)
+            statistics._rows[scale], statistics._sums[scale] = arrays[f"rows-{scale}"], arrays[f"sums-{scale}"]
+            if rows := int(statistics._rows[scale].sum()):
+                statistics._seconds[scale] = SecondMoment.of(arrays[f"second-{scale}"], rows, dimension)
         return statistics
 
 
@@ -334,9 +321,3 @@ class Snapshot:
             if name in self._kept:
                 found[i] = self._kept[name][scale][1]
         return found
-
-
-def _joined(array: IntArray, axes: int) -> IntArray:
-    """An array of so many axes; of one more, the second was that of the folds."""
-    joined: IntArray = array if array.ndim == axes else array.sum(axis=1)
-    return joined

@@ -11,8 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision, sensors
-from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration, guess
+from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
+from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import EmbeddingError, WeightsError
@@ -178,58 +178,19 @@ class TestWeights:
         with pytest.raises(EmbeddingError, match="expected weights whose tensors have the SHA-256"):
             from_configuration(named)
 
-    def test_published_weights_are_named_and_memories_made_before_are_found(self, file, cache, monkeypatch):
+    def test_published_weights_are_named(self, file, cache, monkeypatch):
         name = f"resnet18-{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}.pth"
         file.rename(cache / name)
         monkeypatch.setitem(PUBLISHED, "resnet18", f"https://nowhere.invalid/{name}")
         for embedding in (Vision(), Joined(Kernels(dimension=64), Vision())):
             assert repr(from_configuration(configuration_of(embedding))) == repr(embedding)
-            found = guess(embedding.name, embedding.dimension, embedding.fingerprint, sensors.BIOTAC)
-            assert repr(found) == repr(embedding)
         assert configuration_of(Vision())["weights"]["name"] == "resnet18"
 
-    def test_damaged_published_weights_are_refused_and_nothing_is_fetched_for_a_guess(self, cache):
+    def test_damaged_published_weights_are_refused(self, cache):
         (cache / "resnet18-f37072fd.pth").write_bytes(b"not weights")
         published = VISION | {"weights": {"name": "resnet18", "sha256": "0" * 64}, "seed": None}
         with pytest.raises(WeightsError, match="is damaged"):
             from_configuration(published)
-        assert guess("vision", 448, "0" * 64, sensors.BIOTAC) is None
-
-
-class TestGuess:
-    @pytest.mark.parametrize(
-        ("embedding", "sensor"),
-        [
-            (Kernels(), sensors.BIOTAC),
-            (Kernels(dimension=64), sensors.BIOTAC),
-            (Frames(), sensors.GELSIGHT),
-            (Frames(rest=None), sensors.GELSIGHT),
-            (Frames(cosines=64), sensors.GELSIGHT),
-            (Maps(layout=(6, 10)), sensors.ROBOSKIN),
-            (Maps(layout=(19,)), sensors.BIOTAC),
-        ],
-        ids=repr,
-    )
-    def test_what_is_in_common_use_is_found_by_its_fingerprint(self, embedding, sensor):
-        found = guess(embedding.name, embedding.dimension, embedding.fingerprint, sensor)
-        assert repr(found) == repr(embedding)
-
-    @pytest.mark.parametrize(
-        ("name", "dimension", "fingerprint"),
-        [
-            ("kernels", 64, "0" * 64),
-            ("kernels", 10**9, ""),
-            ("kernels", 0, ""),
-            ("kernels", True, ""),
-            ("kernels", "64", ""),
-            (None, 64, ""),
-            ("mine", 64, ""),
-            ("robust kernels", 64, ""),
-            ("maps", 7, ""),
-        ],
-    )
-    def test_of_anything_else_it_finds_none(self, name, dimension, fingerprint):
-        assert guess(name, dimension, fingerprint, sensors.BIOTAC) is None
 
 
 IMPORTS = """

@@ -36,7 +36,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 from store.encoding import decode_payload, encode_payload
 
-KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "felt", "x", "", "OBSERVE")
+KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "member", "x", "", "OBSERVE")
 
 
 def forged_row(rng: random.Random, path: Path, scene: Scene) -> str:
@@ -51,7 +51,7 @@ def made_row(rng: random.Random, path: Path, scene: Scene) -> tuple[str, dict[st
     kind = rng.choice(KINDS)
     row: dict[str, Any] = {"kind": kind, "label": rng.choice(("a", "b", "new")), "key": rng.randbytes(32)}
     told = [kind]
-    if kind in ("observe", "merge", "felt"):
+    if kind in ("observe", "merge", "member"):
         told.append(_fill(rng, row, path, scene))
     elif kind == "retract":
         spans = (
@@ -106,7 +106,7 @@ def _fill(rng: random.Random, row: dict[str, Any], path: Path, scene: Scene) -> 
     """Give a row attributes and arrays of an observation, or of a generation, of which some are others."""
     attributes, payload = observation(path)
     way = rng.choice(("arrays", "arrays", "arrays", "payload", "payload", "attributes", "sound"))
-    if row["kind"] == "felt" and way != "sound":
+    if row["kind"] == "member" and way != "sound":
         way = "attributes"
     if row["kind"] == "merge":
         named = [row for other in scene.others for row in generations(other) if row.base]

@@ -23,7 +23,7 @@ VALUES = (*NUMBERS, *TEXTS, None, True, False, 0.5, -0.0, 1e308, 5e-324, float("
 VALUES += ([1], [None], {"x": 1}, [[1, 10**12]], [[1, 1], [1, 1]], [[5, 1]], [-1], {"a": {"b": [1, {"c": 2}]}})
 DTYPES = ("|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U3")
 NAMES = ("", "x", "readings", "readings-rest", "readings-shape", "readings-zero", "readings-2e-8", "readings-2e9999")
-NAMES += ("stages-15", "codes-15", "values-15", "places-15", "stages-x", "stages-1048576", "stages-99999", "stages--1")
+NAMES += ("codes-15", "codes-015", "codes-0", "codes-x", "codes-1048576", "codes-99999", "codes--1")
 NAMES += ("codes-" + "9" * 60, "zarr.json", "../x", "__x", "c", "READINGS", "exemplar-readings", "tuned-0", "a" * 100)
 
 

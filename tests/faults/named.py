@@ -134,8 +134,8 @@ def sizes() -> dict[str, Named]:
         return make
 
     large = zstd.compress(bytes(2**28), 1)
-    many = [Packed(f"stages-{i}", "|u1", (2**28,), 2, 2**28, large) for i in range(60)]
-    one = [Packed("stages-15", "<i4", (2**20, 64), 2, 2**28, large)]
+    many = [Packed(f"codes-{i}", "|u1", (2**28,), 2, 2**28, large) for i in range(60)]
+    one = [Packed("codes-15", "<i4", (2**20, 64), 2, 2**28, large)]
     made = {
         "one array": row(payload=pack(one, 2), attributes={"columns": 30}),
         "spans": row(kind="retract", label="", attributes={"sequences": [[1, 10**12]]}),

@@ -32,7 +32,7 @@ from scroll_tactile.pipelines.plain_export import export_plain
 from store import Store, StoreError, check_store, repair_store
 
 OURS = (ScrollTactileError, StoreError)
-DATA = Path(__file__).parents[1] / "data"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
 NEVER = 2**40
 TOUCHES: tuple[Operation, ...] = tuple(("observe", name, (i, 30)) for i in range(2) for name in "ab")
 HISTORIES: dict[str, tuple[Operation, ...]] = {
@@ -80,7 +80,7 @@ def glance(learner: TactileLearner) -> dict[str, Any]:
 
 
 def corpus(home: Path) -> list[Memory]:
-    """All memories, made in a folder: of this version, and those that earlier ones left in tests/data."""
+    """All memories, made in a folder, and the golden one of format 1."""
     made = []
     for name, history in HISTORIES.items():
         learner = opened(home / name)
@@ -97,12 +97,9 @@ def corpus(home: Path) -> list[Memory]:
             shutil.rmtree(home / name)
             (home / "copy").rename(home / name)
         made.append(Memory(name, home / name, earlier[-1], earlier[:-1]))
-    for store in sorted(DATA.glob("0.*/store")):
-        path = shutil.copytree(store, home / store.parent.name)
-        with TactileLearner.open(path) as learner:  # as this version writes it
-            learner.digest()
-        with TactileLearner.open(path, mode="read") as learner:
-            made.append(Memory(path.name, path, glance(learner)))
+    shutil.unpack_archive(GOLDEN, home / "golden")
+    with TactileLearner.open(home / "golden", mode="read") as learner:
+        made.append(Memory("golden", home / "golden", glance(learner)))
     return made
 
 

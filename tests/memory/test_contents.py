@@ -4,7 +4,6 @@ import copy
 import pickle
 import threading
 
-import numpy as np
 import pytest
 from forging import spoil_row
 from touches import SETTINGS, SmallSample, contents, fed, filled, require_same, stream
@@ -13,7 +12,6 @@ import scroll_tactile.memory.state
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.memory.contents import Contents
-from scroll_tactile.memory.state import Memory
 from store import StoreClosedError, StoreError, StoreFullError
 from store.log_writer import LogWriter
 
@@ -179,25 +177,6 @@ class TestChanges:
             assert not learner.observe(*_given(OBSERVED[1])).repeated
             require_same(learner, OBSERVED)
 
-    def test_a_memory_that_version_0_6_compacted_twice_knows_what_was_taken_back(self, tmp_path, monkeypatch):
-        to_arrays = Memory.to_arrays
-
-        def before(self, *words):
-            arrays, attributes = to_arrays(self, *words)
-            attributes = {name: value for name, value in attributes.items() if name != "copies"}
-            return arrays | {"excluded": np.zeros(0, np.int64)}, attributes
-
-        monkeypatch.setattr(Memory, "to_arrays", before)
-        learner, receipts = filled(tmp_path / "m", [*OBSERVED, *OBSERVED], again=True)
-        learner.retract(receipts[0])
-        learner.compact(keep=3)
-        learner.observe("a", stream((50, 60)))
-        learner.close()
-        monkeypatch.undo()
-        with TactileLearner.open(tmp_path / "m") as learner:
-            assert learner.observe(*_given(OBSERVED[0])).sequence == len(OBSERVED) + 1
-            assert _sample(learner) == _sample(many([*OBSERVED, *OBSERVED[1:], ("a", (50, 60))]))
-
     def test_what_a_damaged_retraction_took_back_is_learned_again(self, tmp_path):
         learner, receipts = filled(tmp_path / "m", OBSERVED)
         learner.retract(receipts[1])
@@ -304,21 +283,6 @@ class TestCopies:
         monkeypatch.undo()
         assert _sample(learner) == before
         assert not learner.observe("a", stream((90, 60))).repeated
-
-    def test_memories_of_versions_that_did_not_count_copies_are_counted_when_opened(self, tmp_path, monkeypatch):
-        to_arrays = Memory.to_arrays
-
-        def before(self, *words):
-            arrays, attributes = to_arrays(self, *words)
-            return arrays, {name: value for name, value in attributes.items() if name != "copies"}
-
-        monkeypatch.setattr(Memory, "to_arrays", before)
-        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-            for name, touch in MANY:
-                learner.observe(name, stream(touch), again=True)
-        monkeypatch.undo()
-        with TactileLearner.open(tmp_path / "m") as learner:
-            assert _sample(learner) == _sample(many(MANY))
 
     def test_three_times_everything_is_calibrated_as_once(self):
         scene = Scene(sensor=sensors.BIOTAC)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from touches import Windowed, fed
 
 from examples.benchmarks.buffers import compare
-from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile import Kernels
+from scroll_tactile.errors import InputError
 from scroll_tactile.memory.exemplars import (
     CANDIDATES,
     Exemplar,
@@ -23,11 +23,9 @@ from scroll_tactile.memory.exemplars import (
     quotas,
     rank,
 )
-from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
-from store import Store
 
 few = settings(max_examples=60, deadline=None)
 LARGEST = 2**20
@@ -252,25 +250,6 @@ def test_a_sample_that_could_hold_nothing_is_refused(wrong):
         ExemplarSample(**wrong)
 
 
-@pytest.mark.parametrize(("kept", "size"), [([None, 3000], 400), ([4, 3000], 4), ([4, None], 4)])
-def test_a_memory_that_0_1_made_with_a_limit_in_bytes_opens_with_its_count_or_the_usual_one(kept, size, tmp_path):
-    pad = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
-    embedding = Kernels(dimension=64)
-    Store.open(tmp_path, identity=Identity.of(pad, embedding, None).to_json() | {"exemplars": kept}).close()
-    with TactileLearner.open(tmp_path, embedding=embedding) as learner:
-        for seed in range(6):
-            learner.observe("ab"[seed % 2], np.random.default_rng(seed).random((50, 2)))
-        assert sum(map(len, learner.exemplars.values())) == min(size, 6)
-    with pytest.raises(MismatchError, match=f"exemplars={size}; it was opened with 7"):
-        TactileLearner.open(tmp_path, embedding=embedding, exemplars=7)
-
-
-def test_what_0_1_noted_of_streams_dropped_for_their_bytes_is_passed_over():
-    arrays, about = sample_of([("a", 1), ("a", 2), ("b", 9)]).to_arrays()
-    again = ExemplarSample.from_arrays(arrays, about | {"felt": {"a": [8, "02"], "b": [4000, None]}}, 3, 0)
-    assert held(again) == [("a", 1), ("a", 2), ("b", 9)]
-
-
 def test_an_exemplars_code_is_the_last_of_its_own_at_its_widest_scale():
     narrow, wide = Scale("window", 5), Scale("window", 20)
     codes = {narrow: np.arange(8, dtype=np.int32).reshape(4, 2), wide: np.array([[1, 2], [3, 4], [8, 9]], np.int32)}
@@ -339,7 +318,6 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
 
 def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
     from examples.benchmarks.buffers import run_buffers
-    from scroll_tactile import Kernels
     from scroll_tactile.datasets import Recordings
     from scroll_tactile.datasets.simulator import Scene
     from scroll_tactile.sensors import Sensor
@@ -364,7 +342,7 @@ def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
 
 
 def test_views_change_no_exemplar():
-    """They are herded by windows, as f* is trained, and as those of memories without views were."""
+    """They are herded by windows, as f* is trained."""
     observed = [(name, (seed, readings)) for seed, readings in enumerate((60, 10, 25, 90, 60, 60, 37)) for name in "ab"]
     windowed = fed(observed, embedding=Windowed(seed=0, dimension=64))
     assert fed(observed).exemplars == windowed.exemplars

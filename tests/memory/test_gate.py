@@ -83,9 +83,9 @@ def require_refused(path, match, expected=DamageError, others=None, **settings_)
 
 
 def readings_row(path, **changes):
-    """A row of readings as they are, with some of its arrays changed; None leaves one out."""
+    """A row of readings with some of its arrays changed; None leaves one out."""
     touch = validate(stream((20, 60)), PAD)
-    arrays = {"readings": touch.readings, **changes}
+    arrays = {**pack_readings(touch.readings), **changes}
     arrays = {name: array for name, array in arrays.items() if array is not None}
     return put_row(path, key=touch.key, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
 
@@ -118,15 +118,15 @@ ROWS = {
     "bytes in words": ("nbytes", {"attributes": {"columns": 60, "nbytes": "a"}}),
     "bytes of others": ("columns", {"attributes": {"columns": 60, "nbytes": 488}}),
     "bytes of none": ("nbytes", {"attributes": {"columns": 60, "nbytes": 480}, "payload": {}}),
-    "another shape": ("readings", {"payload": {"readings": np.zeros(3, np.float32)}}),
-    "another type": ("readings", {"payload": {"readings": np.zeros((60, 2))}}),
-    "text": ("readings", {"payload": {"readings": np.full((60, 2), "x")}}),
-    "not finite": ("range of 'pad'", {"payload": {"readings": NAN}}),
-    "out of range": ("range of 'pad'", {"payload": {"readings": np.full((60, 2), 1.5, np.float32)}}),
+    "another shape": ("readings", {"payload": {"readings-2e0": np.zeros(3, np.int8)}}),
+    "another type": ("readings", {"payload": {"readings-2e0": np.zeros((2, 60))}}),
+    "text": ("readings", {"payload": {"readings-2e0": np.full((2, 60), "x")}}),
+    "not finite": ("range of 'pad'", {"payload": pack_readings(NAN)}),
+    "out of range": ("range of 'pad'", {"payload": pack_readings(np.full((60, 2), 1.5, np.float32))}),
     "a power beyond all": ("2e200", {"payload": {"readings-2e200": np.ones((2, 60), np.int8)}}),
     "two ways": (
         "one way",
-        {"payload": {"readings": np.zeros((60, 2), np.float32), "readings-2e0": np.ones(3, np.int8)}},
+        {"payload": {"readings-2e0": np.zeros((2, 60), np.int8), "readings-2e1": np.ones((2, 60), np.int8)}},
     ),
     "a short key": ("key: expected 32 bytes", {"key": b"abc"}),
     "no name": ("name of 1 to 200", {"label": ""}),
@@ -143,19 +143,17 @@ def test_a_row_that_is_no_observation_is_damage(path, others, name):
     match, changes = ROWS[name]
     row = {
         "attributes": {"columns": 60, "nbytes": 480},
-        "payload": {"readings": validate(stream((20, 60)), PAD).readings},
+        "payload": pack_readings(validate(stream((20, 60)), PAD).readings),
     }
     put_row(path, **row | changes)
     require_refused(path, match, others=others)
 
 
-@pytest.mark.parametrize("packing", ["readings", "packed"])
-def test_a_row_under_the_key_of_another_touch_is_damage(made, path, others, packing):
+def test_a_row_under_the_key_of_another_touch_is_damage(made, path, others):
     """What would be left out of a merge as "shared" though it was never there."""
     label, key = observed_in(made / "other")[0]
     readings = validate(stream((20, 60)), PAD).readings
-    payload = {"readings": readings} if packing == "readings" else pack_readings(readings)
-    put_row(path, key=key, label=label, attributes={"columns": 60, "nbytes": 480}, payload=payload)
+    put_row(path, key=key, label=label, attributes={"columns": 60, "nbytes": 480}, payload=pack_readings(readings))
     require_refused(path, r"row 14 .* key: expected the content hash of its readings", others=others)
 
 
@@ -178,7 +176,7 @@ def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
 def test_what_merge_leaves_out_passes_the_gate_too(path, others):
     """A row that was retracted, one that both observed: opening refuses either."""
     readings = validate(stream(OTHER[0][1]), PAD).readings
-    put_row(path, label="d", key=bytes(32), attributes={"columns": 60, "nbytes": 480}, payload={"readings": readings})
+    put_row(path, label="d", key=bytes(32), attributes={"columns": 60, "nbytes": 480}, payload=pack_readings(readings))
     put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[14, 14]]})
     require_refused(path, r"row 14 .* content hash", others=others)
 
@@ -191,8 +189,8 @@ def test_a_row_of_a_kind_that_nobody_knows_is_of_a_newer_version(path, others, k
 
 def test_a_generation_that_opening_refuses_is_not_merged(path, others):
     attributes, arrays = checkpoint_of(path)
-    put_checkpoint(path, attributes | {"pool": ["nobody"] * len(attributes["pool"])}, arrays)
-    require_refused(path, "pool: expected materials that were observed", others=others)
+    put_checkpoint(path, attributes | {"sample": ["nobody"] * len(attributes["sample"])}, arrays)
+    require_refused(path, "sample: expected materials that were observed", others=others)
 
 
 def test_an_exemplar_under_the_key_of_another_touch_is_damage(made, tmp_path, others):
@@ -233,7 +231,7 @@ ZEROS = {
     ],
 )
 def test_packed_readings_must_fit_together(path, changes):
-    readings_row(path, **{"readings": None} | ZEROS | changes)
+    readings_row(path, **ZEROS | changes)
     require_refused(path, "readings")
 
 
@@ -256,18 +254,18 @@ LARGE = 2**20 + 1
 def test_codes_must_be_those_of_the_touch(made, tmp_path, match, spoil, scale):
     path = copied(made / "coded", tmp_path / "m")
     attributes, arrays = row_of(path)
-    put_row(path, attributes=attributes, payload=arrays | {f"stages-{scale}": spoil(arrays[f"stages-{scale}"])})
+    put_row(path, attributes=attributes, payload=arrays | {f"codes-{scale}": spoil(arrays[f"codes-{scale}"])})
     embedding = STORED["embedding"]
     require_refused(path, match, embedding=embedding)
 
 
-@pytest.mark.parametrize("changes", [{"stages-37": None}, {"stages-38": "stages-37"}, {"codes-37": "stages-37"}])
+@pytest.mark.parametrize("changes", [{"codes-37": None}, {"codes-38": "codes-37"}])
 def test_scales_must_be_those_of_the_touch(made, tmp_path, changes):
     path = copied(made / "coded", tmp_path / "m")
     attributes, arrays = row_of(path)
     changed = arrays | {name: None if of is None else arrays[of] for name, of in changes.items()}
     put_row(path, attributes=attributes, payload={name: one for name, one in changed.items() if one is not None})
-    require_refused(path, "scale|stages", embedding=STORED["embedding"])
+    require_refused(path, "scales", embedding=STORED["embedding"])
 
 
 @pytest.mark.parametrize(
@@ -317,11 +315,11 @@ IDENTITIES = {
     "sensor": ["x", None, [], {}, {"name": "pad"}],
     "embedding": ["x", {}, [], None],
     "grid": [None, {}, {"bits": 20, "scales": ["a"]}, {"bits": 20, "scales": []}, {"bits": True, "scales": [15]}],
-    "exemplars": ["abc", [1], [-1, None], [True, None], [10**30, None]],
+    "exemplars": ["abc", [1], -1, True, 10**30, None],
     "augmentation": [{"x": 1}, "x", {"copies": 10**9}, {"copies": 2, "speed": 1e300}, {"copies": True}],
-    "recall": ["x", -1, True, 10**30],
-    "views": [1, "true"],
-    "reading": [[1, "all"], ["x", "y"], [True]],
+    "recall": ["x", -1, True, 10**30, None],
+    "views": [1, "true", None],
+    "reading": [[1, "all"], ["x", "y"], [True], None],
 }
 
 
@@ -368,7 +366,7 @@ def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
             path,
             key=readings.key,
             attributes={"columns": 60, "nbytes": 480},
-            payload={"readings": readings.readings},
+            payload=pack_readings(readings.readings),
             time=time,
         )
     with opened(path, mode="read") as learner:
@@ -384,16 +382,16 @@ SUMS = {
     "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
     "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
     "second-1048576": [lambda a: a * 0],
-    "pool-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
-    "pool-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
-    "pool-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],
-    "pool-rows": [lambda a: a + LARGE, lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
+    "sample-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
+    "sample-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
+    "sample-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],
+    "sample-rows": [lambda a: a + LARGE, lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
     "kept-keys": [lambda a: a * 0],
     "kept-columns": [lambda a: -a, lambda a: a + 1, lambda a: None],
     "kept-levels": [lambda a: a[:-1], lambda a: a.astype(np.int16)],
     "exemplar-keys": [lambda a: a[:-1]],
     "exemplar-sources": [lambda a: a + 10**6, lambda a: -a - 1, lambda a: a.astype(float)],
-    "withdrawn": [lambda a: np.array([10**12]), lambda a: np.array([0]), lambda a: np.array([1.5])],
+    "retracted": [lambda a: np.array([10**12]), lambda a: np.array([0]), lambda a: np.array([1.5])],
     "excluded": [lambda a: np.array([1, 1])],
 }
 
@@ -404,19 +402,19 @@ def test_arrays_of_a_generation_must_be_those_of_touches(path, field, place):
     changed = SUMS[field][place](arrays.pop(field))
     put_checkpoint(path, attributes, arrays | ({} if changed is None else {field: changed}))
     require_refused(
-        path, "generation 2 .*: (observations|lengths|rows|sums|second|pool|kept|exemplar|withdrawn|excluded)"
+        path, "generation 2 .*: (observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded)"
     )
 
 
 ABOUT = {
     "dimension": [63, "x", None],
-    "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20]],
+    "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20], [15.0, 37, 2**20, 2**20 + 1]],
     "materials": [["a", "a", "b"], ["a", "b", "\n"], ["a", "b", 3], "abc", None],
-    "pool": [[], ["a"], ["z"] * 12, None],
+    "sample": [[], ["a"], ["z"] * 12, None],
+    "copies": [None, [1], [0] * 12, [True] * 12],
     "kept": [[], ["z"] * 12, None],
-    "capacity": ["x", [1], [True, None]],
     "exemplars": [None, [], {}, {"materials": ["z"] * 12}],
-    "descriptions": [[], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
+    "descriptions": [None, [], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
     "tuned_upto": [None, -1, 10**9, "x"],
     "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
 }
@@ -534,9 +532,7 @@ def changed(draw, attributes, arrays):
     elif names and draw(st.booleans()):
         del chosen[draw(st.sampled_from(names))]
     elif what == "array":
-        arrays[draw(st.sampled_from(["x", "stages-15", "codes-15", "values-37", "readings", "tuned-bias"]))] = np.zeros(
-            3
-        )
+        arrays[draw(st.sampled_from(["x", "codes-15", "codes-015", "readings", "tuned-bias"]))] = np.zeros(3)
     return attributes, arrays
 
 
@@ -562,7 +558,7 @@ def test_a_row_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_fa
     source, settings_ = data.draw(st.sampled_from([("whole", {}), ("coded", {"embedding": STORED["embedding"]})]))
     path = copied(made / source, tmp_path_factory.mktemp("row") / "m")
     attributes, arrays = data.draw(changed(*row_of(path, data.draw(st.sampled_from([1, 13])))))
-    kind = data.draw(st.sampled_from(["observe", "observe", "retract", "describe", "merge", "felt", "dream"]))
+    kind = data.draw(st.sampled_from(["observe", "observe", "retract", "describe", "merge", "member", "dream"]))
     put_row(path, kind=kind, attributes=attributes, payload=arrays)
     require_typed_or_equal(path, **settings_)
 

@@ -1,47 +1,77 @@
-"""Memories written by earlier releases are read: run as a test it reads them, run as a script it writes this one's.
+"""A memory of format 1 opens in every later version: as a test this reads the golden one, as a script it makes it.
 
-`python tests/memory/test_golden.py` makes `tests/data/<version>/`: a store that has all kinds of rows and generations,
-and `expected.json`, what was in it. A release adds its own and never touches those of others.
+`python tests/memory/test_golden.py` makes `tests/data/format-1.zip`, a memory that has all kinds of rows and
+checkpoints, and `tests/data/format-1.json`, what is in it. A release from 1.0 on never makes it again.
 """
 
 import hashlib
 import json
 import shutil
-import sqlite3
-import sys
-from contextlib import closing
+import tempfile
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scroll_tactile import Kernels, Sensor, TactileLearner, __version__
+import store.layout
+from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.gate import check_memory
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
-from store import Store, VersionError
+from store import Store, VersionError, check_store
+from store.layout import read_current, write_current
 
-DATA = Path(__file__).parents[1] / "data"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
+EXPECTED = GOLDEN.with_suffix(".json")
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
-# Of what earlier releases observed: it is viewed and kept as now, but for what was compacted. Before 0.3 its windows
-# count as the stages that they make, but for the same.
-EARLIER = {
-    "0.1.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
-    "0.2.0": "140956f954c31c819cbe4ce52734c4a7f3082e418d526dd673003160637dea2e",
-    "0.3.0": "fd4382a21ead3d6d3a1a7e110ebc593960402bd1d8fe83188c99697183a73705",
-}
 NAMES = ("felt", "Samt ü/√", "cork")
-COMPACTED = (0, 1, 2, 3, 6, 7, 8, 9, 11)  # seeds of the touches whose readings are gone, of 60 readings each
+STANDING = [0, 1, 2, 3, 4, 6, 7, 8, 9]  # seeds of the touches in it, of 60 readings each; "cork" has one of 40 beside
 ASKED = [(100 + seed, readings) for seed in range(3) for readings in (9, 30, 60)]
+# What the memory says, but for f* and probabilities: machines solve with other last bits.
+EXACT = ("digest", "materials", "exemplars", "descriptions", "kept")
 
 
-def stream(seed, readings):
+def stream(seed, readings=60):
     """A random walk whose step is the seed's: materials of their own."""
     rng = np.random.default_rng([seed, readings])
     return 0.5 + 0.4 * np.sin(np.cumsum(rng.normal(0, 0.1 + seed % 3 / 3, (readings, 2)), axis=0))
 
 
-def open_golden(path, mode="write"):
+def opened(path, mode="write"):
     return TactileLearner.open(path, sensor=PAD, embedding=Kernels(seed=0, dimension=64), exemplars=4, mode=mode)
+
+
+def write(target):
+    """Make the memory: felt, retracted, merged, compacted, fine-tuned, and left as a killed process leaves it."""
+    with tempfile.TemporaryDirectory() as home:
+        path, other_path = Path(home, "memory"), Path(home, "other")
+        with opened(other_path) as other:
+            for seed in range(4):
+                other.observe(NAMES[seed % 3], stream(seed))
+            other.compact(keep=2)
+        learner = opened(path)
+        with learner.batch():
+            receipts = [learner.observe(NAMES[seed % 3], stream(seed), source=f"{seed}.csv") for seed in range(4, 10)]
+        learner.retract(receipts[1])
+        learner.describe("felt", {"wool": 0.75, "viscose": 0.25})
+        learner.describe("cork", {"soft": False, "natural": True})
+        learner.observe("short", stream(1, 8))
+        learner.forget("short")
+        learner.compact(keep=3)
+        learner.merge(other_path, shared="once")
+        learner.fine_tune(epochs=1)
+        learner.observe("cork", stream(20, 40))
+        learner.describe("cork", {"soft": False, "natural": None})
+        learner.retract(learner.observe("felt", stream(21)))
+        with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in sorted(path.rglob("*")):
+                if file.is_file() and file.name not in ("lock", "holder.json"):
+                    archive.write(file, file.relative_to(path))
+        said = json.dumps(content(learner), indent=1, ensure_ascii=False) + "\n"
+        target.with_suffix(".json").write_text(said, encoding="utf-8")
+        learner.close()
 
 
 def content(learner):
@@ -63,168 +93,109 @@ def kept(learner):
     """The touches kept for recall, each as its material and key, and a digest of their levels."""
     touches = learner.memory.kept.touches()
     levels = hashlib.sha256(b"".join(touch.levels.tobytes() for touch in touches)).hexdigest()
-    return [[touch.material, touch.key.hex()] for touch in touches], levels
+    return [[[touch.material, touch.key.hex()] for touch in touches], levels]
 
 
-def fresh(seeds):
-    """A memory without a path that observes now what is in a golden store: touches of some seeds, and the last."""
-    learner = TactileLearner(sensor=PAD, embedding=Kernels(seed=0, dimension=64), exemplars=4)
-    for seed in seeds:
-        learner.observe(NAMES[seed % 3], stream(seed, 60))
-    learner.observe("cork", stream(20, 40))
-    return learner
+def require(learner):
+    """What the memory says is what was recorded."""
+    found, expected = content(learner), json.loads(EXPECTED.read_text(encoding="utf-8"))
+    assert {name: found[name] for name in (*EXACT, "tuned")} == {name: expected[name] for name in (*EXACT, "tuned")}
+    for (name, probability), (material, share) in zip(found["answers"], expected["answers"], strict=True):
+        assert name == material
+        assert probability == pytest.approx(share, abs=1e-4)
 
 
-def arrays_of(learner, endings):
-    """The arrays of the statistics whose names end so, to the byte."""
-    arrays, _ = learner.memory.statistics.to_arrays()
-    return {name: array.tobytes() for name, array in arrays.items() if name.endswith(tuple(endings))}
+@pytest.fixture
+def golden(tmp_path):
+    """A copy of the golden memory."""
+    shutil.unpack_archive(GOLDEN, tmp_path / "m")
+    return tmp_path / "m"
 
 
-def require(learner, expected):
-    found = json.loads(json.dumps(content(learner)))
-    exact = [name for name in expected if name not in ("answers", "earlier", "current")]
-    assert {name: found[name] for name in exact} == {name: expected[name] for name in exact}
-    if expected["current"]:  # the readouts of earlier ones were others
-        for (name, probability), (material, share) in zip(found["answers"], expected["answers"], strict=True):
-            assert name == material
-            assert probability == pytest.approx(share, abs=1e-4)  # machines solve with other last bits
+def test_it_is_small_and_holds_no_pickle():
+    files = list(GOLDEN.parent.rglob("*"))
+    assert len(files) <= 30 and sum(file.stat().st_size for file in files) < 500_000
+    names = zipfile.ZipFile(GOLDEN).namelist()
+    assert {name.split("/")[0].rstrip("0123456789") for name in names} == {"CURRENT", "log-", "checkpoints"}
 
 
-def write(folder):
-    """Make the store: felt, retracted, merged, compacted, fine-tuned, and left as a killed process leaves it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    with open_golden(folder / "other") as other:
-        for seed in range(6):
-            other.observe(NAMES[seed % 3], stream(seed, 60))
-        other.compact(keep=2)
-    learner = open_golden(folder / "memory")
-    with learner.batch():
-        receipts = [learner.observe(NAMES[seed % 3], stream(seed, 60)) for seed in range(6, 18)]
-    learner.retract(receipts[4])
-    learner.describe("felt", {"wool": 0.75, "viscose": 0.25})
-    learner.describe("cork", {"soft": False, "natural": True})
-    learner.observe("short", stream(1, 8))
-    learner.forget("short")
-    learner.compact(keep=6)
-    learner.merge(folder / "other", shared="once")
-    learner.fine_tune(epochs=1)
-    learner.observe("cork", stream(20, 40))
-    learner.describe("cork", {"soft": False, "natural": None})
-    learner.retract(learner.observe("felt", stream(21, 60)))
-    shutil.rmtree(folder / "other")
-    shutil.copytree(folder / "memory", folder / "store", ignore=shutil.ignore_patterns("*-shm", "lock", "holder.json"))
-    (folder / "expected.json").write_text(json.dumps(content(learner), indent=1) + "\n", encoding="utf-8")
-    learner.close()
-    shutil.rmtree(folder / "memory")
+def test_it_is_sound(golden):
+    assert [problem for problem in check_store(golden) if problem.kind != "leftover"] == []
+    assert check_memory(golden) == []
 
 
-@pytest.fixture(params=sorted(path.name for path in DATA.iterdir() if (path / "expected.json").is_file()))
-def golden(request, tmp_path):
-    """A copy of a golden store, and what is in it."""
-    shutil.copytree(DATA / request.param / "store", tmp_path / "m")
-    expected = json.loads((DATA / request.param / "expected.json").read_text(encoding="utf-8"))
-    expected["current"] = request.param == __version__
-    if request.param in EARLIER:
-        expected |= {"digest": EARLIER[request.param], "earlier": request.param}
-    return tmp_path / "m", expected
+def test_every_kind_of_row_and_checkpoint_is_in_it(golden):
+    with Store.open(golden, mode="read") as held:
+        assert {head.kind for head in held.heads()} == {"observe", "retract", "merge", "member", "describe"}
+        assert 0 < held.compacted < held.latest().upto < held.last
+        assert {"sample", "kept", "exemplars", "descriptions", "tuned"} <= set(held.latest().attributes)
+        assert len(held.base().arrays["exemplar-readings"])
 
 
-def test_it_is_read(golden):
-    path, expected = golden
-    with open_golden(path, mode="read") as learner:
-        require(learner, expected)
+@pytest.mark.parametrize("how", [opened, TactileLearner.open])
+def test_it_says_what_was_recorded(golden, how):
+    with how(golden, mode="read") as learner:
+        require(learner)
+        now = TactileLearner(sensor=PAD, embedding=Kernels(seed=0, dimension=64), exemplars=4)
+        for seed in STANDING:
+            now.observe(NAMES[seed % 3], stream(seed))
+        now.observe("cork", stream(20, 40))
+        assert learner.digest() == now.digest()
+        assert kept(learner) == kept(now)
 
 
-def test_it_opens_from_its_path_alone(golden):
-    path, expected = golden
-    with TactileLearner.open(path, mode="read") as learner:
-        require(learner, expected)
-
-
-def test_it_is_written_on(golden):
-    path, expected = golden
-    with open_golden(path) as learner:
-        require(learner, expected)
-        receipt = learner.observe("new", stream(30, 60))
-        learner.retract(receipt)
-        require(learner, expected)
+def test_it_is_written_on(golden, monkeypatch):
+    with opened(golden) as learner:
+        require(learner)
+        learner.retract(learner.observe("new", stream(30)))
+        require(learner)
         learner.compact()
-    with open_golden(path) as learner:
-        require(learner, expected)
-
-
-def test_it_is_upgraded_to_what_its_touches_give_now_once(golden, monkeypatch):
-    path, expected = golden
-    earlier, embedded = expected.get("earlier"), []
-    codes = Memory.codes
-    monkeypatch.setattr(Memory, "codes", lambda self, record: embedded.append(record) or codes(self, record))
-    there = [seed for seed in range(18) if seed != 10]
-    now = fresh([seed for seed in there if not (earlier and seed in COMPACTED)])
-    with open_golden(path) as learner:
-        views = [f"-{view}" for view in learner.plan.views]
-        assert arrays_of(learner, views) == arrays_of(now, views)
-        if earlier in (None, "0.3.0"):
-            widths = ["observations", "lengths", *(f"-{width}" for width in learner.plan.widths)]
-            assert arrays_of(learner, widths) == arrays_of(fresh(there), widths)
-        assert kept(learner) == kept(now)
-        assert (learner.digest() == now.digest()) == (not earlier)
-    assert embedded
-    embedded.clear()
-    with open_golden(path) as learner:
-        assert kept(learner) == kept(now)
-        assert learner.digest() == expected["digest"]
+    embedded = []
+    monkeypatch.setattr(Memory, "codes", lambda self, record: embedded.append(record))
+    with opened(golden) as learner:
+        require(learner)
     assert not embedded
+    assert check_store(golden) == []
 
 
-def test_every_kind_of_row_and_generation_is_in_it(golden):
-    path, _ = golden
-    assert (path / "journal.sqlite-wal").stat().st_size > 0
-    with Store.open(path, mode="read") as store:
-        assert {head.kind for head in store.heads()} == {"observe", "retract", "merge", "felt", "describe"}
-        assert 0 < store.compacted < store.last
-        assert store.latest().upto < store.last
-        assert "tuned" in store.latest().attributes
+def test_it_is_what_this_version_writes(golden, tmp_path):
+    """Where names or values on the disk change, an earlier version may not read them."""
+    write(tmp_path / "again.zip")
+    again, expected = (json.loads(file.read_text("utf-8")) for file in (tmp_path / "again.json", EXPECTED))
+    assert {name: again[name] for name in EXACT} == {name: expected[name] for name in EXACT}
+    shutil.unpack_archive(tmp_path / "again.zip", tmp_path / "again")
+    written = []
+    for path in (golden, tmp_path / "again"):
+        with Store.open(path, mode="read") as held:
+            rows = [(head.kind, head.label, head.key, sorted(head.attributes)) for head in held.heads()]
+            arrays = [sorted(record.arrays) for record in held.records(held.compacted)]
+            points = [
+                (point.upto, sorted(point.arrays), sorted(point.attributes)) for point in (held.latest(), held.base())
+            ]
+            written.append((held.identity, rows, arrays, points))
+            assert held.identity == Identity.read(held).to_json()
+    assert written[0] == written[1]
 
 
-def test_it_is_what_this_release_writes(tmp_path):
-    """Where the format changes, a new version and a new golden store are due."""
-    current = DATA / __version__
-    write(tmp_path / "again")
-    again, expected = (json.loads((one / "expected.json").read_text()) for one in (tmp_path / "again", current))
-    for exact in ("digest", "materials", "exemplars", "descriptions", "kept"):  # an f* is not the same on every machine
-        assert again[exact] == expected[exact]
-    shutil.copytree(current / "store", tmp_path / "golden")  # a look with SQLite empties its log
-    shapes = []
-    for path in (tmp_path / "again" / "store", tmp_path / "golden"):
-        with closing(sqlite3.connect(path / "journal.sqlite")) as connection:
-            shapes.append(connection.execute("SELECT name, sql FROM sqlite_master ORDER BY name").fetchall())
-        with Store.open(path) as store:
-            shapes[-1] += sorted(store.latest().arrays)
-    assert shapes[0] == shapes[1]
-
-
-def test_a_newer_store_is_refused_with_what_to_do(golden):
-    path, _ = golden
-    with Store.open(path):
-        pass  # so that its log is in the file
-    with closing(sqlite3.connect(path / "journal.sqlite")) as connection:
-        connection.execute("PRAGMA user_version = 99")
-    before = (path / "journal.sqlite").read_bytes()
-    with pytest.raises(VersionError, match="is written in format 99; this release reads up to format 1: upgrade it"):
-        open_golden(path)
-    assert (path / "journal.sqlite").read_bytes() == before
+def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
+    monkeypatch.setattr(store.layout, "FORMAT_VERSION", 2)
+    write_current(golden, read_current(golden))
+    monkeypatch.undo()
+    before = {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()}
+    for mode in ("write", "read"):
+        with pytest.raises(VersionError, match="is written in format 2; this release reads format 1: upgrade it"):
+            opened(golden, mode)
+    assert {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()} == before
 
 
 def test_a_row_of_an_unknown_kind_is_refused_with_what_to_do(golden):
-    path, _ = golden
-    with Store.open(path) as store:
-        store.append("dream", "", b"")
+    with Store.open(golden) as held:
+        held.append("dream", "", b"")
     with pytest.raises(MismatchError, match=r"is of kind 'dream', .* Open the memory with the version that wrote it"):
-        open_golden(path)
+        opened(golden)
 
 
 if __name__ == "__main__":
-    write(DATA / __version__)
-    print((DATA / __version__ / "expected.json").read_text())
-    sys.exit()
+    GOLDEN.parent.mkdir(exist_ok=True)
+    write(GOLDEN)
+    print(EXPECTED.read_text(encoding="utf-8"))

@@ -55,7 +55,7 @@ def received(path):
 
 @cheap
 @given(
-    kind=st.sampled_from(["observe", "retract", "describe", "merge", "felt", "x"]),
+    kind=st.sampled_from(["observe", "retract", "describe", "merge", "member", "x"]),
     label=st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=8),
     key=st.binary(max_size=40),
     fields=st.dictionaries(st.sampled_from(["columns", "nbytes", "sequences", "constituents", "x"]), json_values),

@@ -74,45 +74,10 @@ def test_codes_come_back():
     }
 
 
-def earlier(windows, *, placed):
-    """The arrays of a row of version 0.2: the codes of all windows, as they are or as places among their values."""
-    if not placed:
-        return {f"codes-{scale}": rows for scale, rows in windows.items()}
-    arrays = {}
-    for scale, rows in windows.items():
-        arrays[f"values-{scale}"], places = np.unique(rows.T, return_inverse=True)
-        arrays[f"places-{scale}"] = places.reshape(rows.T.shape).astype(np.uint16)
-    return arrays
-
-
-@pytest.mark.parametrize("placed", [False, True])
-@pytest.mark.parametrize("seed", range(6))
-def test_the_windows_of_an_earlier_row_count_as_its_stages(seed, placed):
-    _, _, columns, codes = touch(seed)
-    arrays = earlier(windows_of(seed), placed=placed)
-    found = row_codes(arrays, columns, READING, None)
-    assert {scale: rows.tolist() for scale, rows in found.items()} == {
-        scale: rows.tolist() for scale, rows in codes.items()
-    }
-
-
-def test_where_an_earlier_row_holds_copies_its_readings_are_embedded_again_or_it_counts_without_them():
-    _, _, columns, codes = touch(3)
-    doubled = {scale: np.concatenate([rows, rows + 1]) for scale, rows in windows_of(3).items()}
-    readings = {"readings": np.ones((columns, 2), np.float32)}
-    wanted = {NARROW: np.full((1, DIMENSION), 7, np.int32)}
-    assert row_codes(earlier(doubled, placed=True) | readings, columns, READING, lambda _: wanted) is wanted
-    for arrays in (earlier(doubled, placed=True), earlier(doubled, placed=True) | readings):
-        found = row_codes(arrays, columns, READING, None)
-        assert {scale: rows.tolist() for scale, rows in found.items()} == {
-            scale: rows.tolist() for scale, rows in codes.items()
-        }
-
-
 def test_readings_alone_need_their_embedding():
     arrays = pack_readings(np.ones((20, 2), np.float32))
     with pytest.raises(MismatchError, match="by the embedding that made the memory"):
-        row_codes(arrays, 20, READING, None)
+        row_codes(arrays, None)
 
 
 def windows_of(seed):

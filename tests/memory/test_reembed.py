@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from commands import refused, run
 from forging import put_row
-from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, kept_of, require_same, stream, without
+from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, stream, without
 
 from scroll_tactile import Kernels, Maps, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory import reembed
-from scroll_tactile.memory.kept import KeptTouches
 from scroll_tactile.prediction.reembedding import reembed_memory
 from scroll_tactile.signals.copies import Augmented
 from store import DamageError, LockedError, Store, StoreFullError
@@ -115,16 +114,6 @@ def test_nothing_is_lost_it_is_the_memory_that_was_fed_afresh(path, tmp_path, se
         held = arrays_of(learner)
     with TactileLearner.open(path, readout="ridge") as again:
         assert (arrays_of(again), again.settings) == (held, afresh.settings)
-
-
-def test_kept_touches_that_an_earlier_version_lost_come_back(path):
-    with filled(path)[0] as learner:
-        learner.memory.kept = KeptTouches(learner.memory.kept.made)  # as 0.6 left them, also in the checkpoint
-        learner.close()
-    with TactileLearner.open(path) as learner:
-        assert kept_of(learner) == []
-        learner.reembed()
-        require_same(learner, OBSERVED)
 
 
 def test_replayed_it_is_the_same(path, other):

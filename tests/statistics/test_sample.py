@@ -145,13 +145,6 @@ def test_halves_go_upward_whatever_the_sign():
     assert mean_code(np.array([3, -3, 5, -5, 1, -1]), 2).tolist() == [2, -1, 3, -2, 1, 0]
 
 
-def test_the_sums_that_an_earlier_version_kept_become_rows():
-    pairs = np.array([[0, 0, 2], [1, 0, 3], [1, 1, 1]])
-    touch = SampledTouch.of_sums(np.array([[3, -3], [10, 11], [7, -7]], np.int32), pairs)
-    assert touch.rows.tolist() == [[2, -1], [3, 4], [7, -7]]
-    assert rows_at(touch, 1).tolist() == [[3, 4], [7, -7]]
-
-
 @pytest.mark.parametrize("materials", [1, 7, 400])
 def test_the_usual_capacity_is_shared_evenly(materials):
     rng = np.random.default_rng(0)

@@ -269,28 +269,6 @@ def test_full_statistics_do_not_merge():
         filled(half) + filled(half)
 
 
-@few
-@given(touches, touches, touches)
-def test_three_folds_of_an_earlier_version_add_up(a, b, c):
-    """It kept rows and sums of each fold on an axis of their own, and a second moment for each."""
-    parts = [of(a), of(b), of(c)]
-    whole, names = of(a + b + c).to_arrays()
-
-    def by_fold(kept, *shape):
-        """What is kept of each material, shape (materials, folds, …)."""
-        found = [[kept(part, name) if name in part.materials else np.zeros(shape) for part in parts] for name in names]
-        return np.array(found, np.int64).reshape(len(names), 3, *shape)
-
-    arrays = {"lengths": whole["lengths"], "observations": by_fold(lambda part, name: part.materials[name])}
-    for scale in SCALES:
-        arrays[f"rows-{scale}"] = by_fold(lambda part, name, at=scale: part.counts(at, [name])[0])
-        arrays[f"sums-{scale}"] = by_fold(lambda part, name, at=scale: part.sums(at, [name])[0], DIMENSION)
-        for fold, part in enumerate(parts):
-            if part.second(scale).rows:
-                arrays[f"second-{scale}-{fold}"] = part.second(scale).packed()
-    same(Statistics.from_arrays(DIMENSION, SCALES, arrays, names), of(a + b + c))
-
-
 def test_fewer_touches_of_as_many_rows_do_not_contain_more():
     whole, part = of([]), of([])
     whole.add("wool", {5: np.ones((2, 3), np.int32)})

@@ -1,4 +1,4 @@
-"""The frames of a log: their bytes, and whether they are as they were written (LOG.md describes them)."""
+"""The frames of a log: their bytes, and whether they are as they were written (FORMAT.md describes them)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A record as the payload of a frame, and back (LOG.md describes it)."""
+"""A record as the payload of a frame, and back (FORMAT.md describes it)."""
 
 from __future__ import annotations
 

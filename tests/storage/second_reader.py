@@ -1,4 +1,4 @@
-"""A second reader of the log, written from store/LOG.md alone: `python tests/storage/second_reader.py LOG`.
+"""A second reader of the log, written from store/FORMAT.md alone: `python tests/storage/second_reader.py LOG`.
 
 It reads a whole file into memory, imports nothing of the store, and prints the rows.
 """

@@ -1,4 +1,4 @@
-"""A reader written from store/LOG.md alone finds the rows and the damage that the store's own finds."""
+"""A reader written from store/FORMAT.md alone finds the rows and the damage that the store's own finds."""
 
 import json
 import subprocess

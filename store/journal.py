@@ -231,10 +231,12 @@ class Journal:
             current = read_current(self.folder)
             try:
                 return _OpenLog(self.folder, current, write=self._write)
-            except FileNotFoundError as error:
+            except StoreError as error:
+                path = log_path(self.folder, current.log)
+                if path.exists():
+                    raise
                 # A writer removes a log after another has taken its place.
                 if read_current(self.folder) == current:
-                    path = log_path(self.folder, current.log)
                     raise DamageError(
                         f"{path}, which {self.folder / CURRENT_FILE} names, is not there: put it back from a copy, or "
                         "repair the store (repair_store), which resumes from what verifies",

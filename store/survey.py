@@ -11,7 +11,7 @@ from typing import Literal
 
 from store.checkpoint_files import CheckpointReader
 from store.encoding import decode_payload
-from store.exceptions import DamageError, NotAStoreError, VersionError, reported
+from store.exceptions import DamageError, NotAStoreError, StoreError, VersionError, reported
 from store.files import store_folder
 from store.framing import FRAME_BYTES, NO_CHECKSUM, read_frame
 from store.journal import Rows, head_bytes
@@ -157,8 +157,10 @@ class FoundLog:
             return
         try:
             self._reader = LogReader(path, identity=identity or find_identity(path))
-        except DamageError as error:
-            self.damage.append(str(error))
+        except StoreError as error:
+            if not isinstance(error, DamageError) and path.exists():
+                raise
+            self.damage.append(str(error))  # also where a writer has just removed it
             return
         if identity is not None and self._reader.identity != identity:
             self.damage.append(f"{path} is the log of another store, or of another time: nothing of it was read")

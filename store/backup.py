@@ -56,7 +56,7 @@ def _copy(source: Path, draft: Path) -> None:
         try:
             _copy_named(source, draft, current)
             failure = None
-        except (FileNotFoundError, DamageError) as error:
+        except (FileNotFoundError, StoreError) as error:
             failure = error
         # A writer removes what it replaces only after `CURRENT` has ceased to name it.
         if read_current(source / CURRENT_FILE) == current:

@@ -27,9 +27,10 @@ from store.row_encoding import (
     head_size,
     head_without_arrays,
     row_sequence,
+    verified_size,
 )
 
-__all__ = ["Journal", "Rows"]
+__all__ = ["Journal", "Rows", "head_bytes"]
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +90,11 @@ class Rows:
 
     def _take(self, log: LogReader, frame: Frame) -> None:
         try:
-            sequence = row_sequence(log.peek(frame.offset, min(HEAD_BYTES, frame.size)))
+            if log.payloads:
+                sequence = row_sequence(log.peek(frame.offset, min(HEAD_BYTES, frame.size)))
+            else:
+                verified_size(data := head_bytes(log, frame.offset, frame.size), frame.size)
+                sequence = row_sequence(data)
             if self.sequences and sequence <= self.sequences[-1]:
                 raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
         except ValueError as error:
@@ -97,6 +102,13 @@ class Rows:
             self.damage.setdefault(len(self), []).append(DamageError(what, path=log.path, offset=frame.offset))
         else:
             self.add(sequence, frame)
+
+
+def head_bytes(log: LogReader, offset: int, size: int) -> bytes:
+    """Return the bytes of a row without its arrays, not verified; raise ValueError for no row."""
+    data = log.peek(offset, min(size, USUAL_HEAD))
+    needed = head_size(data, size)
+    return data[:needed] if needed <= len(data) else log.peek(offset, needed)
 
 
 class _OpenLog:
@@ -191,11 +203,8 @@ class _OpenLog:
 
     def head(self, index: int) -> Head:
         """Return the head of a row. Raises DamageError, and ValueError for what is none."""
-        offset, size = self.rows.offsets[index], self.rows.sizes[index]
-        data = self.log.peek(offset, min(size, USUAL_HEAD))
-        if (needed := head_size(data, size)) > len(data):
-            data = self.log.peek(offset, needed)
-        return decode_head(data, size)
+        size = self.rows.sizes[index]
+        return decode_head(head_bytes(self.log, self.rows.offsets[index], size), size)
 
     def data(self, index: int) -> bytes:
         """Return the bytes of a row, verified. Raises DamageError."""

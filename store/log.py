@@ -183,7 +183,7 @@ class LogReader:
         file: LogFile | None = None,
     ) -> None:
         self.path = path
-        self._payloads = payloads
+        self.payloads = payloads
         self.header_damage: DamageError | None = None
         with reported(path, "opening the log"):
             self._file = LogFile(path, write=self.WRITES) if file is None else file
@@ -300,7 +300,7 @@ class LogReader:
             frame = read_frame(self._window.read(place.offset, FRAME_BYTES), place.offset)
             if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
                 return batch, place
-            if self._payloads and self._window.digest(frame.payload_offset, frame.size) != frame.digest:
+            if self.payloads and self._window.digest(frame.payload_offset, frame.size) != frame.digest:
                 return batch, place
             batch.append(frame)
             if frame.kind == COMMIT:

@@ -18,6 +18,7 @@ __all__ = [
     "head_size",
     "head_without_arrays",
     "row_sequence",
+    "verified_size",
 ]
 
 ROW = 2  # the kind of a frame that holds a record
@@ -76,16 +77,21 @@ def head_size(data: bytes, whole: int) -> int:
     return end
 
 
+def verified_size(data: bytes, whole: int) -> int:
+    """Return as `head_size`, of a head that is all there; raise ValueError where its own digest fails, too."""
+    end = head_size(data, whole)
+    if payload_digest(data[: FIELDS.size] + data[HEAD_BYTES:end]) != data[FIELDS.size : HEAD_BYTES]:
+        raise ValueError("a row's head is not as it was written")
+    return end
+
+
 def decode_head(data: bytes, whole: int) -> Head:
     """Return the head of a row of `whole` bytes, of which `data` has the head, verified by its own digest.
 
     Raises ValueError for what `encode_row` never made. Anybody can make a digest.
     """
-    end = head_size(data, whole)
+    texts = data[HEAD_BYTES : verified_size(data, whole)]
     sequence, time, size, _, *lengths = FIELDS.unpack_from(data)
-    fields, texts = data[: FIELDS.size], data[HEAD_BYTES:end]
-    if payload_digest(fields + texts) != data[FIELDS.size : HEAD_BYTES]:
-        raise ValueError("a row's head is not as it was written")
     if not 1 <= sequence <= LARGEST_NUMBER or size > LARGEST_NUMBER or not math.isfinite(time):
         raise ValueError(f"a row has the sequence {sequence}, {size} bytes and the time {time}")
     parts, start = [], 0

@@ -17,7 +17,7 @@ from store.encoding import decode_payload
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from store.files import store_folder
 from store.framing import FRAME_BYTES, NO_CHECKSUM, read_frame
-from store.journal import Rows
+from store.journal import Rows, head_bytes
 from store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
@@ -35,7 +35,7 @@ from store.layout import (
 )
 from store.log import LogReader, Place, find_identity
 from store.records import JSON, from_json
-from store.row_encoding import ROW, decode_head, decode_row, head_size, row_sequence
+from store.row_encoding import ROW, decode_head, decode_row, row_sequence
 
 __all__ = ["Fault", "FoundCheckpoint", "FoundLog", "Problem", "Progress", "Survey", "check_store", "require_store"]
 
@@ -43,7 +43,6 @@ __all__ = ["Fault", "FoundCheckpoint", "FoundLog", "Problem", "Progress", "Surve
 Progress = Callable[[str, int, int], object]
 REPORT_EVERY = 256  # rows
 ATTEMPTS = 4
-USUAL_HEAD = 512  # bytes that are read at once of a row's head
 NOWHERE = Place(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
 
 
@@ -202,8 +201,7 @@ class FoundLog:
             offset = -1 if damage.offset is None else damage.offset
             frame = read_frame(log.bytes_at(offset, FRAME_BYTES), offset) if offset >= 0 else None
             if frame is not None and frame.identity == log.identity and frame.kind == ROW:
-                data = log.peek(offset, min(frame.size, USUAL_HEAD))
-                data = log.peek(offset, head_size(data, frame.size))
+                data = head_bytes(log, offset, frame.size)
                 sequence = row_sequence(data)
                 if sequence > before:
                     decode_head(data, frame.size)
@@ -257,9 +255,7 @@ class FoundLog:
     def head_data(self, sequence: int) -> bytes:
         """Return the bytes of a row's head, not verified."""
         assert self._reader is not None
-        offset, size = self._offsets[sequence]
-        data = self._reader.peek(offset, min(size, USUAL_HEAD))
-        return self._reader.peek(offset, head_size(data, size))
+        return head_bytes(self._reader, *self._offsets[sequence])
 
     def row_size(self, sequence: int) -> int:
         """Return the bytes of a row."""

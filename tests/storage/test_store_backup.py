@@ -12,13 +12,15 @@ import pytest
 from store_builds import (
     add,
     as_after_a_crash,
-    change,
     commit,
     contents,
     damage,
-    flip,
+    flip_row,
     folders,
+    log_of,
+    newest,
     same_arrays,
+    spoil,
 )
 
 import store.backup
@@ -41,9 +43,8 @@ with Store.open(sys.argv[1], identity={}) as opened:
 
 
 def kept(folder):
-    """What is in a folder but for the two files that SQLite makes for any reader, and the writer's lock."""
-    found = contents(folder)
-    return {name: found[name] for name in found if not name.endswith(("-shm", "-wal", "lock", "holder.json"))}
+    """What is in a folder but for what a writer leaves, its lock."""
+    return {name: data for name, data in contents(folder).items() if not name.endswith(("lock", "holder.json"))}
 
 
 def same_store(found, expected):
@@ -71,7 +72,11 @@ def test_a_copy_is_the_store_and_goes_on_by_itself(either, tmp_path, mode):
         opened.backup(tmp_path / "new" / "copy")
         opened.backup(str(tmp_path / "another"))
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["copy"]
-    assert sorted(path.name for path in (tmp_path / "new" / "copy").iterdir()) == ["generations", "journal.sqlite"]
+    assert sorted(path.name for path in (tmp_path / "new" / "copy").iterdir()) == [
+        "CURRENT",
+        "checkpoints",
+        f"log-0000000{1 + which}",
+    ]
     assert same_store(tmp_path / "new" / "copy", either)
     assert kept(either) == before
     assert folders(tmp_path / "another") == folders(either)
@@ -86,10 +91,11 @@ def test_a_store_without_rows_or_with_a_log_is_copied_too(opened, tmp_path):
     assert same_store(tmp_path / "empty", opened.path)
     add(opened, 1)
     crashed = as_after_a_crash(opened, tmp_path / "crashed")
-    assert (crashed / "journal.sqlite-wal").stat().st_size > 0
+    assert log_of(crashed).stat().st_size >= 2**20  # the room ahead
     with Store.open(crashed, mode="read") as reader:
         reader.backup(tmp_path / "copy")
     assert same_store(tmp_path / "copy", opened.path)
+    assert log_of(tmp_path / "copy").stat().st_size < 2**13
 
 
 def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
@@ -101,14 +107,14 @@ def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
         assert copy.last == 1
 
 
-def test_a_generation_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
+def test_a_checkpoint_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
     real, instants = store.backup._copy_tree, ["before", "after", "within"]
     with Store.open(plain) as writer:
         commit(writer.commit, 20)
 
         def replaced(source, target):
             # The first call of each attempt copies the folder, those within it its arrays.
-            outer = source.parent.name == "generations"
+            outer = source.parent.name == "checkpoints"
             instant = instants[-1] if instants else ""
             if instants and (instant == "within") != outer:
                 instants.pop()
@@ -124,24 +130,27 @@ def test_a_generation_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_
             reader.backup(tmp_path / "copy")
         assert instants == []
     assert same_store(tmp_path / "copy", plain)
-    assert folders(tmp_path / "copy") == ["00000006"]
+    assert folders(tmp_path / "copy") == ["00000005"]
 
 
-def test_rows_that_come_while_it_is_made_are_in_none_of_its_parts(plain, tmp_path, monkeypatch):
-    """All parts are of one moment: the journal, too, though it is copied last."""
-    real = store.backup._copy_generations
+def test_a_log_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
+    real, times = store.backup._copy_named, []
     with Store.open(plain) as writer:
-        as_it_was = shutil.copytree(plain, tmp_path / "before", ignore=shutil.ignore_patterns("*-shm", "lock"))
 
-        def and_then(*arguments):
-            real(*arguments)
-            add(writer, 21)
-            commit(writer.commit, 21)
-            commit(writer.compact, 21)
+        def and_then(source, draft, current):
+            if len(times) < 3:
+                times.append(1)
+                if len(times) == 2:
+                    real(source, draft, current)
+                commit(writer.compact, 20)
+                if len(times) == 2:
+                    return
+            real(source, draft, current)
 
-        monkeypatch.setattr(store.backup, "_copy_generations", and_then)
+        monkeypatch.setattr(store.backup, "_copy_named", and_then)
         writer.backup(tmp_path / "copy")
-    assert same_store(tmp_path / "copy", as_it_was)
+    assert same_store(tmp_path / "copy", plain)
+    assert log_of(tmp_path / "copy").name == "log-00000004"
 
 
 def test_what_is_there_is_not_written_over(plain, tmp_path):
@@ -156,7 +165,7 @@ def test_what_is_there_is_not_written_over(plain, tmp_path):
                 opened.backup(tmp_path / name)
         for inside in (
             plain / "copy",
-            plain / "generations" / "9",
+            plain / "checkpoints" / "9",
             tmp_path / "door" / "copy",
             plain / ".." / "s" / "c",
         ):
@@ -167,19 +176,21 @@ def test_what_is_there_is_not_written_over(plain, tmp_path):
 
 
 def test_a_damaged_store_is_not_copied(plain, tmp_path):
-    change(plain, "UPDATE record SET label = 'z' WHERE sequence = 18")
-    with Store.open(plain) as opened, pytest.raises(DamageError, match=r"s/journal.sqlite|row 18 fails") as caught:
-        opened.backup(tmp_path / "copy")
-    assert caught.value.path == plain
+    def is_refused(match):
+        with Store.open(plain, mode="read") as opened, pytest.raises(DamageError, match=match) as caught:
+            opened.backup(tmp_path / "copy")
+        assert str(caught.value.path).startswith(str(plain))
+        assert "s/" in str(caught.value)
+
+    flip_row(plain, 18, arrays=True)
+    is_refused("row 18 has arrays that fail")
     repair_store(plain)
-    flip(plain / "generations" / "00000002" / "rows" / "c" / "0" / "0")
-    with Store.open(plain) as opened, pytest.raises(DamageError, match="array 'rows' of generation 2"):
-        opened.backup(tmp_path / "copy")
-    (plain / "generations" / "00000002" / "zarr.json").unlink()
-    with Store.open(plain) as opened, pytest.raises(DamageError, match="generation 2"):
-        opened.backup(tmp_path / "copy")
-    shutil.rmtree(plain / "generations" / "00000002")
-    with Store.open(plain) as opened, pytest.raises(StoreError, match="generations/00000002: No such file"):
+    spoil(newest(plain))
+    is_refused("array 'rows' of checkpoint 1")
+    (newest(plain) / "zarr.json").unlink()
+    is_refused("checkpoint in")
+    shutil.rmtree(newest(plain))
+    with Store.open(plain, mode="read") as opened, pytest.raises(StoreError, match="checkpoints/00000001"):
         opened.backup(tmp_path / "copy")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
 

@@ -1,4 +1,4 @@
-"""Generations: written whole, made durable before they count, in the background when asked."""
+"""Checkpoints: written whole, made durable before they count, in the background when asked."""
 
 import logging
 import os
@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import store.generations
-import store.groups
 from store_builds import folders
 
+import store.checkpoint_files
+import store.checkpoints
 from store import DamageError, Store, StoreError, check_store
 from store.chunks import ArrayFiles
 
@@ -20,12 +20,12 @@ ONE = {"x": np.arange(10)}
 
 
 class Gate:
-    """Holds writers of generations at the door and counts them."""
+    """Holds writers of checkpoints at the door and counts them."""
 
     def __init__(self, monkeypatch):
         self.open, self.reached, self.uptos = threading.Event(), threading.Event(), []
-        self.write = store.generations.write_group
-        monkeypatch.setattr(store.generations, "write_group", self)
+        self.write = store.checkpoints.write_checkpoint
+        monkeypatch.setattr(store.checkpoints, "write_checkpoint", self)
 
     def __call__(self, parent, number, draft, identity):
         self.uptos.append(draft.upto)
@@ -105,9 +105,9 @@ def fail(*_):
 )
 def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
     with monkeypatch.context() as broken:
-        broken.setattr(store.groups, "sync_tree", fail)
+        broken.setattr(store.checkpoint_files, "sync_tree", fail)
         opened.commit_later(ONE, upto=0)
-        opened._generations.wait()
+        opened._checkpoints.wait()
     with pytest.raises(StoreError, match="the disk says no"):
         surface(opened)
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
@@ -118,7 +118,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr(store.generations, "write_group", fail)
+    monkeypatch.setattr(store.checkpoints, "write_checkpoint", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, upto=0)
         raise KeyError
@@ -127,7 +127,7 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
 def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
     opened = Store.open(tmp_path, identity={})
     with monkeypatch.context() as broken:
-        broken.setattr(store.generations, "write_group", fail)
+        broken.setattr(store.checkpoints, "write_checkpoint", fail)
         opened.commit_later(ONE, upto=0)
         with pytest.raises(StoreError, match="background commit failed"):
             opened.close()
@@ -138,7 +138,7 @@ def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
     opened.commit(ONE, upto=0)
     for name in ("sync_tree", "_write_zarr", "sync_folder"):
         with monkeypatch.context() as broken:
-            broken.setattr(store.groups, name, fail)
+            broken.setattr(store.checkpoint_files, name, fail)
             with pytest.raises(StoreError, match="the disk says no"):
                 opened.commit({"x": np.arange(3)}, upto=0)
         assert folders(opened.path) == ["00000001"]
@@ -148,7 +148,7 @@ def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
 def test_what_an_interrupted_commit_left_is_removed_by_the_next_writer(opened):
     opened.commit(ONE, upto=0)
     opened.close()
-    parent = opened.path / "generations"
+    parent = opened.path / "checkpoints"
     for name in ("00000002", "00000003.partial"):
         (parent / name / "x").mkdir(parents=True)
         (parent / name / "x" / "zarr.json").write_text("{}")
@@ -162,7 +162,7 @@ def test_what_an_interrupted_commit_left_is_removed_by_the_next_writer(opened):
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
-def test_every_file_and_folder_is_durable_before_the_generation_counts(opened, monkeypatch):
+def test_every_file_and_folder_is_durable_before_the_checkpoint_counts(opened, monkeypatch):
     events = []
 
     def noted(owner, attribute, name):
@@ -176,15 +176,21 @@ def test_every_file_and_folder_is_durable_before_the_generation_counts(opened, m
 
     noted(os, "fsync", lambda file: str(Path(f"/proc/self/fd/{file}").readlink()))
     noted(os, "rename", lambda old, new: str(new))
-    noted(opened._journal, "make_current", lambda row: "")
+    noted(os, "replace", lambda old, new: str(new))
     opened.commit({"x": np.arange(10), "y": np.array(1.5)}, upto=0)
-    parent = opened.path / "generations"
+    parent = opened.path / "checkpoints"
     final = parent / "00000001"
     i = events.index(("rename", str(final)))
     written = {final, *final.rglob("*")}
     draft = f"{final}.partial"
     assert {name.replace(draft, str(final)) for kind, name in events[:i] if kind == "fsync"} >= set(map(str, written))
-    assert events[i + 1 :] == [("fsync", str(parent)), ("make_current", "")]
+    current = opened.path / "CURRENT"
+    assert events[i + 1 :] == [
+        ("fsync", str(parent)),
+        ("fsync", f"{current}.new"),
+        ("replace", str(current)),
+        ("fsync", str(opened.path)),
+    ]
 
 
 def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
@@ -199,10 +205,10 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
     assert not isinstance(caught.value, DamageError)
 
 
-@pytest.mark.parametrize("instant", ["GroupReader", "read"])
-def test_a_reader_whose_generation_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
+@pytest.mark.parametrize("instant", ["CheckpointReader", "read"])
+def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
     opened.commit(ONE, upto=0)
-    owner = store.generations if instant == "GroupReader" else ArrayFiles
+    owner = store.checkpoints if instant == "CheckpointReader" else ArrayFiles
     real = getattr(owner, instant)
     waiting = [2, 3, 4]
 

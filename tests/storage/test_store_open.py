@@ -5,17 +5,16 @@ import json
 import multiprocessing
 import os
 import re
-import sqlite3
 import subprocess
 import sys
 import threading
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from store_builds import change, contents
+from store_builds import contents
 
+import store.layout
 import store.store
 from store import (
     LockedError,
@@ -25,7 +24,6 @@ from store import (
     StoreClosedError,
     StoreError,
     StoreFullError,
-    VersionError,
     check_store,
 )
 
@@ -170,14 +168,7 @@ def test_other_things_are_left_alone(tmp_path, mode):
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "thesis.txt").write_text("mine")
-    database = tmp_path / "database"
-    database.mkdir()
-    with closing(sqlite3.connect(database / "journal.sqlite")) as connection:
-        connection.execute("CREATE TABLE mine (x)")
-    text = tmp_path / "text"
-    text.mkdir()
-    (text / "journal.sqlite").write_text("dear diary" * 50)
-    for path in (tmp_path / "file", tmp_path / "file" / "below", folder, database, text):
+    for path in (tmp_path / "file", tmp_path / "file" / "below", folder):
         before = contents(path) if path.is_dir() else None
         with pytest.raises(StoreError if path.name == "below" else NotAStoreError, match=str(path)):
             Store.open(path, identity={}, mode=mode)
@@ -186,13 +177,15 @@ def test_other_things_are_left_alone(tmp_path, mode):
 
 def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_path, monkeypatch):
     Store.open(tmp_path / "s", identity={}).close()
-    there, looks = Path.is_file, []
+    real, looks = store.layout.read_current, []
 
-    def not_yet(path):
-        looks.append(path)
-        return len(looks) > 1 and there(path)
+    def not_yet(folder):
+        looks.append(folder)
+        if len(looks) == 1:
+            raise FileNotFoundError
+        return real(folder)
 
-    monkeypatch.setattr(Path, "is_file", not_yet)
+    monkeypatch.setattr(store.layout, "read_current", not_yet)
     with Store.open(tmp_path / "s", mode="read") as opened:
         assert opened.last == 0
 
@@ -202,39 +195,20 @@ def test_a_mode_is_read_or_write(tmp_path):
         Store.open(tmp_path, identity={}, mode="append")
 
 
-def test_a_future_format_is_refused_and_not_touched(tmp_path):
-    Store.open(tmp_path, identity={}).close()
-    change(tmp_path, "PRAGMA user_version = 7")
-    before = contents(tmp_path)
-    for mode in ("read", "write"):
-        with pytest.raises(VersionError, match=r"format 7; .* up to format 1: upgrade"):
-            Store.open(tmp_path, mode=mode)
-    assert contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("statement", ["PRAGMA journal_mode = DELETE", "ANALYZE", "VACUUM", "PRAGMA user_version = 1"])
-def test_what_another_program_may_do_to_the_journal_does_no_harm(tmp_path, statement):
-    with Store.open(tmp_path, identity={"a": 1}) as opened:
-        opened.append("a", "b", b"", arrays={"x": np.arange(3)})
-        opened.commit({"x": np.arange(3)}, upto=1)
-    with closing(sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)) as connection:
-        connection.execute(statement)
-    for mode in ("read", "write"):
-        with Store.open(tmp_path, mode=mode) as opened:
-            assert [row.label for row in opened.records()] == ["b"]
-            assert opened.latest().upto == 1
-    assert check_store(tmp_path) == []
-
-
-def test_an_interrupted_creation_is_finished_by_the_next(tmp_path):
-    (tmp_path / "lock").touch()
-    (tmp_path / "generations").mkdir()
-    (tmp_path / "journal.sqlite.new").write_bytes(b"SQLite for")
+@pytest.mark.parametrize("died", ["os.replace", "store.store.write_current", "store.layout.sync_open"])
+def test_an_interrupted_creation_is_finished_by_the_next(tmp_path, monkeypatch, died):
+    path = tmp_path / "s"
+    with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):
+        broken.setattr(died, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        Store.open(path, identity={"a": 0})
+    (path / "log-00000001.new").write_bytes(b"half")
+    (path / "CURRENT.new").write_bytes(b"half")
     with pytest.raises(NotAStoreError):
-        Store.open(tmp_path, mode="read")
-    with Store.open(tmp_path, identity={"a": 1}) as opened:
-        assert opened.append("a", "b", b"").sequence == 1
-    assert not (tmp_path / "journal.sqlite.new").exists()
+        Store.open(path, mode="read")
+    with Store.open(path, identity={"a": 1}) as opened:
+        assert (opened.append("a", "b", b"").sequence, opened.identity) == (1, {"a": 1})
+        assert contents(path).keys() == {"CURRENT", "lock", "holder.json", "log-00000001"}
+    assert check_store(path) == []
 
 
 def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):
@@ -252,7 +226,7 @@ def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):
         assert opened.last == durable > 1
         with pytest.raises(StoreFullError):
             opened.commit({"x": noise.integers(0, 2**60, 200_000)}, upto=1)
-        assert len(list((small_disk / "s" / "generations").iterdir())) == 1
+        assert len(list((small_disk / "s" / "checkpoints").iterdir())) == 1
         ballast.unlink()
         assert opened.append("a", "b", b"", arrays={"x": sent[-1]}).sequence == durable + 1
         assert opened.commit({"x": np.arange(4)}, upto=durable + 1)
@@ -274,27 +248,15 @@ def test_a_disk_that_may_not_be_written_can_be_read(small_disk):
             Store.open(folder, identity={})
 
 
-def test_a_database_that_may_not_grow_is_full(tmp_path):
-    with Store.open(tmp_path, identity={}) as opened:
-        opened.append("a", "b", b"")
-        with opened._journal._using("limiting its size") as connection:
-            connection.execute("PRAGMA max_page_count = 12")
-            with pytest.raises(StoreFullError):
-                opened.append("a", "b", b"", arrays={"x": np.random.default_rng(0).integers(0, 2**60, 9000)})
-            connection.execute("PRAGMA max_page_count = 100000")
-        assert opened.append("a", "c", b"").sequence == 2
-        assert [row.label for row in opened.records()] == ["b", "c"]
-
-
 def test_sizes_are_those_on_the_disk(tmp_path):
     with Store.open(tmp_path, identity={}) as opened:
-        assert opened.size()["generations"] == 0
+        assert opened.size()["checkpoints"] == 0
         opened.append("a", "b", b"")
         opened.commit({"x": np.arange(100)}, upto=1)
         found = opened.size()
-        assert found["journal"] == sum(path.stat().st_size for path in tmp_path.glob("journal.sqlite*"))
-        files = [path for path in (tmp_path / "generations").rglob("*") if path.is_file()]
-        assert found["generations"] == sum(path.stat().st_size for path in files) > 0
+        assert found["journal"] == (tmp_path / "log-00000001").stat().st_size
+        files = [path for path in (tmp_path / "checkpoints").rglob("*") if path.is_file()]
+        assert found["checkpoints"] == sum(path.stat().st_size for path in files) > 0
 
 
 def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_path, monkeypatch):
@@ -306,25 +268,9 @@ def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_p
 
     with monkeypatch.context() as broken:
         broken.setattr(Path, "unlink", read_only)
-        broken.setattr("store.groups._write_zarr", lambda *_: read_only(tmp_path))
+        broken.setattr("store.checkpoint_files._write_zarr", lambda *_: read_only(tmp_path))
         with pytest.raises(StoreError):
             opened.commit({}, upto=1)
         opened.close()
     with Store.open(tmp_path / "s") as again:
         assert again.last == 1
-
-
-def test_a_journal_that_sqlite_could_only_open_to_read_is_not_opened_to_write(tmp_path, monkeypatch):
-    Store.open(tmp_path / "s", identity={}).close()
-    connect = sqlite3.connect
-
-    def read_only(database, **options):
-        # As SQLite does by itself where opening the file to write fails.
-        return connect(database.replace("mode=rw", "mode=ro"), **options)
-
-    with monkeypatch.context() as broken:
-        broken.setattr(sqlite3, "connect", read_only)
-        with pytest.raises(ReadOnlyError, match="may not be written while opening the journal"):
-            Store.open(tmp_path / "s")
-    with Store.open(tmp_path / "s") as again:
-        assert again.append("a", "b", b"").sequence == 1

@@ -97,6 +97,7 @@ class Checkpoints:
             if current.newest is None or named.upto >= current.newest.upto:
                 self._commit(replace(current, newest=named))
             self.remove_unnamed()
+            self._journal.keep_index()
             return named.number
 
     def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:

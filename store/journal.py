@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,102 +12,27 @@ from store.archive import Files
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
-from store.framing import Frame
 from store.layout import CURRENT_FILE, Current, log_path
 from store.log import LogReader, Place
 from store.log_writer import LogWriter
 from store.records import JSON, Head, Record, from_json
 from store.row_encoding import (
-    HEAD_BYTES,
     ROW,
     decode_head,
     decode_row,
     encode_row,
-    head_size,
     head_without_arrays,
-    row_sequence,
-    verified_size,
+    key_prefix,
 )
+from store.rows import EVERY, Index, Rows, head_bytes
 
-__all__ = ["Journal", "Rows", "head_bytes"]
+__all__ = ["Journal"]
 
 logger = logging.getLogger(__name__)
 
 LAST_SEQUENCE = 2**62  # far beyond what anybody appends
-USUAL_HEAD = 512  # bytes that are read at once of a row's head
 ATTEMPTS = 8  # of a reader, while a writer puts another log in the place of the one
 MOST_PLACES = 4096
-
-
-class Rows:
-    """Which rows a log holds, in order: sequence, offset and size of each; and where damage lies between them."""
-
-    def __init__(self) -> None:
-        self.sequences, self.offsets, self.sizes = array("Q"), array("Q"), array("Q")
-        self.damage: dict[int, list[DamageError]] = {}  # by the count of the rows before it
-
-    def __len__(self) -> int:
-        return len(self.sizes)
-
-    def add(self, sequence: int, frame: Frame) -> None:
-        """Add the row in a frame."""
-        self.sequences.append(sequence)
-        self.offsets.append(frame.offset)
-        self.sizes.append(frame.size)
-
-    def cut(self, count: int) -> None:
-        """Keep the first rows alone."""
-        del self.sequences[count:], self.offsets[count:], self.sizes[count:]
-
-    def extend(self, rows: Rows) -> None:
-        """Add rows behind these."""
-        for index, damage in rows.damage.items():
-            self.damage.setdefault(len(self) + index, []).extend(damage)
-        self.sequences += rows.sequences
-        self.offsets += rows.offsets
-        self.sizes += rows.sizes
-
-    def take(self, log: LogReader, until: int | None = None) -> Iterator[Place]:
-        """Add the rows that follow in a log, up to an offset; yield the place behind each batch. Damage is noted."""
-        while True:
-            try:
-                for batch in log.refresh():
-                    for frame in batch:
-                        if until is not None and frame.offset >= until:
-                            return
-                        if frame.kind == ROW:
-                            self._take(log, frame)
-                    yield log.place
-                return
-            except DamageError as damage:
-                noted = self.damage.setdefault(len(self), [])
-                if damage.offset in [earlier.offset for earlier in noted]:
-                    return  # nothing can be read behind it
-                noted.append(damage)
-                with suppress(DamageError):
-                    log.resume()
-
-    def _take(self, log: LogReader, frame: Frame) -> None:
-        try:
-            if log.payloads:
-                sequence = row_sequence(log.peek(frame.offset, min(HEAD_BYTES, frame.size)))
-            else:
-                verified_size(data := head_bytes(log, frame.offset, frame.size), frame.size)
-                sequence = row_sequence(data)
-            if self.sequences and sequence <= self.sequences[-1]:
-                raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
-        except ValueError as error:
-            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
-            self.damage.setdefault(len(self), []).append(DamageError(what, path=log.path, offset=frame.offset))
-        else:
-            self.add(sequence, frame)
-
-
-def head_bytes(log: LogReader, offset: int, size: int) -> bytes:
-    """Return the bytes of a row without its arrays, not verified; raise ValueError for no row."""
-    data = log.peek(offset, min(size, USUAL_HEAD))
-    needed = head_size(data, size)
-    return data[:needed] if needed <= len(data) else log.peek(offset, needed)
 
 
 class _OpenLog:
@@ -127,6 +51,7 @@ class _OpenLog:
             if self.log.identity != current.log_identity:
                 raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
             self.identity = self._read_identity()
+            self.index = Index(files.folder, current.log_identity, self.log.beginning)
             if named is not None and self.log.place == named.place:
                 self.first = named.upto
             self.read_all = self.first == 0
@@ -194,12 +119,37 @@ class _OpenLog:
             self._read_before()
         return bisect_right(self.rows.sequences, after)
 
-    def _read_before(self) -> None:
-        earlier, until = Rows(), self.places[0][1].offset
-        for _ in earlier.take(self.log.from_its_beginning(), until):
+    def _read_before(self, *, indexed: bool = True) -> None:
+        until = self.places[0][1].offset
+        earlier = self.index.read(until) if indexed and not self._files.is_packed else Rows()
+        for _ in earlier.take(self.log.beginning_at(self.index.end), until):
             pass
         earlier.extend(self.rows)
         self.rows, self.read_all = earlier, True
+
+    def drop_index(self) -> bool:
+        """Read the log itself where an index was used, which may be wrong; whether one was."""
+        if not self.index.count:
+            return False
+        end, staged = self.log.place.offset, Rows()
+        for row in zip(self.rows.sequences, self.rows.offsets, self.rows.sizes, self.rows.keys, strict=True):
+            if row[1] >= end:
+                staged.append(*row)
+        self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
+        self.rows, self.first, self.read_all = Rows(), 0, True
+        for _ in self.rows.take(self.log.beginning_at(self.log.beginning), end):
+            pass
+        self.rows.extend(staged)
+        return True
+
+    def keep_index(self) -> None:
+        """Have the files of the index say what is known, where that is much more than they do."""
+        if len(self.rows) >= EVERY:
+            self.find(0)
+            try:
+                self.index.write(self.rows, self.log.place)
+            except OSError as error:
+                logger.warning("%s: the index of rows could not be written: %s", self.path, error)
 
     def head(self, index: int) -> Head:
         """Return the head of a row. Raises DamageError, and ValueError for what is none."""
@@ -355,7 +305,8 @@ class Journal:
                 raise DamageError(f"{at.path} has a row, or a checkpoint, of number {at.last}", path=at.path)
             data = encode_row(sequence, kind, label, key, time, attributes, payload, len(payload))
             try:
-                at.rows.add(sequence, writer.stage(ROW, data))
+                frame = writer.stage(ROW, data)
+                at.rows.append(sequence, frame.offset, frame.size, key_prefix(key))
                 if not self._batch:
                     writer.commit()
                     at.note_place(writer.place)
@@ -392,13 +343,15 @@ class Journal:
             with self._using(f"reading rows behind {after}") as at:
                 index = at.find(after)
                 found = at.rows.sequences[index] if index < len(at.rows) else last + 1
-                if not chosen:
-                    self._require_no_gap(at, after, min(found - 1, last), index)
-                if found > last:
-                    return
                 try:
+                    if not chosen:
+                        self._require_no_gap(at, after, min(found - 1, last), index)
+                    if found > last:
+                        return
                     head = self._record(at, index) if arrays else self._head(at, index)
                 except DamageError:
+                    if at.drop_index():
+                        continue
                     if not chosen:
                         raise
             after = found
@@ -437,6 +390,21 @@ class Journal:
             return Record(**vars(row.head), arrays=decode_payload(row.payload))
         except (DamageError, ValueError) as error:
             raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
+
+    def with_key(self, key: bytes) -> Iterator[Head]:
+        """Yield the rows of a key, but for damaged ones."""
+        with self._looking("looking for a key") as at:
+            at.find(0)
+            for index in at.rows.with_key(key):
+                with suppress(DamageError):
+                    head = self._head(at, index)
+                    if head.key == key:
+                        yield head
+
+    def keep_index(self) -> None:
+        """Write what is known of the rows beside the log, so that nobody has to read it for that."""
+        with self._using("keeping the index of rows") as at:
+            at.keep_index()
 
     def given_up(self, sequence: int) -> CompactedError:
         """Return the error for a row whose arrays a base stands for."""

@@ -388,12 +388,18 @@ class LogReader:
         with reported(self.path, "looking for the log"):
             return not self._file.is_at(self.path)
 
-    def from_its_beginning(self) -> LogReader:
+    @property
+    def beginning(self) -> Place:
+        """The place of the first frame behind the header."""
+        assert self._first is not None, "its header is damaged"
+        return Place.behind(self._first)
+
+    def beginning_at(self, place: Place) -> LogReader:
         """Return another reader, of heads alone, of the same open file, whatever its path names by now.
 
         That one is not to be closed.
         """
-        return LogReader(self.path, payloads=False, file=self._file)
+        return LogReader(self.path, place=place, payloads=False, file=self._file)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -17,6 +17,8 @@ __all__ = [
     "encode_row",
     "head_size",
     "head_without_arrays",
+    "key_prefix",
+    "prefix_in",
     "row_sequence",
     "verified_size",
 ]
@@ -61,6 +63,16 @@ def row_sequence(data: bytes) -> int:
     if not 1 <= sequence <= LARGEST_NUMBER:
         raise ValueError(f"a row has the sequence {sequence}")
     return sequence
+
+
+def key_prefix(key: bytes) -> int:
+    """Return the first eight bytes of a key as a number, by which a row is looked for; equal keys have equal ones."""
+    return int.from_bytes(key[:8], "little")
+
+
+def prefix_in(data: bytes) -> int:
+    """Return the `key_prefix` of a row of which these are the first HEAD_BYTES + 8, or all."""
+    return key_prefix(data[HEAD_BYTES : HEAD_BYTES + min(8, FIELDS.unpack_from(data)[4])])
 
 
 def head_size(data: bytes, whole: int) -> int:

@@ -17,7 +17,6 @@ from store.encoding import decode_payload
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from store.files import store_folder
 from store.framing import FRAME_BYTES, NO_CHECKSUM, read_frame
-from store.journal import Rows, head_bytes
 from store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
@@ -36,6 +35,7 @@ from store.layout import (
 from store.log import LogReader, Place, find_identity
 from store.records import JSON, from_json
 from store.row_encoding import ROW, decode_head, decode_row, row_sequence
+from store.rows import Rows, head_bytes
 
 __all__ = ["Fault", "FoundCheckpoint", "FoundLog", "Problem", "Progress", "Survey", "check_store", "require_store"]
 

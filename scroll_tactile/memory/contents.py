@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from scroll_tactile.memory.rows import MEMBER, OBSERVE
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.ranges import CURE
+from store import Head, Store
 
-__all__ = ["Contents", "KnownContents", "refusal"]
+__all__ = ["Contents", "StoredContents", "refusal"]
 
 
 def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
@@ -63,33 +66,22 @@ class Contents:
         return min((sequence for name, sequence in self._rows.get(key, ()) if name == material), default=None)
 
 
-class KnownContents:
-    """The contents of a memory: read when they are first asked for, and changed with it from then on.
+class StoredContents:
+    """The touches of a memory that is kept in a store, looked for there. memory: gives it as it is just now."""
 
-    read: reads them. contents: where they are known already.
-    """
+    def __init__(self, store: Store, memory: Callable[[], Memory]) -> None:
+        self._store, self._memory = store, memory
 
-    def __init__(self, read: Callable[[], Contents], contents: Contents | None = None) -> None:
-        self._read, self._contents = read, contents
+    def _standing(self, key: bytes) -> list[Head]:
+        memory = self._memory()
+        gone = memory.retracted | memory.excluded
+        found = (head for head in self._store.with_key(key) if head.kind in (OBSERVE, MEMBER))
+        return [head for head in found if head.sequence <= memory.sequence and head.sequence not in gone]
 
-    def get(self) -> Contents:
-        """The contents."""
-        if self._contents is None:
-            self._contents = self._read()
-        return self._contents
+    def names(self, key: bytes) -> list[str]:
+        """As `Contents.names`."""
+        return list(dict.fromkeys(head.label for head in self._standing(key)))
 
-    def added(self, rows: Iterable[tuple[str, bytes, int]]) -> None:
-        """Touches were added, as the rows of `Contents`; they are not gone through before anybody asked."""
-        if self._contents is not None:
-            for row in rows:
-                self._contents.add(*row)
-
-    def removed(self, rows: Iterable[tuple[str, bytes, int]]) -> None:
-        """Touches were taken out, as `added`."""
-        if self._contents is not None:
-            for row in rows:
-                self._contents.remove(*row)
-
-    def unknown(self) -> None:
-        """The memory is another, or changed in a way that only reading tells."""
-        self._contents = None
+    def find(self, material: str, key: bytes) -> int | None:
+        """As `Contents.find`."""
+        return min((head.sequence for head in self._standing(key) if head.label == material), default=None)

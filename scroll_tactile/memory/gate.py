@@ -125,6 +125,10 @@ class MemoryStore(Store):
         """As `Store.heads`."""
         return map(self.gate.head, super().heads(after, kind=kind, label=label))
 
+    def with_key(self, key: bytes) -> Iterator[Head]:
+        """As `Store.with_key`."""
+        return map(self.gate.head, super().with_key(key))
+
     def record(self, sequence: int) -> Record:
         """As `Store.record`."""
         return self.gate.record(super().record(sequence))

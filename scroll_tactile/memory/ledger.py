@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.changes import apply_appended, relabel
-from scroll_tactile.memory.contents import Contents, KnownContents
+from scroll_tactile.memory.contents import Contents, StoredContents
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
@@ -78,7 +78,7 @@ class Ledger:
         contents: Contents | None = None,
     ) -> None:
         self.store = store
-        self._contents = KnownContents(self._read_contents, contents)
+        self._contents = contents
         self._bare = bare
         self.lock = threading.RLock()
         self.version = 0
@@ -102,38 +102,34 @@ class Ledger:
                 self._undo()
             else:
                 self._memory = self._load()
-                self._contents.unknown()
             self._whole = True
             self._changed()
         return self._memory
 
-    def contents(self) -> Contents:
+    def contents(self) -> Contents | StoredContents:
         """Which touches the memory has, by their content; whoever calls holds the lock.
 
-        Raises StoreClosedError where the memory was closed before anybody asked, and for a snapshot of such a one.
+        Raises StoreClosedError for a snapshot of a memory that was closed before anybody asked.
         """
-        _ = self.memory  # where a change was cut short, both are read again
-        return self._contents.get()
-
-    def _read_contents(self) -> Contents:
-        """The contents by the heads of the journal: 13 us a row, for each is verified."""
-        memory, store = self._memory, self.store
-        if store is None:
+        _ = self.memory  # where a change was cut short, it is read again
+        if self.store is not None:
+            return StoredContents(self.store, lambda: self._memory)
+        if self._contents is None:
             raise StoreClosedError(
                 "this is a snapshot of a memory that was closed, which does not say what touches it has: make it "
                 "before the memory is closed, or observe with again=True"
             )
-        gone = memory.gone(_sound(store, RETRACT), memory.sequence)
-        heads = itertools.takewhile(lambda head: head.sequence <= memory.sequence, _sound(store))
-        stand = (head for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence not in gone)
-        return Contents(map(_touch, stand))
+        return self._contents
 
     def copied_contents(self) -> Contents | None:
-        """A copy of `contents`; None where it raises StoreClosedError."""
-        try:
-            return self.contents().copy()
-        except StoreClosedError:
-            return None
+        """All that `contents` has, to be changed apart; None where nobody knows."""
+        memory, store = self.memory, self.store
+        if store is None or self._closed:
+            return None if self._contents is None else self._contents.copy()
+        gone = memory.retracted | memory.excluded
+        heads = itertools.takewhile(lambda head: head.sequence <= memory.sequence, _sound(store))
+        stand = (head for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence not in gone)
+        return Contents((head.label, head.key, head.sequence) for head in stand)
 
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
         durable = self.store is not None and not self._batching
@@ -222,7 +218,8 @@ class Ledger:
             undo = self._undo_of(material, stream.key, columns) if self.store is None else None
             with self._mutation(_nothing, undo):
                 sequence = self._append(material, stream, columns, codes, source)
-                self._contents.added([(material, stream.key, sequence)])
+                if self._contents is not None:
+                    self._contents.add(material, stream.key, sequence)
                 self._changed([(material, codes, 1)])
             self._snapshot_if_due()
             return self._receipt(sequence, material, stream)
@@ -233,7 +230,8 @@ class Ledger:
 
         def undo() -> None:
             memory()
-            self._contents.removed([(material, key, sequence)])
+            if self._contents is not None:
+                self._contents.remove(material, key, sequence)
 
         return undo
 
@@ -308,7 +306,6 @@ class Ledger:
             memory.refill(store)
             memory.sequence = store.append(RETRACT, material, b"", attributes={"sequences": sequences}).sequence
             memory.describe(material, None)
-            self._contents.removed(map(_touch, records))
             self._changed(retracted)
         self._snapshot_if_due()
 
@@ -322,8 +319,6 @@ class Ledger:
                 with store.batch():
                     self._changed(relabel(self._memory, store, record, material))
                 sequence = self._memory.sequence
-                self._contents.removed([_touch(record)])
-                self._contents.added([(material, record.key, sequence)])
             self._snapshot_if_due()
             return sequence
 
@@ -400,11 +395,8 @@ class Ledger:
                     one_name=one_name,
                     descriptions=descriptions,
                 )
-                before = memory.sequence
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
-                    came = (head for head in store.heads(before) if head.kind in (OBSERVE, MEMBER))
-                    self._contents.added(map(_touch, came))
             self._changed()
             self._snapshot_if_due()
         return Merged(added, incoming.shared, len(incoming.descriptions)), incoming.refused
@@ -448,13 +440,11 @@ class Ledger:
             try:
                 if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
-                    self._contents.unknown()
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
                     return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
-            self._contents.unknown()
             self._memory, self._whole = self._load(), True
             self._changed()
             return True
@@ -528,11 +518,6 @@ class Ledger:
 
 def _nothing() -> None:
     """Nothing to revert: the journal refused the row before the memory was changed."""
-
-
-def _touch(row: Head | Record) -> tuple[str, bytes, int]:
-    """The touch of a row, as `Contents` takes it."""
-    return row.label, row.key, row.sequence
 
 
 def _sound(store: Store, kind: str | None = None) -> Iterator[Head]:

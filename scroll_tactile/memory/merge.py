@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 from pydantic import BaseModel
 
 from scroll_tactile.errors import InputError, MismatchError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory.contents import Contents, refusal
+from scroll_tactile.memory.contents import Contents, StoredContents, refusal
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import MemoryStore, require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
@@ -163,7 +163,7 @@ class Incoming:
         ours: Store,
         memory: Memory,
         theirs: MemoryStore,
-        contents: Contents,
+        contents: Contents | StoredContents,
         *,
         once: bool,
         one_name: bool,
@@ -257,12 +257,12 @@ class Incoming:
                 yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
 
 
-def _row(contents: Contents, head: Head) -> int | None:
+def _row(contents: Contents | StoredContents, head: Head) -> int | None:
     """Our row of a touch that both have under one name; None where we have it not."""
     return contents.find(head.label, head.key)
 
 
-def _refused(incoming: Sequence[Head], contents: Contents) -> Iterator[tuple[Head, str]]:
+def _refused(incoming: Sequence[Head], contents: Contents | StoredContents) -> Iterator[tuple[Head, str]]:
     """The touches that are there under another name, or came under another just before, and why they are refused."""
     came: dict[bytes, str] = {}
     for head in incoming:

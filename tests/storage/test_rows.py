@@ -1,0 +1,119 @@
+"""Where rows are is known from the index's files, or from the log where they are wrong or lost, and always the same."""
+
+import random
+import shutil
+import struct
+
+import numpy as np
+import pytest
+
+import store.journal
+import store.rows
+from store import Store
+from store.records import payload_digest
+from store.rows import HEADER
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(store.rows, "EVERY", 8)
+    monkeypatch.setattr(store.journal, "EVERY", 8)
+
+
+def made(path, rows=100, seed=0):
+    """A store with rows of a few keys, checkpoints and several files of the index; its keys by sequence."""
+    draw, keys = random.Random(seed), {}
+    with Store.open(path, identity={"of": "rows"}) as kept:
+        for _ in range(rows):
+            key = bytes([draw.randrange(12)]) * draw.choice((0, 3, 8, 32))
+            head = kept.append("observe", "a", key, arrays={"x": np.arange(3)})
+            keys[head.sequence] = key
+            if draw.random() < 0.2:
+                kept.commit({"sum": np.arange(4)}, upto=head.sequence)
+        kept.commit({"sum": np.arange(4)}, upto=kept.last)
+    return keys
+
+
+def files(path):
+    return sorted((path / "derived").iterdir())
+
+
+def require_all(path, keys):
+    """Every key finds its rows, and every row is what was written."""
+    with Store.open(path, mode="read") as kept:
+        for key in set(keys.values()):
+            assert [head.sequence for head in kept.with_key(key)] == [n for n, own in keys.items() if own == key]
+        assert list(kept.with_key(b"never")) == []
+        assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
+        assert kept.record(1).key == keys[1]
+
+
+def test_it_is_the_log_that_counts_whatever_the_files_say(tmp_path):
+    keys = made(tmp_path / "s")
+    assert len(files(tmp_path / "s")) > 1
+    require_all(tmp_path / "s", keys)
+    for file in files(tmp_path / "s"):
+        whole = file.read_bytes()
+        for place in (0, 9, 20, 60, HEADER.size + 3, len(whole) // 2, -1):
+            harmed = bytearray(whole)
+            harmed[place] ^= 1
+            file.write_bytes(harmed)
+            require_all(tmp_path / "s", keys)
+        file.write_bytes(whole[:-40])
+        require_all(tmp_path / "s", keys)
+        file.write_bytes(whole)
+    shutil.rmtree(tmp_path / "s" / "derived")
+    require_all(tmp_path / "s", keys)
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, column):
+    keys = made(tmp_path / "s")
+    file = files(tmp_path / "s")[0]
+    data = bytearray(file.read_bytes()[:-16])
+    count = HEADER.unpack_from(data)[-1]
+    at = HEADER.size + 8 * count * column + 8 * (count // 2)
+    struct.pack_into("<Q", data, at, struct.unpack_from("<Q", data, at)[0] + 1)
+    file.write_bytes(bytes(data) + payload_digest(bytes(data)))
+    with Store.open(tmp_path / "s", mode="read") as kept:
+        assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
+
+
+def test_files_of_another_log_are_not_believed(tmp_path):
+    made(tmp_path / "other", rows=60, seed=1)
+    keys = made(tmp_path / "s")
+    shutil.rmtree(tmp_path / "s" / "derived")
+    shutil.copytree(tmp_path / "other" / "derived", tmp_path / "s" / "derived")
+    require_all(tmp_path / "s", keys)
+
+
+def test_a_new_log_has_files_of_its_own(tmp_path):
+    keys = made(tmp_path / "s")
+    with Store.open(tmp_path / "s") as kept:
+        kept.compact({"sum": np.arange(4)}, upto=60)
+        for _ in range(20):
+            head = kept.append("observe", "b", b"new")
+            keys[head.sequence] = b"new"
+        kept.commit({"sum": np.arange(4)}, upto=kept.last)
+    with Store.open(tmp_path / "s", mode="read") as kept:
+        assert [head.sequence for head in kept.with_key(b"new")] == list(range(101, 121))
+        assert [head.sequence for head in kept.heads()] == list(keys)
+    assert len(files(tmp_path / "s")) == 1
+
+
+def test_there_are_few_files_however_many_rows(tmp_path):
+    keys = made(tmp_path / "s", rows=600)
+    assert len(files(tmp_path / "s")) <= 8
+    require_all(tmp_path / "s", keys)
+
+
+def test_a_writer_that_opens_it_again_goes_on_with_its_files(tmp_path):
+    keys = made(tmp_path / "s")
+    for _ in range(6):
+        with Store.open(tmp_path / "s") as kept:
+            for _ in range(5):
+                head = kept.append("observe", "b", b"again")
+                keys[head.sequence] = b"again"
+            assert len(list(kept.with_key(b"again"))) == sum(key == b"again" for key in keys.values())
+            kept.commit({"sum": np.arange(4)}, upto=kept.last)
+    require_all(tmp_path / "s", keys)

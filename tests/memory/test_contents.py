@@ -66,17 +66,12 @@ class TestOneContent:
                 break
 
     @pytest.mark.parametrize("asked", [True, False])
-    def test_a_snapshot_of_a_closed_memory_knows_what_is_there_or_says_that_it_does_not(self, tmp_path, asked):
+    def test_a_snapshot_of_a_closed_memory_says_that_it_does_not_know_what_is_there(self, tmp_path):
         filled(tmp_path / "m", OBSERVED, exemplars=0)[0].close()
         learner = TactileLearner.open(tmp_path / "m")
-        if asked:
-            learner.names_of(stream((0, 60)))
         learner.close()
         for other in (pickle.loads(pickle.dumps(learner)), copy.deepcopy(copy.deepcopy(learner))):
             assert other.digest() == learner.digest()
-            if asked:
-                assert other.observe("a", stream((0, 60))).repeated
-                continue
             for call in ((other.names_of,), (other.observe, "a")):
                 with pytest.raises(StoreClosedError, match="snapshot of a memory that was closed"):
                     call[0](*call[1:], stream((0, 60)))
@@ -193,7 +188,7 @@ class TestChanges:
         learner, receipts = filled(tmp_path / "m", OBSERVED[:6])
         with learner:
             assert learner.names_of(stream((0, 60))) == ["a"]
-            monkeypatch.setattr(learner._ledger._contents, "_read", None)
+            monkeypatch.setattr(learner._ledger.store._journal._open, "_read_before", None)
             for receipt in receipts[:3]:
                 learner.relabel(receipt, "z")
                 assert learner.observe("z", stream((receipt.sequence - 1, 60))).repeated

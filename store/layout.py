@@ -177,10 +177,10 @@ def write_current(folder: Path, current: Current) -> None:
             file.write(current.to_bytes())
             file.flush()
             sync_open(file.fileno())
+        draft.replace(folder / CURRENT_FILE)
     except BaseException:
         remove_tree(draft)
         raise
-    draft.replace(folder / CURRENT_FILE)
     sync_folder(folder)
 
 
@@ -325,6 +325,7 @@ def remove_unnamed(folder: Path, current: Current) -> None:
 
     What does not carry a name of ours is left alone.
     """
+    remove_tree(folder / (CURRENT_FILE + NEW))
     for number in log_numbers(folder, unfinished=True):
         path = log_path(folder, number)
         if number != current.log:

@@ -131,15 +131,19 @@ class Current:
             if current.base is not None and (current.newest is None or current.newest.upto < current.base.upto):
                 raise ValueError("its base is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:
-            raise DamageError(
-                f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and "
-                "the checkpoints by themselves",
-                path=path,
-            ) from error
+            raise _not_as_written(path, error) from error
         return current
 
 
 NAMES = ("newest", "base")
+
+
+def _not_as_written(path: Path, error: Exception) -> DamageError:
+    return DamageError(
+        f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and the "
+        "checkpoints by themselves",
+        path=path,
+    )
 
 
 def _digest(known: dict[str, Any]) -> str:
@@ -161,7 +165,11 @@ def _hex(text: Any, size: int) -> bytes:
 def read_current(folder: Path) -> Current:
     """Return what `CURRENT` says. Raises DamageError, VersionError, and OSError where it is not there."""
     path = folder / CURRENT_FILE
-    return Current.from_bytes(read_regular(path, LARGEST_CURRENT), path)
+    try:
+        data = read_regular(path, LARGEST_CURRENT)
+    except DamageError as error:
+        raise _not_as_written(path, error) from error
+    return Current.from_bytes(data, path)
 
 
 def write_current(folder: Path, current: Current) -> None:

@@ -132,15 +132,19 @@ class Current:
             if current.base is not None and (current.newest is None or current.newest.upto < current.base.upto):
                 raise ValueError("its base is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:
-            raise DamageError(
-                f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and "
-                "the checkpoints by themselves",
-                path=path,
-            ) from error
+            raise _not_as_written(path, error) from error
         return current
 
 
 NAMES = ("newest", "base")
+
+
+def _not_as_written(path: Path, error: Exception) -> DamageError:
+    return DamageError(
+        f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and the "
+        "checkpoints by themselves",
+        path=path,
+    )
 
 
 def _digest(known: dict[str, Any]) -> str:
@@ -161,7 +165,11 @@ def _hex(text: Any, size: int) -> bytes:
 
 def read_current(path: Path, read: Callable[[Path, int], bytes] = read_regular) -> Current:
     """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
-    return Current.from_bytes(read(path, LARGEST_CURRENT), path)
+    try:
+        data = read(path, LARGEST_CURRENT)
+    except DamageError as error:
+        raise _not_as_written(path, error) from error
+    return Current.from_bytes(data, path)
 
 
 def write_current(folder: Path, current: Current) -> None:
@@ -177,10 +185,10 @@ def write_current(folder: Path, current: Current) -> None:
             file.write(current.to_bytes())
             file.flush()
             sync_open(file.fileno())
+        draft.replace(folder / CURRENT_FILE)
     except BaseException:
         remove_tree(draft)
         raise
-    draft.replace(folder / CURRENT_FILE)
     sync_folder(folder)
 
 
@@ -325,6 +333,7 @@ def remove_unnamed(folder: Path, current: Current) -> None:
 
     What does not carry a name of ours is left alone.
     """
+    remove_tree(folder / (CURRENT_FILE + NEW))
     for number in log_numbers(folder, unfinished=True):
         path = log_path(folder, number)
         if number != current.log:

@@ -232,6 +232,11 @@ class FoundLog:
         self.rows.append((sequence, fault))
 
     @property
+    def last(self) -> int:
+        """The sequence of its last row, 0 without any."""
+        return self.rows[-1][0] if self.rows else 0
+
+    @property
     def is_read(self) -> bool:
         """Whether anything of it was read."""
         return self._reader is not None
@@ -326,25 +331,27 @@ class Survey:
             return FoundCheckpoint(number, path, named, is_base, [wrong], None)
 
     def _found_log(self) -> FoundLog:
-        """Return the log that counts: without `CURRENT` the newest for whose compacted rows a checkpoint stands."""
-        if self.current is not None:
-            path = log_path(self.folder, self.current.log)
-            return FoundLog(self.files, _or_aside(path), self.current.log_identity, self.progress)
-        there = [log_path(self.folder, number) for number in reversed(log_numbers(self.folder))]
-        there += sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}"), reverse=True)
+        """Return the log that counts; where that is gone, or nobody knows which it was, the one that tells most.
+
+        Of logs whose compacted rows no checkpoint stands for there is none to go on from.
+        """
+        named, aside = log_path(self.folder, 1), list[Path]()
+        if self.current is None:
+            aside = sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}*"))
+        else:
+            named = _or_aside(log_path(self.folder, self.current.log))
+            if self.files.is_packed or named.exists():
+                return FoundLog(self.files, named, self.current.log_identity, self.progress)
+        there = [log_path(self.folder, number) for number in log_numbers(self.folder)]
         newest = self.sound[0].upto if self.sound else 0
-        first: FoundLog | None = None
-        for path in there:
-            log = FoundLog(self.files, path, None, self.progress)
-            if log.compacted <= newest:
-                if first is not None:
-                    first.close()
-                return log
-            if first is None:
-                first = log
-            else:
+        found = [FoundLog(self.files, path, None, self.progress) for path in there or aside[-1:]]
+        best = max(found, key=lambda log: (log.compacted <= newest, log.last), default=None)
+        for log in found:
+            if log is not best:
                 log.close()
-        return first or FoundLog(self.files, log_path(self.folder, 1), None, self.progress)
+        if self.current is not None and best is not None:
+            self.damage.append(Problem(named, f"{named} is gone: {best.path} is what was before it", "lost"))
+        return best or FoundLog(self.files, named, None, self.progress)
 
     def _drop_foreign(self) -> None:
         """Where a checkpoint is another store's it does not count."""

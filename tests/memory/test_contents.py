@@ -65,7 +65,6 @@ class TestOneContent:
             else:
                 break
 
-    @pytest.mark.parametrize("asked", [True, False])
     def test_a_snapshot_of_a_closed_memory_says_that_it_does_not_know_what_is_there(self, tmp_path):
         filled(tmp_path / "m", OBSERVED, exemplars=0)[0].close()
         learner = TactileLearner.open(tmp_path / "m")

@@ -75,7 +75,7 @@ def test_a_copy_is_the_store_and_goes_on_by_itself(either, tmp_path, mode):
     assert sorted(path.name for path in (tmp_path / "new" / "copy").iterdir()) == [
         "CURRENT",
         "checkpoints",
-        f"log-0000000{1 + which}",
+        log_of(either).name,
     ]
     assert same_store(tmp_path / "new" / "copy", either)
     assert kept(either) == before

@@ -1,15 +1,18 @@
-"""Compaction: a base stands for rows that have given up their arrays."""
+"""Compaction: a base stands for rows that have given up their arrays, in a log that takes the other's place."""
 
-import logging
-import sqlite3
-from contextlib import closing
+import errno
+import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
-import store.generations
-from store_builds import as_after_a_crash, change, folders, query
+from store_builds import as_after_a_crash, base, damage, flip_row, folders, log_of, newest, rows
 
-from store import CompactedError, DamageError, RecordError, Store, StoreError
+import store.checkpoints
+import store.layout
+from store import CompactedError, DamageError, RecordError, Store, StoreError, check_store
+from store.row_encoding import decode_row
 
 LAST = 12
 
@@ -26,24 +29,41 @@ def sums(upto):
     return {"sum": np.array(upto * (upto + 1) // 2), "bulk": np.full(500, upto)}
 
 
-@pytest.fixture
-def opened(tmp_path):
-    """Twelve rows, and a generation up to the last; one up to row 8 was before it."""
-    with Store.open(tmp_path / "s", identity={"for": "compaction"}) as fresh:
+def compact(opened, upto, **options):
+    opened.compact(sums(upto), upto=upto, newest=(sums(opened.last), {}), **options)
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory):
+    """Twelve rows, and a checkpoint up to the last; not to be changed."""
+    with Store.open(tmp_path_factory.mktemp("made") / "s", identity={"for": "compaction"}) as fresh:
         for number in range(1, LAST + 1):
             add(fresh, number)
-        fresh.commit(sums(8), upto=8)
         fresh.commit(sums(LAST), upto=LAST)
-        yield fresh
+    return fresh.path
 
 
-def spoil(opened, number):
-    chunk = opened.path / "generations" / f"{number:08d}" / "bulk" / "c" / "0"
+@pytest.fixture
+def opened(made, tmp_path):
+    with Store.open(shutil.copytree(made, tmp_path / "s")) as copy:
+        yield copy
+
+
+def path_of(file):
+    return str(Path(f"/proc/self/fd/{file}").readlink())
+
+
+def open_files():
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def spoil(folder):
+    chunk = folder / "bulk" / "c" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-1])
 
 
 def payloads(path):
-    return [sequence for (sequence,) in query(path, "SELECT sequence FROM payload ORDER BY sequence")]
+    return [number for number, data in rows(path).items() if decode_row(data).payload is not None]
 
 
 def agrees(opened, compacted, last=LAST):
@@ -54,23 +74,22 @@ def agrees(opened, compacted, last=LAST):
     for after in range(compacted):
         with pytest.raises(CompactedError, match=f"records 1 to {compacted}"):
             opened.records(after)
-    base = opened.base()
+    found = opened.base()
     if compacted:
-        assert (base.upto, base.arrays["sum"]) == (compacted, sums(compacted)["sum"])
+        assert (found.upto, found.arrays["sum"]) == (compacted, sums(compacted)["sum"])
     else:
-        assert base is None
+        assert found is None
     return True
 
 
 def test_rows_give_up_their_arrays_for_the_base_and_keep_their_heads(opened):
     before = list(opened.heads())
-    opened.compact(sums(5), upto=5, attributes={"made": "now"})
+    compact(opened, 5, attributes={"made": "now"})
     assert agrees(opened, 5)
     assert list(opened.heads()) == before
     assert payloads(opened.path) == list(range(6, LAST + 1))
     assert opened.base().attributes == {"made": "now"}
     assert opened.base().arrays["bulk"][100:102].tolist() == [5, 5]
-    # The newest is still the one with all rows, whatever its number.
     assert opened.latest().upto == LAST
     opened.close()
     for mode in ("read", "write"):
@@ -78,198 +97,252 @@ def test_rows_give_up_their_arrays_for_the_base_and_keep_their_heads(opened):
             assert agrees(again, 5)
 
 
-def test_the_space_is_given_back_to_the_disk(opened):
-    before = opened.size()["journal"]
-    opened.compact(sums(LAST), upto=LAST)
-    # A row without its arrays takes some 200 bytes, a table a page; the log is empty.
-    assert opened.size()["journal"] < before / 2
-    assert (opened.path / "journal.sqlite").stat().st_size < 9 * 4096
-    assert (opened.path / "journal.sqlite-wal").stat().st_size == 0
-
-
-def test_the_base_stays_while_generations_come_and_go(opened):
+def test_no_commit_is_needed_before_and_the_base_may_be_the_newest(opened):
+    add(opened, LAST + 1)
     opened.compact(sums(5), upto=5)
-    base = opened.base().number
-    for number in range(LAST + 1, LAST + 6):
+    assert agrees(opened, 5, LAST + 1)
+    assert (opened.latest().upto, opened.newest, len(folders(opened.path))) == (5, opened.base().number, 1)
+
+
+def test_the_space_is_given_back_to_the_disk(opened):
+    before = log_of(opened.path).stat().st_size
+    opened.compact(sums(LAST), upto=LAST)
+    opened.close()
+    # A row without its arrays takes some 200 bytes; there is one log and one checkpoint.
+    assert log_of(opened.path).stat().st_size < LAST * 300 < before
+    assert folders(opened.path) == ["00000002"]
+    assert sorted(entry.name for entry in opened.path.iterdir()) == ["CURRENT", "checkpoints", "lock", "log-00000002"]
+
+
+def test_there_is_one_checkpoint_and_beside_it_the_base_which_stays(opened):
+    assert folders(opened.path) == ["00000001"]
+    compact(opened, 5)
+    assert folders(opened.path) == ["00000002", "00000003"]
+    for number in range(LAST + 1, LAST + 5):
         add(opened, number)
         opened.commit(sums(number), upto=number)
         assert agrees(opened, 5, number)
-        assert opened.base().number == base
-    assert len(folders(opened.path)) == 2  # the current and the base
+        assert folders(opened.path) == ["00000002", f"{number - LAST + 3:08d}"]
+    compact(opened, 9)
+    assert folders(opened.path) == ["00000008", "00000009"]
     with Store.open(opened.path, mode="read") as reader:
-        assert agrees(reader, 5, LAST + 5)
-
-
-def test_there_is_one_generation_and_beside_it_the_base(opened):
-    assert folders(opened.path) == ["00000002"]
-    opened.compact(sums(5), upto=5)
-    assert folders(opened.path) == ["00000002", "00000003"]
-    add(opened, LAST + 1)
-    opened.commit(sums(LAST + 1), upto=LAST + 1)
-    assert folders(opened.path) == ["00000003", "00000004"]
-    opened.compact(sums(9), upto=9)
-    assert folders(opened.path) == ["00000004", "00000005"]
-    assert agrees(opened, 9, LAST + 1)
-
-
-def test_a_generation_with_all_rows_has_to_be_there_first(opened):
-    add(opened, LAST + 1)
-    with pytest.raises(RecordError, match=f"all {LAST + 1} records; the newest has those up to {LAST}: commit one"):
-        opened.compact(sums(5), upto=5)
-    opened.commit(sums(LAST + 1), upto=LAST + 1)
-    assert payloads(opened.path) == list(range(1, LAST + 2))
-    opened.compact(sums(5), upto=5)
-    with Store.open(opened.path.with_name("fresh"), identity={}) as fresh:
-        add(fresh, 1)
-        with pytest.raises(RecordError, match="all 1 records; there is none"):
-            fresh.compact(sums(1), upto=1)
+        assert agrees(reader, 9, LAST + 4)
 
 
 @pytest.mark.parametrize("upto", [4, -1, LAST + 1, True, 5.0])
 def test_there_is_no_way_back_before_the_base(opened, upto):
-    opened.compact(sums(5), upto=5)
+    compact(opened, 5)
     for call in (opened.commit, opened.commit_later, opened.compact):
         with pytest.raises(RecordError, match=f"upto must be a sequence from 5, .* to {LAST}"):
             call(sums(0), upto=upto)
     assert agrees(opened, 5)
 
 
-def test_a_damaged_base_is_named_and_the_newest_generation_gone_on_from(opened, caplog):
-    opened.compact(sums(5), upto=5)
-    spoil(opened, 3)
-    with pytest.raises(DamageError, match="array 'bulk' of generation 3"):
+def test_a_damaged_base_is_named_and_the_newest_checkpoint_gone_on_from(opened, caplog):
+    compact(opened, 5)
+    spoil(base(opened.path))
+    with pytest.raises(DamageError, match="array 'bulk' of checkpoint 2"):
         opened.base()
     assert opened.latest().upto == LAST
     # It is kept all the same, for a repair to decide.
     for number in range(LAST + 1, LAST + 4):
         add(opened, number)
         opened.commit(sums(number), upto=number)
-    assert "00000003" in folders(opened.path)
+    assert "00000002" in folders(opened.path)
     assert caplog.records == []
 
 
-def test_nothing_is_given_up_beside_a_newest_generation_that_cannot_be_read(opened):
-    spoil(opened, 2)
-    with pytest.raises(DamageError, match=r"generation 2, .* nothing was given up") as caught:
-        opened.compact(sums(5), upto=5)
-    assert caught.value.path == opened.path / "generations" / "00000002"
-    assert payloads(opened.path) == list(range(1, LAST + 1))
-    opened.commit(sums(LAST), upto=LAST)
-    opened.compact(sums(5), upto=5)
-    assert agrees(opened, 5)
-
-
-def test_a_damaged_newest_generation_is_passed_over_for_the_base(opened, caplog):
-    opened.compact(sums(5), upto=5)
-    spoil(opened, 2)
+def test_a_damaged_newest_checkpoint_is_passed_over_for_the_base(opened, caplog):
+    compact(opened, 5)
+    spoil(newest(opened.path))
     assert opened.latest().upto == 5
     assert "replaying" in caplog.text
     assert [row.sequence for row in opened.records(opened.latest().upto)] == list(range(6, LAST + 1))
     assert opened.base().upto == 5
 
 
-@pytest.mark.parametrize("assignment", ["base = 0", "upto = 6", "checksum = x''", "base = 7"])
-def test_a_damaged_row_of_the_base_is_not_believed(opened, assignment, caplog):
-    opened.compact(sums(5), upto=5)
-    change(opened.path, f"UPDATE generation SET {assignment} WHERE number = 3")
-    assert opened.compacted == 0
-    with pytest.raises(DamageError, match="the arrays of row 1 are missing"):
-        list(opened.records())
-    # Whoever goes on from the newest generation would not meet that: opening says it.
-    with Store.open(opened.path, mode="read"):
-        assert f"{opened.path}: the row of generation 3 fails its checksum" in caplog.text
-    if assignment != "base = 0":
-        with pytest.raises(DamageError, match="row of generation 3"):
-            opened.base()
-    assert opened.latest().upto == LAST
-    for number in range(LAST + 1, LAST + 4):
-        add(opened, number)
-        opened.commit(sums(number), upto=number)
-    # Nobody knows what it was, so it stays for a repair to find.
-    assert "00000003" in folders(opened.path)
+def test_a_damaged_row_behind_the_base_is_named_and_nothing_is_given_up(opened):
+    flip_row(opened.path, 7, arrays=True)
+    before = log_of(opened.path).read_bytes()
+    with pytest.raises(DamageError, match="row 7 is not as it was written") as caught:
+        compact(opened, 5)
+    assert caught.value.sequence == 7
+    assert log_of(opened.path).read_bytes() == before
+    # Where the base stands for it, its arrays are given up anyway.
+    compact(opened, 7)
+    assert agrees(opened, 7)
 
 
-def test_a_row_that_passes_for_a_base_is_not_believed(opened, caplog):
-    """A flipped bit in `base` of a generation that is none."""
-    change(opened.path, "UPDATE generation SET base = 1 WHERE number = 2")
-    assert opened.compacted == 0
-    assert len(list(opened.records())) == LAST
-    assert opened.latest() is None
+def test_a_lost_head_is_no_more_silently_left_out_than_a_row(opened):
+    opened.close()
+    flip_row(opened.path, 3)  # the checkpoint contains it: opening does not read it
+    with Store.open(opened.path) as again:
+        with pytest.raises(DamageError, match="repair the store"):
+            compact(again, 5)
+        assert (again.compacted, folders(again.path)) == (0, ["00000001"])
 
 
-class CrashError(Exception):
+def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch):
+    real = store.checkpoints.write_checkpoint
+
+    def forgetful(folder, number, *rest):
+        sha256 = real(folder, number, *rest)
+        spoil(folder / "checkpoints" / f"{number:08d}")
+        return sha256
+
+    with monkeypatch.context() as broken, pytest.raises(DamageError, match="array 'bulk'"):
+        broken.setattr(store.checkpoints, "write_checkpoint", forgetful)
+        compact(opened, 5)
+    assert agrees(opened, 0)
+    compact(opened, 5)
+    assert agrees(opened, 5)
+
+
+CALLS = ["replace", "rename", "fsync", "fdatasync", "write", "open", "mkdir", "ftruncate", "unlink", "rmdir", "read"]
+
+
+def failing(monkeypatch, name, at, error, *, after, owner=os):
+    """Let the call of this number raise, before or after it has done its work; the list of calls."""
+    real, calls = getattr(owner, name), []
+
+    def call(*args, **options):
+        calls.append(args)
+        if len(calls) == at:
+            if after:
+                real(*args, **options)
+            raise error
+        return real(*args, **options)
+
+    monkeypatch.setattr(owner, name, call)
+    return calls
+
+
+class KilledError(BaseException):
     pass
 
 
-def crash(*_, **__):
-    raise CrashError
-
-
-STEPS = {
-    "before the folder is written": (store.generations, "write_group"),
-    "before the journal knows it": ("journal", "make_current"),
-    "before what is dropped is removed": (store.generations, "remove_others"),
-    "before the space is given back": ("journal", "shrink"),
+HOW = {
+    "fails": (OSError(errno.EIO, "the disk says no"), False),
+    "fails, and has done it": (OSError(errno.EIO, "the disk says no"), True),
+    "killed": (KilledError(), True),
 }
 
 
-@pytest.mark.parametrize(("owner", "name"), STEPS.values(), ids=STEPS)
-def test_a_crash_between_two_steps_leaves_all_of_it_or_none(opened, monkeypatch, tmp_path, owner, name):
-    done = name in ("remove_others", "shrink")
-    with monkeypatch.context() as broken:
-        broken.setattr(opened._journal if owner == "journal" else owner, name, crash)
-        with pytest.raises(CrashError):
-            opened.compact(sums(5), upto=5)
-    # Both as another process would find it, and in this one, which goes on.
-    as_after_a_crash(opened, tmp_path / "copy")
-    with Store.open(tmp_path / "copy", mode="read") as reader:
-        assert agrees(reader, 5 if done else 0)
-    with Store.open(tmp_path / "copy") as again:
-        assert agrees(again, 5 if done else 0)
-        assert len(folders(again.path)) == 1 + done
-    assert agrees(opened, 5 if done else 0)
-    assert opened.latest().upto == LAST
-    opened.commit(sums(LAST), upto=LAST)
-    opened.compact(sums(6), upto=6)
-    assert agrees(opened, 6)
-    assert len(folders(opened.path)) == 2
+@pytest.mark.parametrize(("error", "after"), HOW.values(), ids=HOW)
+@pytest.mark.parametrize("name", CALLS)
+def test_whatever_call_fails_all_that_was_acknowledged_is_there(made, tmp_path, monkeypatch, name, error, after):
+    """In this process, which goes on, and for another, which finds the folder as it was left."""
+    at, outcomes = 0, set()
+    while True:
+        # Of reads and the like there are many: some will do.
+        at += 9 if name in ("read", "open") else 1
+        with Store.open(shutil.copytree(made, tmp_path / f"s{at}")) as opened:
+            raised = None
+            with monkeypatch.context() as broken:
+                calls = failing(broken, name, at, error, after=after)
+                try:
+                    compact(opened, 5)
+                except (StoreError, KilledError) as caught:
+                    raised = caught
+            if len(calls) < at:
+                break
+            left = as_after_a_crash(opened, tmp_path / f"left{at}")
+            add(opened, LAST + 1)
+            outcomes.add((raised is None, opened.compacted))
+            assert agrees(opened, opened.compacted, LAST + 1)
+            assert opened.latest().upto == LAST
+            with Store.open(opened.path, mode="read") as reader:
+                assert agrees(reader, opened.compacted, LAST + 1)
+            killed = as_after_a_crash(opened, tmp_path / f"killed{at}")
+            compact(opened, 6)
+            assert agrees(opened, 6, LAST + 1)
+            assert len(folders(opened.path)) == 2
+        assert check_store(opened.path) == []
+        for copy, last in ((left, LAST), (killed, LAST + 1)):
+            with Store.open(copy) as again:
+                assert again.last == last
+                assert agrees(again, again.compacted, last)
+                assert add(again, last + 1) == last + 1
+            assert check_store(copy) == []
+        for path in tmp_path.iterdir():
+            shutil.rmtree(path)
+    if name in ("fsync", "replace"):
+        assert {(False, 0), (False, 5)} <= outcomes or not after
+    assert outcomes <= {(True, 5), (False, 0), (False, 5)}
 
 
-def test_a_failed_transaction_keeps_its_folder_until_it_is_certain_that_nothing_names_it(opened, monkeypatch):
-    """What could not be synced may be on the disk all the same."""
-    with monkeypatch.context() as broken:
-        broken.setattr(opened._journal, "make_current", crash)
-        with pytest.raises(CrashError):
-            opened.commit(sums(LAST), upto=LAST)
-    assert folders(opened.path) == ["00000002", "00000003"]
-    assert opened.latest().number == 2
-    assert opened.commit(sums(LAST), upto=LAST) == 4
-    assert folders(opened.path) == ["00000004"]
+@pytest.mark.parametrize("name", ["replace", "fsync", "open"])
+@pytest.mark.parametrize("after", [False, True])
+def test_whatever_call_of_a_commit_fails_the_store_goes_on(tmp_path, monkeypatch, name, after):
+    at = 0
+    while True:
+        at += 1
+        with Store.open(tmp_path / f"s{at}", identity={}) as opened:
+            add(opened, 1)
+            opened.commit(sums(0), upto=0)
+            with monkeypatch.context() as broken:
+                calls = failing(broken, name, at, OSError(errno.EIO, "the disk says no"), after=after)
+                try:
+                    opened.commit(sums(1), upto=1)
+                except StoreError as caught:
+                    assert "the disk says no" in str(caught)
+            if len(calls) < at:
+                break
+            assert opened.latest().upto in (0, 1)
+            # Both may be named on the disk until a sync has succeeded.
+            assert len(folders(opened.path)) >= 1
+            with Store.open(opened.path, mode="read") as reader:
+                assert reader.latest().upto == opened.latest().upto
+            add(opened, 2)
+            opened.commit(sums(2), upto=2)
+            assert len(folders(opened.path)) == 1
+        assert check_store(opened.path) == []
 
 
-def test_space_that_cannot_be_given_back_is_no_failure(opened, monkeypatch, caplog):
-    def full():
-        raise StoreError("no room for it")
+def test_what_another_log_needs_is_durable_before_the_first_is_removed(opened, monkeypatch):
+    """A power cut may undo whatever was not synced, in any order."""
+    events = []
+    sync, replace, unlink = os.fsync, os.replace, os.unlink
+    monkeypatch.setattr(os, "fsync", lambda file: (events.append(path_of(file)), sync(file)))
+    monkeypatch.setattr(os, "replace", lambda old, new: (events.append(("to", str(new))), replace(old, new)))
+    monkeypatch.setattr(os, "unlink", lambda path, **_: (events.append(("gone", str(path))), unlink(path, **_)))
+    home, first = str(opened.path), str(log_of(opened.path))
+    compact(opened, 5)
+    named, gone = events.index(("to", f"{home}/CURRENT")), events.index(("gone", first))
+    assert home in events[named:gone]
+    log = events.index(("to", f"{home}/log-00000002"))
+    assert home in events[log:named]
+    assert {f"{home}/log-00000002.new", f"{home}/CURRENT.new"} <= set(events[:named])
+    assert f"{home}/checkpoints" in events[:named]
 
-    monkeypatch.setattr(opened._journal, "shrink", full)
-    with caplog.at_level(logging.WARNING):
-        opened.compact(sums(5), upto=5)
-    assert "the space was not given back yet: no room for it" in caplog.text
-    assert agrees(opened, 5)
 
-
-def test_a_reader_inside_the_file_only_delays_the_space(opened, caplog, monkeypatch):
-    with closing(sqlite3.connect(opened.path / "journal.sqlite", isolation_level=None)) as other:
-        other.execute("BEGIN")
-        other.execute("SELECT count(*) FROM record").fetchone()
-        opened._journal._connection.execute("PRAGMA busy_timeout = 50")
-        opened.compact(sums(5), upto=5)
-        assert "the space was not given back yet" in caplog.text
-    assert agrees(opened, 5)
-    opened.close()
-    assert not (opened.path / "journal.sqlite-wal").exists()
-    with Store.open(opened.path) as again:
+def test_opening_makes_durable_what_it_found_before_it_removes_anything(opened, monkeypatch):
+    """Its writer may have died after the rename and before the sync."""
+    with monkeypatch.context() as broken, pytest.raises(KilledError):
+        failing(broken, "sync_folder", 1, KilledError(), after=False, owner=store.layout)
+        compact(opened, 5)
+    crashed = as_after_a_crash(opened, opened.path.with_name("c"))
+    events = []
+    sync, unlink = os.fsync, os.unlink
+    monkeypatch.setattr(os, "fsync", lambda file: (events.append(path_of(file)), sync(file)))
+    monkeypatch.setattr(os, "unlink", lambda path, **_: (events.append(("gone", str(path))), unlink(path, **_)))
+    with Store.open(crashed) as again:
         assert agrees(again, 5)
+    assert str(crashed) in events[: events.index(("gone", str(crashed / "log-00000001")))]
+
+
+def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
+    def stuck(*_):
+        raise OSError(errno.EIO, "the disk says no")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(store.checkpoints, "remove_unnamed", stuck)
+        compact(opened, 5)
+    assert "what was replaced could not be removed" in caplog.text
+    assert agrees(opened, 5)
+    assert len(folders(opened.path)) == 3
+    opened.commit(sums(LAST), upto=LAST)
+    assert len(folders(opened.path)) == 2
 
 
 def test_a_reader_in_the_middle_gets_the_rest_or_is_told(opened):
@@ -278,9 +351,34 @@ def test_a_reader_in_the_middle_gets_the_rest_or_is_told(opened):
         assert [next(early).sequence for _ in range(3)] == [1, 2, 3]
         for expected in range(1, 8):
             assert next(late).sequence == expected
-        opened.compact(sums(5), upto=5)
-        with pytest.raises(CompactedError, match="row 4"):
+        compact(opened, 5)
+        # What it has open it may still give.
+        assert next(early).sequence == 4
+        assert reader.compacted == 5
+        with pytest.raises(CompactedError, match="row 5"):
             next(early)
         assert [row.sequence for row in late] == list(range(8, LAST + 1))
         assert [head.sequence for head in heads] == list(range(1, LAST + 1))
         assert agrees(reader, 5)
+
+
+def test_a_reader_that_has_read_nothing_yet_reads_the_log_that_was_replaced(opened):
+    with Store.open(opened.path, mode="read") as reader:
+        heads = reader.heads()  # those before the checkpoint are still to be read
+        compact(opened, 5)
+        assert [head.sequence for head in heads] == list(range(1, LAST + 1))
+
+
+def test_a_reader_stays_open_over_ten_compactions(opened):
+    with Store.open(opened.path, mode="read") as reader, Store.open(opened.path, mode="read") as lazy:
+        files = open_files()
+        last = LAST
+        for upto in range(1, 11):
+            assert add(opened, last := last + 1) == last
+            compact(opened, upto)
+            assert agrees(reader, upto, last)
+            assert reader.latest().upto == last
+        assert agrees(lazy, 10, last)
+        assert log_of(opened.path).name == "log-00000011"
+        assert open_files() == files
+    assert damage(opened.path) == []

@@ -1,0 +1,385 @@
+"""`CURRENT`: lost, damaged, forged or of another time, it is named, and never believed beyond what it names."""
+
+import json
+import shutil
+
+import pytest
+from store_builds import (
+    IDENTITY,
+    LAST,
+    add,
+    as_after_a_crash,
+    build,
+    commit,
+    contents,
+    cut_rows,
+    damage,
+    flip,
+    folders,
+    frames,
+    known_current,
+    log_of,
+    newest,
+    put_current,
+    same_arrays,
+    state,
+    torn,
+    write_log,
+)
+
+from store import DamageError, NotAStoreError, Store, StoreError, VersionError, check_store, repair_store
+from store.layout import log_path
+from store.log import LogReader
+from store.records import payload_digest
+
+
+def is_whole(path, compacted, latest=15):
+    with Store.open(path, mode="read") as opened:
+        assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, LAST, compacted)
+        assert [head.label for head in opened.heads()] == [f"row {number}" for number in range(1, LAST + 1)]
+        assert len(list(opened.records(compacted))) == LAST - compacted
+        found, base = opened.latest(), opened.base()
+        assert found.upto == latest
+        assert same_arrays(found.arrays, state(latest))
+        assert (base.upto if base else 0) == compacted
+    assert damage(path) == []
+    return True
+
+
+HARMS = {
+    "gone": lambda file: file.unlink(),
+    "empty": lambda file: file.write_bytes(b""),
+    "cut off": lambda file: file.write_bytes(file.read_bytes()[:-9]),
+    "a flipped bit": lambda file: flip(file, 60),
+    "another's text": lambda file: file.write_text("dear diary"),
+    "too long": lambda file: file.write_text(json.dumps({"x": "x" * 2**17})),
+    "nested": lambda file: file.write_text('{"x":' + "[" * 9000 + "]" * 9000 + "}"),
+    "zeros": lambda file: file.write_bytes(bytes(len(file.read_bytes()))),
+}
+
+
+@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
+def test_what_is_lost_with_it_is_nothing(either, which, harm):
+    harm(either / "CURRENT")
+    before = contents(either)
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="repair") as caught:
+            Store.open(either, mode=mode, identity={"for": "another"})
+        assert caught.value.path == either / "CURRENT"
+    assert [problem.kind for problem in damage(either)] == ["spare"]
+    after = contents(either)
+    assert {name: after[name] for name in before} == before
+    done = repair_store(either)
+    assert (done.kept, done.lost) == (LAST, [])
+    assert is_whole(either, 6 if which else 0)
+    with Store.open(either) as opened:
+        add(opened, LAST + 1)
+        commit(opened.compact, LAST + 1)
+
+
+@pytest.mark.parametrize("depth", [100, 900, 990, 1100, 5000, 20_000])
+def test_no_depth_of_it_is_an_error_of_another_kind(plain, depth):
+    for text in ("[" * depth + "]" * depth, '{"a":' * depth + "1" + "}" * depth):
+        (plain / "CURRENT").write_text(f'{{"x":{text},"sha256":"0"}}')
+        with pytest.raises(DamageError):
+            Store.open(plain)
+        assert damage(plain)
+
+
+def named(path, **changes):
+    return known_current(path)["newest"] | changes
+
+
+def placed(path, **changes):
+    offset, number, previous = named(path)["place"]
+    place = {"offset": offset, "number": number, "previous": previous} | changes
+    return {"newest": named(path, place=list(place.values()))}
+
+
+def behind_all(path):
+    with LogReader(log_of(path)) as log:
+        for _ in log.refresh():
+            pass
+        return placed(path, offset=log.place.offset, number=log.place.number, previous=log.place.previous.hex())
+
+
+# What anybody can write there with a right sha256; whether what is left reads as if it were whole.
+FORGED = {
+    "no log": lambda path: {"log": None},
+    "a log below 0": lambda path: {"log": [-1, known_current(path)["log"][1]]},
+    "a log in words": lambda path: {"log": ["../../log", known_current(path)["log"][1]]},
+    "a log that is not there": lambda path: {"log": [7, known_current(path)["log"][1]]},
+    "a log of the last number": lambda path: {"log": [2**63 - 1, known_current(path)["log"][1]]},
+    "a log of another identity": lambda path: {"log": [known_current(path)["log"][0], "00" * 8]},
+    "a log of half an identity": lambda path: {"log": [known_current(path)["log"][0], "00"]},
+    "a format below 0": lambda path: {"format": -1},
+    "a format that is true": lambda path: {"format": True},
+    "a checkpoint in a list": lambda path: {"newest": [1]},
+    "a checkpoint without a place": lambda path: {"newest": named(path, place=None)},
+    "an upto in words": lambda path: {"newest": named(path, upto="15")},
+    "a number above any": lambda path: {"newest": named(path, number=2**64)},
+    "a sha256 in capitals": lambda path: {"newest": named(path, sha256="AB" * 32)},
+    "a base without a newest": lambda path: {"newest": None, "base": named(path)},
+    "a base newer than the newest": lambda path: {"base": named(path, upto=16)},
+    "a place in no frame": lambda path: placed(path, offset=named(path)["place"][0] + 1),
+    "a place beyond the end": lambda path: placed(path, offset=2**40),
+    "a place at the last byte of all": lambda path: placed(path, offset=2**63 - 1),
+    "a place of another number": lambda path: placed(path, number=3),
+    "a place of another checksum": lambda path: placed(path, previous="00" * 16),
+}
+
+
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+def test_what_it_never_said_is_named_and_repaired(plain, forge):
+    put_current(plain, **forge(plain))
+    with pytest.raises(DamageError, match=r"repair the store|another store"):
+        Store.open(plain)
+    assert damage(plain)
+    try:
+        with Store.open(plain, mode="read") as opened:  # which can begin at the beginning
+            assert [head.sequence for head in opened.heads()] == list(range(1, LAST + 1))
+    except DamageError:
+        pass
+    before = log_path(plain, 1).read_bytes()
+    repair_store(plain)
+    assert damage(plain) == []
+    assert before in contents(plain).values()  # kept aside, if anything of it was not believed
+    with Store.open(plain) as opened:
+        assert add(opened, opened.last + 1).sequence == opened.last
+    assert damage(plain) == []
+
+
+def test_a_place_behind_rows_that_its_checkpoint_does_not_contain_is_found(plain):
+    """Only a forger writes it: who opens the store does not read what is before the place."""
+    put_current(plain, **behind_all(plain))
+    assert "does not have the place" in damage(plain)[0].what
+    assert repair_store(plain).kept == LAST
+    assert is_whole(plain, 0)
+
+
+@pytest.mark.parametrize("current", ["of now", "gone"])
+def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, current):
+    """Compaction failed just before `CURRENT`, the store went on, and then the disk lost some of it."""
+    other = log_path(plain, 3)
+    shutil.copy(log_of(plain), other)
+    with Store.open(plain, mode="read"):
+        torn(plain, frames(plain)[19].offset)
+    if current == "of now":
+        log_of(plain).rename(log_path(plain, 2))
+        put_current(plain, log=[7, known_current(plain)["log"][1]])
+    else:
+        (plain / "CURRENT").unlink()
+    assert damage(plain)
+    assert repair_store(plain).kept == LAST
+    assert is_whole(plain, 0)
+
+
+@pytest.mark.parametrize("which_one", ["newest", "base"])
+@pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"upto": 14}])
+def test_a_checkpoint_that_is_another_than_the_one_named_is_not_believed(compacted, which_one, change):
+    known = known_current(compacted)[which_one]
+    change = change | ({"upto": 5} if "upto" in change and which_one == "base" else {})
+    put_current(compacted, **{which_one: known | change})
+    with Store.open(compacted, mode="read") as opened:
+        if which_one == "newest":
+            assert opened.latest().upto == 6
+        else:
+            with pytest.raises(DamageError, match="checkpoint"):
+                opened.base()
+            assert opened.latest().upto == 15
+    assert damage(compacted)
+    repair_store(compacted)
+    assert damage(compacted) == []
+
+
+def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_path):
+    with Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
+        for number in range(1, 4):
+            add(other, number)
+        commit(other.commit, 3)
+    mixed = shutil.copytree(plain, tmp_path / "mixed")
+    shutil.copy(log_of(tmp_path / "other"), log_of(mixed))
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match=r"another store|holds no batch"):
+            Store.open(mixed, mode=mode)
+    assert "another store" in damage(mixed)[0].what
+    # A checkpoint of the other, named by a forged CURRENT.
+    shutil.rmtree(newest(plain))
+    shutil.copytree(newest(tmp_path / "other"), newest(plain))
+    put_current(plain, newest=named(plain, upto=3, sha256=known_current(tmp_path / "other")["newest"]["sha256"]))
+    with Store.open(plain, mode="read") as opened:
+        assert opened.latest() is None
+    assert "another store" in " ".join(problem.what for problem in damage(plain))
+    repair_store(plain)
+    assert damage(plain) == []
+    with Store.open(plain) as opened:
+        assert (opened.last, opened.latest()) == (LAST, None)
+
+
+def test_what_it_names_by_a_link_is_not_followed(plain, tmp_path):
+    for target in (log_of(plain), newest(plain), plain / "CURRENT"):
+        moved = target.rename(tmp_path / target.name)
+        target.symlink_to(moved)
+        for mode in ("read", "write"):
+            with pytest.raises(DamageError, match="symbolic link"):
+                Store.open(plain, mode=mode)
+        assert [problem.path for problem in check_store(plain)] == [target]
+        target.unlink()
+        moved.rename(target)
+    assert is_whole(plain, 0)
+
+
+def test_a_log_that_is_gone_is_named(plain):
+    log_of(plain).unlink()
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match=r"which .*CURRENT names, is not there: .* repair") as caught:
+            Store.open(plain, mode=mode)
+        assert caught.value.path == log_path(plain, 1)
+    assert repair_store(plain).kept == 15
+
+
+@pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
+def test_a_newer_format_is_refused_and_not_touched(either, more):
+    put_current(either, format=2, **more)
+    before = contents(either)
+    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
+        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
+            call(either)
+    assert contents(either) == before
+    flip(either / "CURRENT", -20)  # and where that is not what was written, nothing is said of a format
+    with pytest.raises(DamageError):
+        Store.open(either)
+
+
+def test_a_newer_log_is_refused_and_not_touched(plain):
+    file = log_of(plain)
+    data = bytearray(file.read_bytes())
+    data[6] = 2
+    data[72:88] = payload_digest(bytes(data[:72]))
+    file.write_bytes(data)
+    before = contents(plain)
+    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
+        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
+            call(plain)
+    assert contents(plain) == before
+
+
+def test_a_memory_of_a_release_before_the_log_is_told_from_another_folder(tmp_path):
+    (tmp_path / "journal.sqlite").write_bytes(b"SQLite format 3\0" * 300)
+    (tmp_path / "generations" / "00000001").mkdir(parents=True)
+    before = contents(tmp_path)
+    for call in (lambda path: Store.open(path, identity={}), check_store, repair_store):
+        with pytest.raises(VersionError, match=r"made by a release 0\.x, .* learn it again from the recordings"):
+            call(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
+    Store.open(tmp_path, identity={"a": 1}).close()
+    (tmp_path / "CURRENT").unlink()
+    with pytest.raises(NotAStoreError):
+        Store.open(tmp_path, mode="read")
+    with Store.open(tmp_path, identity={"a": 2}) as opened:
+        assert opened.identity == {"a": 2}
+
+
+# Logs that end early, or too late.
+
+
+@pytest.fixture(scope="module")
+def crashed(tmp_path_factory):
+    """A store as a killed writer left it: a checkpoint up to row 4 and one batch behind it, of two rows."""
+    home = tmp_path_factory.mktemp("crashed")
+    with Store.open(home / "s", identity=IDENTITY) as opened:
+        for number in range(1, 5):
+            opened.append("a", f"row {number}", b"")
+        opened.commit({}, upto=4)
+        with opened.batch():
+            opened.append("a", "row 5", b"")
+            opened.append("a", "row 6", b"")
+        as_after_a_crash(opened, home / "c")
+    return home / "c"
+
+
+def test_cut_at_every_byte_the_batch_behind_the_checkpoint_is_there_or_not_and_no_row_of_it_is_lost_unnamed(
+    crashed, tmp_path
+):
+    path = shutil.copytree(crashed, tmp_path / "s")
+    place, begin = known_current(crashed)["newest"]["place"][0], frames(crashed)[4].offset
+    with LogReader(log_of(crashed)) as log:
+        for _ in log.refresh():
+            end = log.place.offset
+    whole = log_of(path).read_bytes()
+    for cut in range(begin, end + 1):
+        log_of(path).write_bytes(whole[:cut])
+        if cut < place:
+            with pytest.raises(DamageError, match="repair the store"):
+                Store.open(path)
+            with Store.open(path, mode="read") as opened:
+                assert opened.last == 4
+                with pytest.raises(DamageError, match="row 4 is missing"):
+                    list(opened.records())
+            if cut % 40 == 0:
+                assert [problem.kind for problem in damage(path)] == ["lost", "spare"]
+                mended = shutil.copytree(path, tmp_path / str(cut))
+                assert repair_store(mended).kept == 4
+                assert damage(mended) == []
+                with Store.open(mended) as opened:
+                    assert opened.append("a", "b", b"").sequence == 5
+            continue
+        expected = 6 if cut == end else 4
+        with Store.open(path, mode="read") as opened:
+            assert (opened.last, len(list(opened.records()))) == (expected, expected)
+        if cut % 10 == 0 or cut == end:
+            assert damage(path) == []
+            with Store.open(path) as opened:
+                assert opened.append("a", "next", b"").sequence == expected + 1
+                assert [head.sequence for head in opened.heads()] == list(range(1, expected + 2))
+
+
+def test_an_older_frame_behind_the_end_is_damage_that_can_be_repaired(plain):
+    """Nothing can be read behind it: its number was long ago."""
+    file, frame = log_of(plain), frames(plain)[18]
+    data = file.read_bytes()
+    file.write_bytes(data + data[frame.offset : frame.end])
+    with pytest.raises(DamageError, match="repair the store"):
+        Store.open(plain)
+    with Store.open(plain, mode="read") as opened:
+        for _ in range(3):
+            assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
+    assert "damaged" in damage(plain)[0].what
+    assert repair_store(plain).kept == LAST
+    assert is_whole(plain, 0)
+
+
+def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
+    write_log(plain, [b"no row"])
+    with pytest.raises(DamageError, match="no row"):
+        Store.open(plain)
+    with Store.open(plain, mode="read") as opened:
+        assert opened.last == 15
+    assert damage(plain)
+    assert repair_store(plain).kept == 15
+    assert folders(plain) == ["00000001"]
+
+
+def test_a_log_of_holes_is_refused_at_once(plain):
+    with log_of(plain).open("r+b") as file:
+        file.truncate(2**43)
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="are on the disk"):
+            Store.open(plain, mode=mode)
+    assert "are on the disk" in damage(plain)[0].what
+
+
+def test_rows_that_a_checkpoint_contains_and_the_log_has_lost_are_never_numbered_again(tmp_path):
+    path = build(tmp_path / "s")
+    cut_rows(path, 3)
+    with pytest.raises(StoreError):
+        Store.open(path)
+    assert repair_store(path).kept == 15
+    with Store.open(path) as opened:
+        assert add(opened, 16).sequence == 16
+    torn(path, frames(path)[16].offset)
+    with Store.open(path) as opened:
+        assert opened.last == 15

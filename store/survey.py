@@ -95,6 +95,7 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
             return found
         for _ in range(ATTEMPTS):
             survey = Survey(folder, progress or (lambda *_: None))
+            survey.log.close()
             found = survey.problems() + list(survey.leftovers())
             if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
                 break
@@ -163,7 +164,11 @@ class FoundLog:
             self._reader.close()
             self._reader = None
             return
-        self._read(self._reader, progress)
+        try:
+            self._read(self._reader, progress)
+        except BaseException:
+            self.close()
+            raise
 
     def _read(self, log: LogReader, progress: Progress) -> None:
         if log.header_damage is not None:

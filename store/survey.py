@@ -172,7 +172,11 @@ class FoundLog:
             self._reader.close()
             self._reader = None
             return
-        self._read(self._reader, progress)
+        try:
+            self._read(self._reader, progress)
+        except BaseException:
+            self.close()
+            raise
 
     def _read(self, log: LogReader, progress: Progress) -> None:
         if log.header_damage is not None:

@@ -12,21 +12,21 @@ import scroll_tactile.memory.ledger
 from faults.model import Operation, Other, State, opened, perform, seen, settle
 from store import StoreError
 
-NEVER = 2**40  # rows between generations
+NEVER = 2**40  # rows between checkpoints
 SUCCESS = "success"
 
 
 def copied(path: Path, to: Path) -> None:
-    """A copy as after a crash; what the lock's holder and SQLite have in memory only is left out."""
+    """A copy as after a crash; the lock is left out."""
     shutil.rmtree(to, ignore_errors=True)
     if path.exists():
-        shutil.copytree(path, to, ignore=shutil.ignore_patterns("*-shm", "lock"))
+        shutil.copytree(path, to, ignore=shutil.ignore_patterns("lock"))
 
 
 class Attempt:
     """An operation, to be done once in folder `path`, on a copy of `start` where one is given.
 
-    every: rows between generations while it is done. home: where the memories lie that are merged.
+    every: rows between checkpoints while it is done. home: where the memories lie that are merged.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Attempt:
             if self.operation[0] == "close":
                 return self.learner.close()
             result = perform(self.learner, self.operation, self.home)
-            self.learner._ledger.store._generations.wait()
+            self.learner._ledger.store._checkpoints.wait()
             return result
         finally:
             scroll_tactile.memory.ledger.SNAPSHOT_EVERY = NEVER

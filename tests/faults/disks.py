@@ -5,7 +5,7 @@ file was synced after them, and a name is there (or gone, or moved) when its fol
 then any may have come, in any order, each sector of 512 bytes by itself; its length may have come without the bytes,
 and be filled with zeros or with what was on the disk before. Of the changes to a folder since then those up to any
 one may have come. Nothing orders a file against another, nor against its folder. Bytes beside a write stay as they
-are, as SQLite expects of every disk (SQLITE_IOCAP_POWERSAFE_OVERWRITE).
+are.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Literal
 
 SECTOR = 512
-DROPPED = "-shm"  # SQLite's memory shared by processes: mapped, made anew on opening
 
 Style = Literal["nothing", "all", "prefix", "scattered", "names only", "bytes only"]
 STYLES: tuple[Style, ...] = ("nothing", "all", "prefix", "prefix", "scattered", "scattered", "names only", "bytes only")
@@ -228,5 +227,5 @@ def _rebuild(folder: Folder, to: Path, rng: random.Random, style: Style) -> None
     for name, node in folder.content(rng, style).items():
         if isinstance(node, Folder):
             _rebuild(node, to / name, rng, style)
-        elif not name.endswith(DROPPED):
+        else:
             (to / name).write_bytes(node.content(rng, style))

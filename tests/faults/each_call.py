@@ -1,7 +1,7 @@
 """A failure, and a crash, at each call in turn: `python tests/faults/each_call.py`.
 
 Each step of a short history, which has all operations, begins from a copy of the memory as it lies on the disk just
-before. Of the calls that the C library gets for files of the memory meanwhile, SQLite's and zarr's among them, the
+before. Of the calls that the C library gets for files of the memory meanwhile, zarr's among them, the
 first fails, then the second, and so on (of the steps in ALIKE each fourth):
 
 - EIO, then ENOSPC (of a write half is done before): a StoreError, and the memory is as before, or success, and it is
@@ -10,8 +10,7 @@ first fails, then the second, and so on (of the steps in ALIKE each fourth):
 - kill -9 in place of the call, and in the middle of each write: opened again it is as before or as after, and goes on.
 
 Watched are open, write, pwrite, fsync, fdatasync, ftruncate, rename, link, unlink, mkdir, rmdir, read and pread, in
-all their variants; others that could write abort the process (see shim.c). SQLite's shared memory is mapped, and its
-stores are not calls; it is not needed to recover.
+all their variants; others that could write abort the process (see shim.c).
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from faults.shim import Shim
 from faults.zygote import Zygote
 
 SLOW = ("compact", "fine_tune")
-GENERATIONS = ("fine-tune", "compact", "close", "compact all but 3", "observe, and a generation", "open")
-SECOND_LOOK = 3  # of so many calls of a step that writes generations one is looked at by opening anew, too
-# They write a generation as two others do, call for call, whose every call is tried: of these one in four is.
+CHECKPOINTS = ("fine-tune", "compact", "close", "compact all but 3", "observe, and a checkpoint", "open")
+SECOND_LOOK = 3  # of so many calls of a step that writes checkpoints one is looked at by opening anew, too
+# They write a checkpoint as two others do, call for call, whose every call is tried: of these one in four is.
 ALIKE = {"fine-tune": 4, "compact": 4, "close": 4}
 THOROUGH = 5  # of so many calls of a slow step one is followed by doing all of it again
 
@@ -53,11 +52,11 @@ MODES = {
 
 OBSERVE: Operation = ("observe", "c", (4, 90))
 HISTORY: tuple[tuple[str, Operation, int], ...] = (
-    # name of the step, operation, rows between generations
+    # name of the step, operation, rows between checkpoints
     ("make", ("open",), NEVER),
     ("observe", ("observe", "a", (0, 90)), NEVER),
     ("", ("batch", tuple(("observe", name, (i, 90)) for i in range(3) for name in "abü")), NEVER),
-    ("observe, and a generation", ("observe", "b", (5, 60)), 1),
+    ("observe, and a checkpoint", ("observe", "b", (5, 60)), 1),
     ("batch", ("batch", (OBSERVE, ("observe", "a", (2, 40)), ("retract", 3), ("forget", "ü"))), NEVER),
     ("retract", ("retract", 2), NEVER),
     ("relabel", ("relabel", 5, "ü"), NEVER),
@@ -122,10 +121,14 @@ def plan(home: Path, others: dict[str, Other]) -> list[Step]:
 
 def leave_unfinished(path: Path) -> None:
     """What crashes may leave behind, and opening has to clear away."""
-    generations = path / "generations"
-    newest = max(generations.iterdir())
-    shutil.copytree(newest, generations / "00000091")
-    shutil.copytree(newest, generations / "00000092.partial")
+    checkpoints = path / "checkpoints"
+    newest = max(checkpoints.iterdir())
+    shutil.copytree(newest, checkpoints / "00000091")
+    shutil.copytree(newest, checkpoints / "00000092.partial")
+    log = max(path.glob("log-*"))
+    shutil.copy(log, path / "log-00000091")
+    for name in ("log-00000092.new", "CURRENT.new"):
+        (path / name).write_bytes(log.read_bytes()[:100])
     (path / "holder.json.new").write_text("{", encoding="utf-8")
 
 
@@ -178,7 +181,7 @@ class Trial(Trials):
     def _goes_on(self, where: str, step: Step, attempt: Attempt, outcome: str, number: int) -> None:
         if self._second_look(step, number):
             copied(self.path, crashed := self.home / "crashed")
-            with opened(crashed, "read" if (crashed / "journal.sqlite").exists() else "write") as learner:
+            with opened(crashed, "read" if (crashed / "CURRENT").exists() else "write") as learner:
                 self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then])
         if step.operation[0] == "close" or attempt.learner is None:
             attempt.learner = opened(self.path)
@@ -197,9 +200,9 @@ class Trial(Trials):
         state, _ = after(state, OBSERVE, self.others)
         perform(learner, OBSERVE, self.home)
         self.require(f"{where}: after one more", learner, [state])
-        # Closing the store alone writes no generation: what was told is in the journal.
+        # Closing the store alone writes no checkpoint: what was told is in the log.
         if not thorough:
-            learner._ledger.store._generations.raise_failure = lambda: None
+            learner._ledger.store._checkpoints.raise_failure = lambda: None
         outcome = self.outcome(f"{where}: closing", learner.close if thorough else learner._ledger.store.close)
         if outcome != SUCCESS:
             step.outcomes[f"closing told of the failure before it: {outcome}"] += 1
@@ -208,7 +211,7 @@ class Trial(Trials):
                 self.require(f"{where}: opened at last", again, [state])
 
     def _second_look(self, step: Step, number: int) -> bool:
-        return step.name not in GENERATIONS or number % SECOND_LOOK == 0
+        return step.name not in CHECKPOINTS or number % SECOND_LOOK == 0
 
     def told(self) -> None:
         """Show failures as they come."""

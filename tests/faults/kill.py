@@ -25,7 +25,7 @@ from faults.model import Operation, Other, State, after, opened, perform, seen, 
 from faults.plans import KINDS, history, prepare
 from faults.zygote import Child, Zygote
 
-SNAPSHOT_EVERY = 6  # rows between generations: some are written behind the back of most children
+SNAPSHOT_EVERY = 6  # rows between checkpoints: some are written behind the back of most children
 GROWN = 40  # touches at which a new memory is begun
 TARGETS = (*KINDS, "open", "close", "idle")
 TOLD = ("done", "begin", "warned", "seen")
@@ -139,7 +139,7 @@ class Killing:
                 self.failures.append(f"{where}: {operation} gave {result}, expected {foretold}")
 
     def _look(self, where: str, operations: list[Operation], told: list[tuple[str, Any]]) -> None:
-        if not (self.path / "journal.sqlite").exists() and self.candidates == [State()]:
+        if not (self.path / "CURRENT").exists() and self.candidates == [State()]:
             self.counts["no memory made yet"] += 1
             return
         before = len(self.failures)

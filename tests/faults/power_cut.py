@@ -1,12 +1,12 @@
 """The plug pulled at random instants: `python tests/faults/power_cut.py --disks 2000`.
 
-All that a history does to the files of a memory is written down, call by call, SQLite's and zarr's among it (see
+All that a history does to the files of a memory is written down, call by call, zarr's among it (see
 shim.c). From that the disk is rebuilt as it may look after a power cut at a random instant (see disks.py), and
 opened: it must hold all that was acknowledged before that instant, or that and the operation that had begun, without
 a warning, and go on. The next history goes on with one of these disks.
 
-That the disks are harsh enough shows `--without folders` (or files, log): syncs of folders, of a generation's files or
-of SQLite's log are taken not to have happened, and failures must then be found. Exit code 1 is right there.
+That the disks are harsh enough shows `--without folders` (or files, log): syncs of folders, of a checkpoint's files or
+of the log are taken not to have happened, and failures must then be found. Exit code 1 is right there.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Recorded:
 WITHOUT = {
     "": lambda event: False,
     "folders": lambda event: event.kind == "F",
-    "files": lambda event: event.kind == "S" and "/generations/" in event.path,
-    "log": lambda event: event.kind == "S" and event.path.endswith("-wal"),
+    "files": lambda event: event.kind == "S" and "/checkpoints/" in event.path,
+    "log": lambda event: event.kind == "S" and Path(event.path).name.startswith("log-"),
 }
 
 

@@ -27,7 +27,7 @@ def compiler() -> str | None:
 def begin_again_watched() -> None:
     """Compile the shim and run this command again with it; returns in the process that has it.
 
-    Exits with 2 where there is no compiler: SQLite's own writes cannot be reached from Python.
+    Exits with 2 where there is no compiler.
     """
     if (made := os.environ.get(MARK)) is not None:
         # The folder is this process's to remove, and not that of its children.
@@ -35,7 +35,7 @@ def begin_again_watched() -> None:
         atexit.register(lambda: shutil.rmtree(made, ignore_errors=True) if os.getpid() == owner else None)
         return
     if sys.platform != "linux" or (tool := compiler()) is None:
-        print("this needs Linux and a C compiler: the calls of SQLite cannot be reached from Python", file=sys.stderr)
+        print("this needs Linux and a C compiler", file=sys.stderr)
         sys.exit(2)
     library = Path(tempfile.mkdtemp(prefix="faults-shim-"), "shim.so")
     subprocess.run([tool, "-shared", "-fPIC", "-O1", "-Wall", SOURCE, "-o", library, "-ldl", "-lpthread"], check=True)

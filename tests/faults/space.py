@@ -1,9 +1,9 @@
 """What a memory takes on the disk, and how long one of a million observations takes to open: `python
 tests/faults/space.py --observations 1000000`.
 
-With the default kernels and simulated BioTac touches: bytes of an observation (a row of the journal), of a material
-and of an exemplar (in the generation), before and after compaction. Then the store alone, with as many small rows: how
-long opening takes, a reader's look whether something came, the newest generation and the rows behind it. Then synthetic
+With the default kernels and simulated BioTac touches: bytes of an observation (a row of the log), of a material
+and of an exemplar (in the checkpoint), before and after compaction. Then the store alone, with as many small rows: how
+long opening takes, a reader's look whether something came, the newest checkpoint and the rows behind it. Then synthetic
 features of 64 dimensions, in batches of 10 000, without exemplars; compacted; opened three times, each in a fresh
 process.
 """
@@ -44,7 +44,7 @@ learner.close()
 
 
 def sizes(path: Path, materials: int, of_each: int, exemplars: int | None, keep: int | None = None) -> dict[str, int]:
-    """Bytes of the journal and of the newest generation of a memory, after it was closed."""
+    """Bytes of the log and of the newest checkpoint of a memory, after it was closed."""
     fed = islice(endless(touches(BIOTAC, materials, 1)), materials * of_each)
     with TactileLearner.open(path, **BIOTAC, exemplars=exemplars) as learner:
         with learner.batch():
@@ -52,10 +52,11 @@ def sizes(path: Path, materials: int, of_each: int, exemplars: int | None, keep:
                 observe(learner, one)
         if keep is not None:
             learner.compact(keep=keep)
-    generations = sorted((path / "generations").iterdir())
+    (log,) = path.glob("log-*")
+    checkpoints = sorted((path / "checkpoints").iterdir())
     return {
-        "journal": (path / "journal.sqlite").stat().st_size,
-        "generation": sum(file.stat().st_size for file in generations[-1].rglob("*") if file.is_file()),
+        "log": log.stat().st_size,
+        "checkpoint": sum(file.stat().st_size for file in checkpoints[-1].rglob("*") if file.is_file()),
         "all": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
     }
 
@@ -69,18 +70,18 @@ def apiece(home: Path, count: int) -> dict[str, float]:
     bare = sizes(home / "6", 2, 2 * count, 0, keep=0)
     kept = min(4 * count, 1200)  # three candidates for each of 400 exemplars
     return {
-        "an observation, without readings": (many["journal"] - few["journal"]) / (2 * count),
-        "an observation, with readings": raw["journal"] / (4 * count),
-        "a material, in a generation": (more["generation"] - few["generation"]) / 6,
-        "a candidate for an exemplar, in a generation": (raw["generation"] - many["generation"]) / kept,
+        "an observation, without readings": (many["log"] - few["log"]) / (2 * count),
+        "an observation, with readings": raw["log"] / (4 * count),
+        "a material, in a checkpoint": (more["checkpoint"] - few["checkpoint"]) / 6,
+        "a candidate for an exemplar, in a checkpoint": (raw["checkpoint"] - many["checkpoint"]) / kept,
         f"all of {4 * count} observations": raw["all"],
         "the same, compacted": compacted["all"],
-        "an observation, compacted (what is known of it)": bare["journal"] / (4 * count),
+        "an observation, compacted (what is known of it)": bare["log"] / (4 * count),
     }
 
 
 def rows_alone(home: Path, count: int) -> dict[str, Any]:
-    """Milliseconds of what a reader does with a store of so many rows, of which the last 100 are in no generation."""
+    """Milliseconds of what a reader does with a store of so many rows, of which the last 100 are in no checkpoint."""
     path, x = home / "rows", np.arange(8, dtype=np.int16)
     with Store.open(path, identity={}) as store:
         for begin in range(0, count, BATCH):
@@ -88,15 +89,15 @@ def rows_alone(home: Path, count: int) -> dict[str, Any]:
                 for i in range(begin, min(begin + BATCH, count)):
                     store.append("a", f"material {i % 1000}", i.to_bytes(16), arrays={"x": x})
         store.commit({"x": np.zeros(1000)}, upto=max(count - 100, 0))
-    figures: dict[str, Any] = {"rows": count, "bytes": sum(file.stat().st_size for file in path.rglob("*.sqlite"))}
+    figures: dict[str, Any] = {"rows": count, "bytes": sum(file.stat().st_size for file in path.glob("log-*"))}
     for mode in ("read", "write"):
         begun = time.perf_counter()
         store = Store.open(path, mode=mode)
         figures[f"ms to open to {mode}"] = 1e3 * (time.perf_counter() - begun)
         for what, look in {
             "look whether something came": lambda store: (store.newest, store.last, store.compacted),
-            "read the newest generation's attributes": lambda store: store.latest(only=()),
-            "read the newest generation": lambda store: store.latest(),
+            "read the newest checkpoint's attributes": lambda store: store.latest(only=()),
+            "read the newest checkpoint": lambda store: store.latest(),
             "read the rows behind it": lambda store: list(store.records(after=store.latest(only=()).upto)),
             "find the rows of one material": lambda store: list(store.heads(label="material 7")),
         }.items():

@@ -24,7 +24,7 @@ COUNTS = {
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux" or not any(map(shutil.which, ("cc", "gcc", "clang"))),
-    reason="needs Linux and a C compiler, for what SQLite does to files",
+    reason="needs Linux and a C compiler, for what is done to files",
 )
 
 

@@ -382,6 +382,7 @@ SUMS = {
     "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
     "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
     "second-1048576": [lambda a: a * 0],
+    "rows-1048576": [lambda a: a * 0, lambda a: a - 1],
     "sample-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
     "sample-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
     "sample-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],

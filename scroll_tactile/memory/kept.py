@@ -1,7 +1,7 @@
 """Kept touches: a bounded sample of what was observed, for recall (see `readouts.recall`).
 
-In a generation these are `kept-keys` (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their
-materials are the attribute `kept`. Of a generation without them the rows are replayed.
+In a checkpoint these are `kept-keys` (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their
+materials are the attribute `kept`.
 """
 
 from __future__ import annotations

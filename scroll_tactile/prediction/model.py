@@ -117,8 +117,7 @@ class Draft:
         judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
         tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
-        # What was compacted before there were views cannot be viewed: then it is judged by its windows alone.
-        views = [view for view in memory.plan.views if len(statistics.names(view)) == len(names)]
+        views = list(memory.plan.views)
         kept = memory.kept.touches() if memory.kept is not None and views else []
         lengths = statistics.longest, statistics.usual_least
         return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)

@@ -46,8 +46,8 @@ class Augmented(FrozenModel):
         copies = []
         for i in range(self.copies):
             copies.append(self._paced(image, (i + rng.random()) / self.copies))
-            # What earlier versions drew of each copy's drift and dead channels: without it the next would have another
-            # pace, and a touch could not be retracted from a memory of theirs.
+            # Unused, of kinds of copies that are gone: without it the next would have another pace, and the figures
+            # that are recorded for copies would be others.
             rng.random(3), rng.random((2, len(image), 1), dtype=np.float32), rng.permutation(len(image))
         return copies
 

@@ -8,7 +8,7 @@ from touches import OBSERVED, SETTINGS, fed, filled, require_same, spoil, stream
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
-from store import ReadOnlyError, Store
+from store import ReadOnlyError
 
 SAID = {"a": {"silk": 0.25, "wool": 0.75}, "b": {"silk": 1.0}, "d": {"soft": True, "wool": 0.5, "jute": None}}
 
@@ -110,14 +110,3 @@ def test_it_is_written_out_plain(path, tmp_path):
         ["d", "soft", "yes", ""],
         ["d", "wool", "yes", "0.5"],
     ]
-
-
-def test_a_memory_of_before_has_none(path):
-    with filled(path)[0] as learner:
-        assert learner.descriptions == {}
-    with Store.open(path) as store:
-        newest = store.latest()
-        attributes = {name: value for name, value in newest.attributes.items() if name != "descriptions"}
-        store.commit(newest.arrays, upto=newest.upto, attributes=attributes)
-    with TactileLearner.open(path, **SETTINGS) as again:
-        require_same(again, OBSERVED)

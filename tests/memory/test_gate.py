@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from touches import PAD, SETTINGS, contents, filled, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner
-from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
+from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
@@ -382,6 +382,7 @@ SUMS = {
     "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
     "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
     "second-1048576": [lambda a: a * 0],
+    "rows-1048576": [lambda a: a * 0, lambda a: a - 1],
     "sample-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
     "sample-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
     "sample-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],
@@ -547,6 +548,8 @@ def require_typed_or_equal(path, **settings_):
             learner.predict(stream((7, 25)))
             learner.observations()
             learner.exemplars  # noqa: B018
+    except EmbeddingMismatchError:  # it may be of another version of its embedding, which a check does not make
+        return
     except TYPED:
         assert found
         return

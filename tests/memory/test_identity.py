@@ -154,6 +154,12 @@ def test_an_identity_that_is_none_is_damage(tmp_path, change):
         TactileLearner.open(tmp_path / "m")
 
 
+def test_another_number_of_exemplars_than_it_was_made_with_is_refused(tmp_path):
+    filled(tmp_path / "m", exemplars=4).close()
+    with pytest.raises(MismatchError, match=r"exemplars=4; it was opened with 7.*leave exemplars out"):
+        TactileLearner.open(tmp_path / "m", exemplars=7)
+
+
 class TestSnapshots:
     def test_a_learner_pickles_into_another_process(self, tmp_path):
         with filled(tmp_path / "m", embedding=Kernels(dimension=64)) as learner:

@@ -167,7 +167,7 @@ def test_rows_hold_readings_alone_where_the_memory_can_embed_them_again(made, tm
     with Store.open(tmp_path / "m", mode="read") as store:
         kinds = {name.partition("-")[0] for name in store.record(1).arrays}
     bare = made["embedding"] is SMALL
-    assert kinds == ({"readings"} if bare else {"stages"} | ({"readings"} if made["exemplars"] else set()))
+    assert kinds == ({"readings"} if bare else {"codes"} | ({"readings"} if made["exemplars"] else set()))
 
 
 def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_path):

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from scroll_tactile.memory.partial import Joint, Partial
 from touches import OBSERVED, PAD, SETTINGS, SMALL, contents, fed, filled, require_same, spoil, stream
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.errors import MismatchError, ObservationError
 from scroll_tactile.memory.packing import reduce_partials
-from scroll_tactile.memory.partial import Joint, Partial
 from scroll_tactile.memory.state import Memory
 from store import DamageError, NotAStoreError, StoreError, VersionError
 

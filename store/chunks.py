@@ -59,8 +59,7 @@ class ArrayFiles:
     def read(self) -> np.ndarray:
         """Return the array, each file verified before it is decompressed; its own sha256 is the caller's to verify."""
         content = self._content
-        array = np.empty(content.shape, content.dtype)
-        plain = flat_bytes(array).view(content.plain).reshape(content.plain_shape)
+        plain = np.empty(content.plain_shape, content.plain)
         most = prod(self._chunk) * plain.itemsize
         most += most // 64 + 1024 + CHUNK_MORE
         for i, (place, path) in enumerate(self._files()):
@@ -68,6 +67,7 @@ class ArrayFiles:
             if hashlib.sha256(data).hexdigest() != content.files[i]:
                 raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
             self._fill(plain, place, data)
+        array = content.from_plain(plain)
         require_values(array)
         return array
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from store.encoding import kept_dtype, require_name, require_shape
+from store.encoding import flat_bytes, kept_dtype, require_name, require_shape
 
 __all__ = ["GROUP_VERSION", "ArrayContent", "read_content"]
 
@@ -33,14 +33,34 @@ class ArrayContent:
     files: tuple[str, ...] = ()
 
     @property
+    def in_planes(self) -> bool:
+        """Whether it is stored byte by byte, all lowest ones first: wide integers take a tenth less so."""
+        return self.dtype.kind in "iu" and self.dtype.itemsize >= 4
+
+    @property
     def plain(self) -> np.dtype:
         """The dtype in zarr, which has no settled type for fixed-width text and warns of it: code points have one."""
-        return np.dtype("<u4") if self.dtype.kind == "U" else self.dtype
+        return np.dtype("|u1") if self.in_planes else np.dtype("<u4") if self.dtype.kind == "U" else self.dtype
 
     @property
     def plain_shape(self) -> tuple[int, ...]:
-        """The shape in zarr: text has a last axis of code points."""
+        """The shape in zarr: text has a last axis of code points, integers in planes a first axis of bytes."""
+        if self.in_planes:
+            return (self.dtype.itemsize, *self.shape)
         return (*self.shape, self.dtype.itemsize // 4) if self.dtype.kind == "U" else self.shape
+
+    def to_plain(self, array: np.ndarray) -> np.ndarray:
+        """Return the array as it is in zarr."""
+        if self.in_planes:
+            return flat_bytes(array).reshape(-1, self.dtype.itemsize).T.reshape(self.plain_shape)
+        return flat_bytes(array).view(self.plain).reshape(self.plain_shape)
+
+    def from_plain(self, plain: np.ndarray) -> np.ndarray:
+        """Return the array that was `plain` in zarr, of its shape and dtype; it may share its memory."""
+        if self.in_planes:
+            rows = np.ascontiguousarray(plain.reshape(self.dtype.itemsize, -1).T)
+            return rows.view(self.dtype).reshape(self.shape)
+        return plain.view(self.dtype).reshape(self.shape)
 
     @property
     def size(self) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 
 from store.archive import files_of
 from store.backup import back_up
-from store.checkpoint_files import Draft
+from store.checkpoint_files import QUICK, THOROUGH, Draft
 from store.checkpoints import Checkpoints
 from store.encoding import check_arrays, encode_payload
 from store.exceptions import (
@@ -293,11 +293,13 @@ class Store:
         raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
         What cannot be kept is refused at once, with RecordError.
         """
-        draft = self._draft(arrays, upto, attributes)
+        draft = self._draft(arrays, upto, attributes, QUICK)
         self._checkpoints.raise_failure()
         self._checkpoints.commit_later(draft)
 
-    def _draft(self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None) -> Draft:
+    def _draft(
+        self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None, level: int = THOROUGH
+    ) -> Draft:
         self._check_open(write=True)
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a checkpoint")
@@ -308,7 +310,7 @@ class Store:
                 f"upto must be a sequence from {first}, the last that was compacted, to {last}, the last that there "
                 f"is, not {upto!r}"
             )
-        return Draft(check_arrays(arrays), upto, to_json("attributes", attributes))
+        return Draft(check_arrays(arrays), upto, to_json("attributes", attributes), level)
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""

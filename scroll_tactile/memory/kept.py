@@ -64,15 +64,16 @@ class KeptTouches(Sample[LevelArray]):
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the material of each touch."""
         kept = self.touches()
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)])
         return {
             "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
             "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
-            "kept-levels": np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)]),
+            "kept-levels": np.diff(levels, prepend=np.uint8(0)),
         }, [touch.material for touch in kept]
 
     def fill(self, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str]) -> None:
         """Take in what `to_arrays` described."""
         columns, channels = arrays["kept-columns"], self.made.sensor.channels
-        parts = np.split(arrays["kept-levels"], np.cumsum(columns * channels)[:-1])
+        parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
         for i, material in enumerate(materials):
             self.add(material, arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1))

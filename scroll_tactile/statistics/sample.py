@@ -153,7 +153,17 @@ class Sample(Generic[T]):
 
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
-        for material, key, item in items:
+        given = list(items)
+        if not self._items and len(given) <= self.capacity:  # all stay: there is nothing to choose
+            for material, key, item in given:
+                held = self._items.get((material, key))
+                self._items[material, key] = item if held is None else self.joined(held, item)
+            for material, key in self._items:
+                self._keys.setdefault(material, []).append(key)
+            for keys in self._keys.values():
+                keys.sort()
+            return
+        for material, key, item in given:
             self.add(material, key, item)
 
     def refill(self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], T]) -> None:

@@ -225,6 +225,17 @@ class LogReader:
         with suppress(DamageError):
             self.resume()
 
+    def has_place(self, place: Place) -> bool:
+        """Return whether a place is behind the first frame or a batch of this log."""
+        if self._first is not None and place == Place.behind(self._first):
+            return True
+        try:
+            with reported(self.path, "looking for a place"):
+                self._commit_before(place)
+        except DamageError:
+            return False
+        return True
+
     def _commit_before(self, place: Place) -> Frame:
         offset = place.offset - FRAME_BYTES
         is_inside = 0 < offset < self._file.size()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
@@ -31,7 +31,7 @@ from store.log_writer import create_log
 from store.records import Checkpoint, to_json
 from store.row_encoding import HEAD_BYTES, ROW, row_sequence
 
-__all__ = ["Checkpoints", "place_in"]
+__all__ = ["Checkpoints", "read_back"]
 
 logger = logging.getLogger(__name__)
 
@@ -132,13 +132,13 @@ class Checkpoints:
                 try:
                     create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
                     drafts = [draft] if newest is None else [draft, newest]
-                    named = [self._write(each, place_in(path, each.upto)[1]) for each in drafts]
+                    identity, places = read_back(path, [each.upto for each in drafts])
+                    named = [self._write(each, place) for each, place in zip(drafts, places, strict=True)]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
                         raise damage
                 except BaseException:
                     remove_tree(path)
                     raise
-                identity = place_in(path, 0)[0]
                 with reported(self._folder, "committing"):
                     write_current(self._folder, Current(number, identity, newest=named[-1], base=named[0]))
             self.remove_unnamed()
@@ -194,16 +194,18 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def place_in(path: Path, upto: int) -> tuple[bytes, Place]:
-    """Return the identity of a log that was just written, and a place in it behind which are all rows behind `upto`.
+def read_back(path: Path, uptos: Sequence[int]) -> tuple[bytes, list[Place]]:
+    """Read a log that was just written; return its identity, and for each of these rows a place.
 
-    Raises DamageError where it does not read back.
+    All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.
     """
     with LogReader(path) as log:
-        found = log.place
+        found = [log.place] * len(uptos)
         for batch in log.refresh():
-            rows = [frame for frame in batch if frame.kind == ROW]
-            if rows and row_sequence(log.peek(rows[-1].offset, HEAD_BYTES)) > upto:
-                break
-            found = log.place
+            last = row_sequence(log.peek(batch[-1].offset, HEAD_BYTES))
+            found = [log.place if last <= upto else place for upto, place in zip(uptos, found, strict=True)]
+        if log.place.offset != path.stat().st_size:
+            raise DamageError(
+                f"{path} does not read back as it was just written: its disk cannot be trusted", path=path
+            )
         return log.identity, found

@@ -232,6 +232,17 @@ class LogReader:
         with suppress(DamageError):
             self.resume()
 
+    def has_place(self, place: Place) -> bool:
+        """Return whether a place is behind the first frame or a batch of this log."""
+        if self._first is not None and place == Place.behind(self._first):
+            return True
+        try:
+            with reported(self.path, "looking for a place"):
+                self._commit_before(place)
+        except DamageError:
+            return False
+        return True
+
     def _commit_before(self, place: Place) -> Frame:
         offset = place.offset - FRAME_BYTES
         is_inside = 0 < offset < self._file.size()
@@ -268,7 +279,7 @@ class LogReader:
                     self.place = Place.behind(self._last)
                 else:
                     return
-                if batch or damage is None:
+                if batch:
                     yield batch
             raise damage
 

@@ -138,9 +138,16 @@ class LogWriter(LogReader):
 
         Raises StoreFullError or another StoreError, and then the log is as it was at the last commit.
         """
+        with self._writing:
+            if self._next != self.place:
+                self.seal()
+
+    def seal(self) -> None:
+        """As `commit`, also where nothing is staged: behind a batch without frames damage of the one before is proven.
+
+        What befalls the last batch cannot be told from what a power cut leaves.
+        """
         with self._writing, reported(self.path, "making a batch durable"):
-            if self._next == self.place:
-                return
             try:
                 last = self._pack(COMMIT, b"")
                 self._write()
@@ -216,11 +223,14 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
             with os.fdopen(descriptor, "wb") as file:
                 file.write(pack_frame(os.urandom(IDENTITY_BYTES), 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
             with LogWriter(draft) as log:
+                count = 0
                 for count, (kind, payload) in enumerate(frames, 1):
                     log.stage(kind, payload)
                     if count % TOGETHER == 0:
                         log.commit()
                 log.commit()
+                if count:
+                    log.seal()  # all of them were durable, and may be all that the log ever holds
             sync_file(draft)
             draft.replace(path)
             sync_folder(path.parent)

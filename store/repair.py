@@ -10,13 +10,12 @@ from os import PathLike
 from pathlib import Path
 
 from store.archive import Files
-from store.checkpoints import place_in
+from store.checkpoints import read_back
 from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
 from store.layout import (
     DAMAGED,
     Current,
-    NamedCheckpoint,
     log_numbers,
     log_path,
     remove_unnamed,
@@ -25,7 +24,6 @@ from store.layout import (
     write_current,
 )
 from store.lock import WriterLock
-from store.log import LogReader
 from store.log_writer import create_log
 from store.records import to_json
 from store.row_encoding import ROW, decode_head, head_without_arrays
@@ -153,6 +151,8 @@ def _repair(survey: Survey) -> Repair:
         )
     folder, plan = survey.folder, _Plan.of(survey)
     number = 1 + max([*log_numbers(folder, unfinished=True), *_put_aside(folder), 0])
+    if log_path(folder, number) == survey.log.path:
+        number += 1  # that of one which is gone
     path = log_path(folder, number)
     create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
     current = _current(path, number, plan)
@@ -192,17 +192,13 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 
 def _current(path: Path, number: int, plan: _Plan) -> Current:
     """Return what `CURRENT` is to say, after the new log was read back. Raises DamageError."""
-    with LogReader(path) as log:
-        for _ in log.refresh():
-            pass
-        identity = log.identity
-
-    def named(found: FoundCheckpoint | None) -> NamedCheckpoint | None:
-        if found is None or found.named is None:
-            return None
-        return replace(found.named, place=place_in(path, found.upto)[1])
-
-    return Current(number, identity, named(plan.start), named(plan.standing))
+    found = [plan.start, plan.standing]
+    identity, places = read_back(path, [0 if each is None else each.upto for each in found])
+    named = [
+        None if each is None or each.named is None else replace(each.named, place=place)
+        for each, place in zip(found, places, strict=True)
+    ]
+    return Current(number, identity, *named)
 
 
 def _move_aside(survey: Survey) -> Path | None:

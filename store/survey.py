@@ -154,7 +154,7 @@ class FoundLog:
         self._open = partial(files.open_log, path)
         self.identity: dict[str, JSON] | None = None
         self.rows: list[tuple[int, Fault | None]] = []
-        self.torn: set[int] = set()
+        self.torn, self.without_arrays = set[int](), set[int]()
         self.compacted = 0
         self._offsets: dict[int, tuple[int, int]] = {}
         self._reader: LogReader | None = None
@@ -227,6 +227,7 @@ class FoundLog:
             if row.head.sequence != sequence:
                 fault = Fault.DAMAGED
             elif row.payload is None:
+                self.without_arrays.add(sequence)
                 self.compacted = sequence
             elif not _is_readable(row.payload):
                 fault = Fault.FOREIGN_ARRAYS
@@ -250,11 +251,7 @@ class FoundLog:
         assert self._reader is not None
         if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.upto):
             return False
-        try:
-            with LogReader(self.path, place=named.place, identity=self._reader.identity, file=self._open()):
-                return True
-        except DamageError:
-            return False
+        return self._reader.has_place(named.place)
 
     def data(self, sequence: int) -> bytes:
         """Return the bytes of a row, verified once more. Raises DamageError."""
@@ -374,7 +371,7 @@ class Survey:
             self._note_gap(before, sequence - 1)
             if fault is not None and not (fault is not Fault.DAMAGED and sequence <= self.compacted):
                 self._note(sequence, sequence, fault)
-            elif fault is None and self.compacted < sequence <= self.log.compacted:
+            elif sequence > self.compacted and sequence in self.log.without_arrays:
                 self._note(sequence, sequence, Fault.NO_ARRAYS)
             before = sequence
         self.last = max(before, upto)

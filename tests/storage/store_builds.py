@@ -10,9 +10,10 @@ import numpy as np
 
 from store import Store, check_store
 from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
+from store.journal import Rows
 from store.layout import checkpoint_path, log_path, read_current, write_current
 from store.log import LogReader, Place
-from store.row_encoding import ROW, encode_row, row_sequence
+from store.row_encoding import ROW, encode_row
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}
@@ -89,9 +90,13 @@ def spoil(folder):
 
 
 def frames(path):
-    """The frames of the rows, by sequence."""
+    """The frames of the rows that verify, by sequence."""
     with LogReader(log_of(path)) as log:
-        return {row_sequence(log.peek(frame.offset, 64)): frame for batch in log.refresh() for frame in batch}
+        found = Rows()
+        for _ in found.take(log):
+            pass
+        places = zip(found.offsets, found.sizes, strict=True)
+        return {number: log.read(*place)[0] for number, place in zip(found.sequences, places, strict=True)}
 
 
 def rows(path):

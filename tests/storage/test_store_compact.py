@@ -182,6 +182,33 @@ def test_a_lost_head_is_no_more_silently_left_out_than_a_row(opened):
         assert (again.compacted, folders(again.path)) == (0, ["00000001"])
 
 
+@pytest.mark.parametrize("upto", [5, LAST])
+def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, upto):
+    """All its rows are one batch, which must not look as one that a power cut left."""
+    opened.compact(sums(upto), upto=upto)
+    opened.close()
+    flip_row(opened.path, LAST - 1)
+    assert damage(opened.path)
+    with Store.open(opened.path, mode="read") as reader, pytest.raises(DamageError, match=f"row {LAST - 1} is missing"):
+        list(reader.heads(LAST - 2))
+
+
+def test_a_log_that_does_not_read_back_does_not_count(opened, monkeypatch):
+    real = store.checkpoints.create_log
+
+    def forgetful(path, *rest):
+        real(path, *rest)
+        data = bytearray(path.read_bytes())
+        data[500] ^= 1
+        path.write_bytes(data)
+
+    with monkeypatch.context() as broken, pytest.raises(DamageError):
+        broken.setattr(store.checkpoints, "create_log", forgetful)
+        compact(opened, 5)
+    assert agrees(opened, 0)
+    assert add(opened, LAST + 1) == LAST + 1
+
+
 def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch):
     real = store.checkpoints.write_checkpoint
 

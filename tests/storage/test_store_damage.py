@@ -6,118 +6,106 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from store_builds import change, flip, folders, same_arrays, state, two_kept
-
-from store import DamageError, NotAStoreError, Store
-
-ROWS = 6
-
-
-@pytest.fixture
-def path(tmp_path):
-    """A closed store of six rows and two generations, up to rows 2 and 4."""
-    with two_kept(), Store.open(tmp_path / "s", identity={"for": "damage"}) as opened:
-        for number in range(1, ROWS + 1):
-            opened.append("a", f"the label of row {number}", bytes([number] * 8), arrays={"x": np.arange(number)})
-            if number in (2, 4):
-                opened.commit({"x": np.arange(1000) + number, "y": np.array(number)}, upto=number)
-    return tmp_path / "s"
-
-
-def chunk_of(folder):
-    return folder / "x" / "c" / "0"
-
-
-@pytest.mark.parametrize(
-    ("row", "covered"), [(1, "generation 2 (up to row 4)"), (4, "generation 2"), (5, "no generation")]
+from store_builds import (
+    LAST,
+    change_rows,
+    flip,
+    flip_row,
+    folders,
+    frames,
+    log_of,
+    lose_rows,
+    newest,
+    same_arrays,
+    spoil,
+    state,
 )
-def test_a_flipped_bit_in_a_row_is_named_and_gone_around(path, row, covered):
-    journal = path / "journal.sqlite"
-    flip(journal, journal.read_bytes().index(f"label of row {row}".encode()))
-    with Store.open(path) as opened:
-        rows = opened.records()
+
+from store import DamageError, Store
+from store.framing import FRAME_BYTES
+
+
+@pytest.mark.parametrize(("row", "covered"), [(1, "checkpoint 1 (up to row 15)"), (14, "checkpoint 1"), (17, "no")])
+@pytest.mark.parametrize("arrays", [False, True])
+def test_a_flipped_bit_in_a_row_is_named_and_gone_around(plain, row, covered, arrays):
+    flip_row(plain, row, arrays=arrays)
+    with Store.open(plain, mode="read") as opened:
+        found = opened.records()
         for expected in range(1, row):
-            assert next(rows).sequence == expected
-        with pytest.raises(DamageError, match=f"row {row} fails") as caught:
-            next(rows)
+            assert next(found).sequence == expected
+        with pytest.raises(DamageError, match=f"row {row} is ") as caught:
+            next(found)
         assert covered in str(caught.value)
-        assert (caught.value.path, caught.value.sequence) == (journal, row)
-        assert [found.sequence for found in opened.records(row)] == list(range(row + 1, ROWS + 1))
-        assert opened.append("a", "b", b"").sequence == ROWS + 1
+        assert (caught.value.path, caught.value.sequence) == (log_of(plain), row)
+        assert [each.sequence for each in opened.records(row)] == list(range(row + 1, LAST + 1))
 
 
-@pytest.mark.parametrize(
-    "assignment",
-    [
-        "kind = 'z'",
-        "label = 'z'",
-        "label = CAST(x'ff' AS TEXT)",
-        "key = x'00'",
-        "time = time + 1",
-        "attributes = '{\"a\":1}'",
-        "attributes = ''",
-        "size = size + 1",
-        "digest = x''",
-        "checksum = x''",
-    ],
-)
-def test_every_column_is_under_the_checksum(path, assignment):
-    change(path, f"UPDATE record SET {assignment} WHERE sequence = 3")
-    with Store.open(path, mode="read") as opened:
-        assert [row.sequence for row in islice(opened.records(), 2)] == [1, 2]
-        assert [head.sequence for head in islice(opened.heads(), 2)] == [1, 2]
-        for read in (lambda: list(opened.records()), lambda: list(opened.heads()), lambda: opened.record(3)):
-            with pytest.raises(DamageError, match="row 3 fails its checksum") as caught:
-                read()
-            assert caught.value.sequence == 3
+def test_a_writer_goes_on_behind_damage_that_a_checkpoint_covers_and_refuses_behind_any_other(plain):
+    flip_row(plain, 14)
+    with Store.open(plain) as opened:
+        assert opened.append("a", "b", b"").sequence == LAST + 1
+    flip_row(plain, 17)
+    before = log_of(plain).read_bytes()
+    with pytest.raises(DamageError, match="repair the store"):
+        Store.open(plain)
+    assert log_of(plain).read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("statement", "said"),
-    [
-        ("UPDATE payload SET bytes = x'' WHERE sequence = 3", "fail their checksum"),
-        ("UPDATE payload SET bytes = substr(bytes, 1, 20) WHERE sequence = 3", "fail their checksum"),
-        ("UPDATE payload SET bytes = (SELECT bytes FROM payload WHERE sequence = 4) WHERE sequence = 3", "fail their"),
-        ("DELETE FROM payload WHERE sequence = 3", "are missing"),
-    ],
-)
-def test_the_arrays_of_a_row_are_under_its_digest_and_its_head_is_not_lost_with_them(path, statement, said):
-    change(path, statement)
-    with Store.open(path, mode="read") as opened:
-        for read in (lambda: list(opened.records()), lambda: opened.record(3)):
-            with pytest.raises(DamageError, match=f"the arrays of row 3 {said}") as caught:
-                read()
-            assert caught.value.sequence == 3
-        assert [row.sequence for row in opened.records(3)] == [4, 5, 6]
-        assert [head.sequence for head in opened.heads()] == list(range(1, ROWS + 1))
+def test_every_byte_of_a_row_and_its_frame_is_under_a_checksum(plain):
+    """Of one that nobody reads at opening, and of one behind the checkpoint."""
+    data = log_of(plain).read_bytes()
+    for row in (9, 18):
+        frame = frames(plain)[row]
+        for place in [*range(frame.offset, frame.offset + FRAME_BYTES + 90), *range(frame.end - 9, frame.end)]:
+            flipped = bytearray(data)
+            flipped[place] ^= 1 << place % 8
+            log_of(plain).write_bytes(flipped)
+            with Store.open(plain, mode="read") as opened:
+                assert [each.sequence for each in islice(opened.records(), row - 1)] == list(range(1, row))
+                for after in (0, row - 1):
+                    with pytest.raises(DamageError, match=f"row {row} is") as caught:
+                        list(opened.records(after))
+                    assert caught.value.sequence == row
+                assert [each.sequence for each in opened.records(row)] == list(range(row + 1, LAST + 1))
+        log_of(plain).write_bytes(data)
 
 
-def test_exchanged_rows_are_found(path):
-    change(path, "UPDATE record SET sequence = 30 WHERE sequence = 3")
-    change(path, "UPDATE record SET sequence = 3 WHERE sequence = 2")
-    change(path, "UPDATE record SET sequence = 2 WHERE sequence = 30")
-    with Store.open(path) as opened, pytest.raises(DamageError, match="row 2"):
-        list(opened.records())
+def test_the_head_of_a_row_is_not_lost_with_its_arrays(plain):
+    flip_row(plain, 3, arrays=True)
+    with Store.open(plain, mode="read") as opened:
+        with pytest.raises(DamageError, match="row 3 is not as it was written"):
+            opened.record(3)
+        assert [head.sequence for head in opened.heads()] == list(range(1, LAST + 1))
 
 
-def test_missing_rows_are_named_and_their_numbers_not_given_again(path):
-    change(path, "DELETE FROM record WHERE sequence IN (2, 3)")
-    with Store.open(path) as opened:
+@pytest.mark.parametrize("row", [2, 17])
+def test_exchanged_and_doubled_rows_are_found(plain, row):
+    def swap(found):
+        found[row], found[row + 1] = found[row + 1], found[row]
+
+    def double(found):
+        found[row + 1] = found[row]
+
+    for change, said in ((swap, f"row {row} is missing"), (double, f"row {row + 1} is missing")):
+        path = shutil.copytree(plain, plain.with_name(change.__name__))
+        change_rows(path, change)
+        with Store.open(path, mode="read") as opened, pytest.raises(DamageError, match=said):
+            list(opened.heads())
+
+
+def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):
+    lose_rows(plain, 2, 3)
+    with Store.open(plain) as opened:
         for read in (opened.records, opened.heads):
             with pytest.raises(DamageError, match="rows 2 to 3 are missing") as caught:
                 list(read())
-            assert [row.sequence for row in read(caught.value.sequence)] == [4, 5, 6]
-    # One table betrays what the other lost at its end.
-    change(path, "DELETE FROM record WHERE sequence > 5")
-    with Store.open(path) as opened, pytest.raises(DamageError, match="rows 6 to 6 are missing"):
-        list(opened.heads(5))
-    change(path, "DELETE FROM record WHERE sequence > 1")
-    change(path, "DELETE FROM payload WHERE sequence > 1")
-    with Store.open(path) as opened:
-        assert opened.last == 4
-        with pytest.raises(DamageError, match="rows 2 to 4 are missing"):
+            assert [row.sequence for row in read(caught.value.sequence)] == list(range(4, LAST + 1))
+    lose_rows(plain, *range(4, LAST + 1))
+    with Store.open(plain) as opened:
+        assert opened.last == 15
+        with pytest.raises(DamageError, match="rows 2 to 15 are missing"):
             list(opened.records())
-        assert opened.append("a", "b", b"").sequence == 5
+        assert opened.append("a", "b", b"").sequence == 16
 
 
 def file_of(folder):
@@ -129,7 +117,7 @@ def rewrite(file, change):
 
 
 SPOIL = {
-    "a bit of an array": lambda folder: flip(file_of(folder), -9),
+    "a bit of an array": spoil,
     "a bit of its header": lambda folder: flip(file_of(folder), 4),
     "a zeroed end": lambda folder: rewrite(file_of(folder), lambda data: data[:-60] + bytes(60)),
     "a file cut short": lambda folder: rewrite(file_of(folder), lambda data: data[:-9]),
@@ -142,60 +130,47 @@ SPOIL = {
     ),
     "no group": lambda folder: (folder / "zarr.json").unlink(),
     "the group's format": lambda folder: rewrite(
-        folder / "zarr.json", lambda data: data.replace(b'"format": 2', b'"format": 9')
+        folder / "zarr.json", lambda data: data.replace(b'"format": 1', b'"format": 9')
     ),
     "nothing left": shutil.rmtree,
 }
 
 
-@pytest.mark.parametrize("spoil", SPOIL.values(), ids=SPOIL.keys())
+@pytest.mark.parametrize("harm", SPOIL.values(), ids=SPOIL.keys())
 @pytest.mark.parametrize("mode", ["read", "write"])
-def test_a_spoilt_generation_is_named_and_the_one_before_it_taken(plain, spoil, mode, caplog):
-    folder = plain / "generations" / "00000002"
-    spoil(folder)
-    with Store.open(plain, mode=mode) as opened, caplog.at_level(logging.WARNING):
+def test_a_spoilt_checkpoint_is_named_and_the_base_taken(compacted, harm, mode, caplog):
+    folder = newest(compacted)
+    harm(folder)
+    with Store.open(compacted, mode=mode) as opened, caplog.at_level(logging.WARNING):
         found = opened.latest()
-    assert (found.number, found.upto) == (1, 10)
-    assert same_arrays(found.arrays, state(10))
+    assert found.upto == 6
+    assert same_arrays(found.arrays, state(6))
     (warning,) = caplog.messages
-    assert "generation 2" in warning
     assert str(folder) in warning
 
 
-def test_without_any_generation_that_verifies_there_is_none(path, caplog):
-    for number in (1, 2):
-        flip(chunk_of(path / "generations" / f"{number:08d}"), -5)
-    with Store.open(path) as opened:
+def test_behind_a_spoilt_checkpoint_the_log_has_every_row(plain, caplog):
+    with Store.open(plain) as opened:
+        spoil(newest(plain))
         assert opened.latest() is None
-        assert len(list(opened.records())) == ROWS
-    assert len(caplog.messages) == 2
-    assert "array 'x' of generation 1" in caplog.messages[1]
+        assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
+        assert opened.commit({"x": np.arange(7)}, upto=6) == 2  # an older one takes no one's place
+        assert folders(plain) == ["00000001"]
+        assert opened.commit({"x": np.arange(7)}, upto=LAST) == 2
+        assert opened.latest().number == 2
+    assert "array 'rows' of checkpoint 1" in caplog.text and "replaying" in caplog.text
 
 
-def test_behind_a_spoilt_generation_the_journal_has_every_row(path, caplog):
-    with Store.open(path) as opened:
-        assert opened.commit({"x": np.arange(1000)}, upto=6) == 3
-        assert folders(path) == ["00000003"]
-        flip(chunk_of(path / "generations" / "00000003"), -5)
-        assert opened.latest() is None
-        assert [row.sequence for row in opened.records()] == list(range(1, ROWS + 1))
-        assert opened.commit({"x": np.arange(7)}, upto=6) == 4
-        assert opened.latest().number == 4
-    assert "replaying" in caplog.text
-
-
-def test_a_spoilt_identity_is_found(path):
-    change(path, "UPDATE meta SET value = '{}' WHERE key = 'identity'")
-    with pytest.raises(DamageError, match="identity"):
-        Store.open(path)
+def test_a_spoilt_identity_is_found(plain):
+    flip(log_of(plain), FRAME_BYTES + 3)
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="payload of frame 0"):
+            Store.open(plain, mode=mode)
 
 
 @pytest.mark.parametrize("spoil", [lambda data: b"", lambda data: b"x" + data[1:], lambda data: data[:50]])
-def test_a_journal_that_is_no_longer_sqlite_is_damage_where_generations_are(path, spoil):
-    journal = path / "journal.sqlite"
-    journal.write_bytes(spoil(journal.read_bytes()))
-    with pytest.raises(DamageError, match=str(journal)):
-        Store.open(path)
-    shutil.rmtree(path / "generations")
-    with pytest.raises(NotAStoreError):
-        Store.open(path)
+def test_a_log_that_is_no_longer_one_is_damage(plain, spoil):
+    rewrite(log_of(plain), spoil)
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match=str(log_of(plain))):
+            Store.open(plain, mode=mode)

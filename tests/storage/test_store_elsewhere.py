@@ -2,21 +2,27 @@
 
 import errno
 import fcntl
-import hashlib
 import json
 import os
 import shutil
 import socket
-import sqlite3
 import stat
-import struct
 import threading
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
-from store_builds import LAST, add, as_after_a_crash, build, change, commit, contents, damage, query
+from store_builds import (
+    LAST,
+    add,
+    as_after_a_crash,
+    build,
+    commit,
+    contents,
+    damage,
+    newest,
+    put_row,
+)
 
 from store import (
     DamageError,
@@ -25,15 +31,13 @@ from store import (
     RecordError,
     Store,
     StoreError,
-    StoreFullError,
     check_store,
     repair_store,
 )
 from store.files import read_regular, same_folder
 from store.lock import is_held
-from store.records import checksum
 
-JOURNAL = "journal.sqlite"
+LOG = "log-00000001"
 
 
 def everything(folder):
@@ -70,7 +74,7 @@ def backed_up(path, target):
 # A read leaves everything as it is.
 
 
-@pytest.fixture(params=["closed", "crashed", "crashed with its shared memory", "closed beside a reader"])
+@pytest.fixture(params=["closed", "crashed", "closed beside a reader"])
 def left(request, tmp_path):
     """A store in each state in which a writer can leave it."""
     path = build(tmp_path / "s")
@@ -83,8 +87,7 @@ def left(request, tmp_path):
     elif request.param.startswith("crashed"):
         writer = Store.open(path)
         add(writer, LAST + 1)
-        hidden = () if "shared" in request.param else ("*-shm",)
-        shutil.copytree(path, tmp_path / "c", ignore=shutil.ignore_patterns("holder.json", *hidden))
+        as_after_a_crash(writer, tmp_path / "c")
         writer.close()
         path = tmp_path / "c"
     return path
@@ -99,14 +102,6 @@ def test_a_read_a_check_and_a_backup_leave_the_folder_as_it_is(left, tmp_path, u
     assert first == again
     if use != "check":
         assert len(first) >= LAST
-
-
-def test_a_row_that_is_only_in_the_log_is_read(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as writer:
-        add(writer, 1)
-        crashed = as_after_a_crash(writer, tmp_path / "c")
-    assert (crashed / f"{JOURNAL}-wal").stat().st_size
-    assert read_all(crashed) == ["row 1"]
 
 
 def test_beside_a_writer_no_file_is_new(tmp_path):
@@ -165,17 +160,6 @@ def test_a_reader_never_sees_half_of_what_writers_in_another_thread_do(tmp_path)
     assert damage(path) == []
 
 
-def test_a_reader_of_a_journal_that_a_repair_replaced_goes_on_with_the_one_it_opened(tmp_path):
-    path = build(tmp_path / "s")
-    change(path, "UPDATE record SET label = 'z' WHERE sequence = 18")
-    with Store.open(path, mode="read") as reader:
-        assert reader.last == LAST
-        repair_store(path)
-        assert reader.last == LAST
-    with Store.open(path, mode="read") as reader:
-        assert reader.last == 17
-
-
 # Links, pipes and other things that are no files.
 
 
@@ -195,19 +179,19 @@ def as_link(path, target):
 
 
 LINKS = {
-    "generations": "",
-    "generations/00000077": "12345",
-    "generations/00000077.partial": "12345",
+    "checkpoints": "",
+    "checkpoints/00000077": "12345",
+    "checkpoints/00000077.partial": "12345",
+    "derived": "12345",
     "holder.json": "file",
     "holder.json.new": "file",
     "lock": "file",
-    JOURNAL: "journal",
-    f"{JOURNAL}-wal": "file",
-    f"{JOURNAL}-shm": "file",
-    f"{JOURNAL}-journal": "file",
-    f"{JOURNAL}.new": "file",
-    f"{JOURNAL}.repaired": "file",
-    f"{JOURNAL}.damaged": "file",
+    "CURRENT": "file",
+    "CURRENT.new": "file",
+    LOG: "log",
+    f"{LOG}.new": "file",
+    f"{LOG}.damaged": "file",
+    "log-00000007": "file",
 }
 
 
@@ -224,7 +208,7 @@ def all_refuse(path, tmp_path):
 @pytest.mark.parametrize("name", LINKS)
 def test_a_link_in_a_store_is_refused_and_nothing_that_it_leads_to_changes(tmp_path, name):
     path, outside = build(tmp_path / "s"), victim(tmp_path)
-    shutil.copy(path / JOURNAL, outside / "journal")
+    shutil.copy(path / LOG, outside / "log")
     as_link(path / name, outside / LINKS[name])
     before, inside = everything(outside), everything(path)
     all_refuse(path, tmp_path)
@@ -236,14 +220,14 @@ def test_a_link_that_comes_while_a_store_is_read_is_not_followed(tmp_path):
     path, outside = build(tmp_path / "s"), victim(tmp_path)
     with Store.open(path, mode="read") as reader:
         assert reader.last
-        as_link(path / f"{JOURNAL}-wal", outside / "file")
-        with pytest.raises(DamageError, match="symbolic link"):
+        as_link(path / "CURRENT", outside / "file")
+        with pytest.raises(DamageError, match="no regular file"):
             list(reader.heads())
 
 
-def test_a_link_among_the_files_of_a_generation_is_not_copied(tmp_path):
+def test_a_link_among_the_files_of_a_checkpoint_is_not_copied(tmp_path):
     path, outside = build(tmp_path / "s"), victim(tmp_path)
-    as_link(path / "generations" / "00000002" / "rows" / "c" / "0" / "0", outside / "file")
+    as_link(newest(path) / "rows" / "c" / "0" / "0", outside / "file")
     with Store.open(path, mode="read") as reader, pytest.raises(DamageError):
         reader.backup(tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
@@ -258,7 +242,7 @@ def test_a_store_is_reached_through_a_link(tmp_path):
     assert check_store(tmp_path / "link") == []
 
 
-@pytest.mark.parametrize("name", [JOURNAL, f"{JOURNAL}-wal", f"{JOURNAL}-shm", "lock"])
+@pytest.mark.parametrize("name", [LOG, "CURRENT", "lock", "log-00000009"])
 def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
     path, outside = build(tmp_path / "s"), tmp_path / "outside"
     (path / name).touch()
@@ -294,7 +278,7 @@ def no_file(path, kind):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device", "folder"])
-@pytest.mark.parametrize("name", [name for name, target in LINKS.items() if target in ("file", "journal")])
+@pytest.mark.parametrize("name", [name for name, target in LINKS.items() if target in ("file", "log")])
 def test_what_is_no_file_is_refused_at_once(tmp_path, name, kind):
     path = build(tmp_path / "s")
     no_file(path / name, kind)
@@ -318,91 +302,7 @@ def test_only_a_regular_file_is_read_and_none_that_is_larger_than_it_may_be(tmp_
         read_regular(tmp_path / "folder" / "file", 5, within=tmp_path)
 
 
-# What SQLite would run, remove or believe.
-
-SCHEMAS = {
-    "a trigger": "CREATE TRIGGER t AFTER INSERT ON payload BEGIN DELETE FROM record; END",
-    "an endless trigger": (
-        "CREATE TRIGGER t AFTER INSERT ON record BEGIN INSERT INTO meta WITH RECURSIVE c(n) AS "
-        "(SELECT 1 UNION ALL SELECT n FROM c) SELECT n, n, n FROM c; END"
-    ),
-    "a view": "CREATE VIEW v AS SELECT * FROM record",
-    "an index": "CREATE INDEX i ON record (length(label))",
-    "a table": "CREATE TABLE other (x)",
-    "a virtual table": "CREATE VIRTUAL TABLE f USING fts5(x)",
-}
-
-
-@pytest.mark.parametrize("what", SCHEMAS)
-def test_a_schema_that_is_not_exactly_ours_is_damage(tmp_path, what):
-    path = build(tmp_path / "s")
-    change(path, SCHEMAS[what])
-    before = contents(path)
-    for mode in ("write", "read"):
-        with pytest.raises(DamageError, match="the tables of"):
-            Store.open(path, mode=mode)
-    assert any("the tables of" in problem.what for problem in check_store(path))
-    after = contents(path)
-    assert {name: after[name] for name in before} == before
-    repair_store(path)
-    assert read_all(path) == [f"row {number}" for number in range(1, LAST + 1)]
-    assert damage(path) == []
-    assert len(query(path, "SELECT * FROM sqlite_master")) == 5
-
-
-def rollback_journal(super_journal):
-    """A rollback journal with no pages that names a super-journal: played back, SQLite removes what it names."""
-    name = os.fsencode(super_journal)
-    header = struct.pack(">8s5I", bytes.fromhex("d9d505f920a163d7"), 0, 1, 6, 512, 4096).ljust(512, b"\0")
-    total = sum(byte - 256 if byte > 127 else byte for byte in name) & 0xFFFFFFFF
-    tail = struct.pack(">I", 0x40000000 // 4096 + 1) + name + struct.pack(">II", len(name), total)
-    return header + tail + bytes.fromhex("d9d505f920a163d7")
-
-
-def test_what_another_program_did_not_end_is_not_played_back(tmp_path):
-    path, outside = build(tmp_path / "s"), victim(tmp_path)
-    (path / f"{JOURNAL}-journal").write_bytes(rollback_journal(outside / "file"))
-    before, inside = everything(outside), everything(path)
-    for mode in ("write", "read"):
-        with pytest.raises(DamageError, match="did not end"):
-            Store.open(path, mode=mode)
-    assert "did not end" in check_store(path)[0].what
-    assert everything(path) == inside
-    repair_store(path)
-    assert everything(outside) == before
-    assert (path / f"{JOURNAL}.damaged-journal").exists()
-    assert read_all(path) == [f"row {number}" for number in range(1, LAST + 1)]
-
-
-@pytest.mark.parametrize("aside", ["../victim/file", "{victim}/file", "generations", "journal.sqlite", 5, None])
-def test_a_forged_note_of_a_repair_moves_nothing_out_of_the_folder(tmp_path, aside):
-    path, outside = build(tmp_path / "s"), victim(tmp_path)
-    aside = aside.format(victim=outside) if isinstance(aside, str) else aside
-    noted = json.dumps({"aside": aside, "heads": [], "kept": 3, "lost": []})
-    with closing(sqlite3.connect(path / JOURNAL)) as connection, connection:
-        values = ("repaired", noted, checksum("meta", b"repaired", noted.encode()))
-        connection.execute("INSERT INTO meta VALUES (?, ?, ?)", values)
-    (path / JOURNAL).rename(path / f"{JOURNAL}.repaired")
-    (path / f"{JOURNAL}-wal").write_bytes(b"mine")
-    before = everything(outside)
-    with pytest.raises(DamageError, match="is damaged: remove it"):
-        repair_store(path)
-    assert everything(outside) == before
-
-
-def put_row(path, *, sequence, payload=b"ARPL\x01\0\0", **changed):
-    """Insert a row with right checksums, of any types."""
-    digest = hashlib.blake2b(payload, digest_size=16).digest()
-    row = {"sequence": sequence, "kind": "a", "label": "b", "key": b"", "time": 1.0, "attributes": "{}"}
-    row |= {"size": len(payload), "digest": digest, **changed}
-    plain = [value.encode() if isinstance(value, str) else value for value in row.values()]
-    with closing(sqlite3.connect(path / JOURNAL)) as connection, connection:
-        marks = ",".join("?" * 9)
-        values = [*row.values(), checksum("record", *plain)]
-        connection.execute("PRAGMA ignore_check_constraints = ON")
-        connection.execute(f"INSERT INTO record VALUES ({marks})", values)
-        connection.execute("INSERT INTO payload VALUES (?, ?)", (sequence, payload))
-
+# Rows that nobody wrote.
 
 FORGED = {
     "nested JSON": {"attributes": '{"x":' + "[" * 100_000 + "]" * 100_000 + "}"},
@@ -418,53 +318,11 @@ FORGED = {
 @pytest.mark.parametrize("what", FORGED)
 def test_a_forged_row_with_a_right_checksum_is_damage(tmp_path, what):
     path = build(tmp_path / "s")
-    put_row(path, sequence=LAST + 1, **FORGED[what])
+    put_row(path, **FORGED[what])
     with Store.open(path, mode="read") as reader, pytest.raises(DamageError) as caught:
         list(reader.heads())
     assert caught.value.sequence == LAST + 1
     assert any(f"row {LAST + 1} fails" in problem.what for problem in check_store(path))
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000 + "]" * 100_000, "null", "x"])
-def test_a_forged_identity_is_damage(tmp_path, text):
-    path = build(tmp_path / "s")
-    with closing(sqlite3.connect(path / JOURNAL)) as connection, connection:
-        values = (text, checksum("meta", b"identity", text.encode()))
-        connection.execute("UPDATE meta SET value = ?, checksum = ? WHERE key = 'identity'", values)
-    with pytest.raises(DamageError, match="identity"):
-        Store.open(path)
-    assert check_store(path)
-
-
-def pages(path):
-    data = bytearray((path / JOURNAL).read_bytes())
-    return data, [memoryview(data)[start : start + 4096] for start in range(0, len(data), 4096)]
-
-
-def test_a_table_that_leads_through_one_page_again_and_again_is_damage_and_ends(tmp_path):
-    path = tmp_path / "s"
-    with Store.open(path, identity={}) as writer:
-        for number in range(1, 400):
-            writer.append("a", f"row {number}" + "x" * 300, b"")
-    data, page = pages(path)
-    # The root of table record, and eight pages that each lead four hundred times to the next, the last one to a leaf.
-    leaf = next(i for i, found in enumerate(page, 1) if found[0] == 0x0D and i > 6)
-    chain = [4, *[i for i in range(7, len(page)) if i != leaf][:8]]
-    for number, below in zip(chain, [*chain[1:], leaf], strict=True):
-        cells = [struct.pack(">I", below) + bytes([0x82, i & 0x7F]) for i in range(100)]
-        place, places = 4096, []
-        for cell in cells:
-            place -= len(cell)
-            page[number - 1][place : place + len(cell)] = cell
-            places.append(place)
-        header = struct.pack(">BHHHBI", 0x05, 0, len(cells), place, 0, below)
-        page[number - 1][: len(header) + 2 * len(places)] = header + struct.pack(f">{len(places)}H", *places)
-    (path / JOURNAL).write_bytes(data)
-    with pytest.raises(DamageError), Store.open(path, mode="read") as reader:
-        list(reader.heads(kind="none of these"))
-    with pytest.raises(DamageError), Store.open(path, mode="read") as reader:
-        list(reader.heads())
-    assert check_store(path)
 
 
 # Locks and paths.
@@ -551,28 +409,24 @@ def test_nobody_backs_a_store_up_into_itself(tmp_path):
 
 def test_numbers_at_the_end_of_all_numbers_are_damage_and_not_counted_on(tmp_path):
     path = build(tmp_path / "s")
-    (path / "generations" / ("9" * 40)).mkdir()
+    (path / "checkpoints" / ("9" * 40)).mkdir()
     with Store.open(path) as writer:
         commit(writer.commit, LAST)
+        (path / "log-999999999999999999").touch()
+        with pytest.raises(DamageError, match="number 999999999999999999"):
+            commit(writer.compact, LAST)
     put_row(path, sequence=2**63 - 1)
     with Store.open(path) as writer, pytest.raises(DamageError, match="number 9223372036854775807"):
         add(writer, LAST + 1)
-    assert (path / "generations" / ("9" * 40)).is_dir()
-
-
-@pytest.mark.skipif(not hasattr(os, "truncate"), reason="makes a file with holes")
-def test_a_file_of_holes_fills_no_disk(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as writer:
-        add(writer, 1)
-        crashed = as_after_a_crash(writer, tmp_path / "c")
-    os.truncate(crashed / JOURNAL, 2**43)
-    with pytest.raises(StoreFullError, match="copy of"):
-        read_all(crashed)
+    assert (path / "checkpoints" / ("9" * 40)).is_dir()
+    put_row(path, sequence=2**63)
+    with pytest.raises(DamageError, match="no row"):
+        Store.open(path)
 
 
 def test_a_file_of_holes_is_not_copied(tmp_path):
     path = build(tmp_path / "s")
-    with (path / "generations" / "00000002" / "rows" / "zarr.json").open("r+b") as file:
+    with (newest(path) / "rows" / "zarr.json").open("r+b") as file:
         file.truncate(2**40)
     with Store.open(path, mode="read") as reader, pytest.raises(DamageError, match="at most"):
         reader.backup(tmp_path / "copy")

@@ -1,15 +1,14 @@
 """Random histories of a store against a list that cannot go wrong."""
 
 import shutil
-import sqlite3
 import tempfile
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from store_builds import flip_row
 
 from store import CompactedError, RecordError, Store, check_store, repair_store
 
@@ -22,14 +21,13 @@ class Undone(Exception):
 
 
 class History(RuleBasedStateMachine):
-    """The model: every row that was acknowledged, the generation that is current, and the base."""
+    """The model: every row that was acknowledged, the checkpoint that is current, and the base."""
 
     def __init__(self):
         super().__init__()
         self.home = Path(tempfile.mkdtemp())
         self.lives = 0
         self.rows: list[tuple[str, bytes]] = []
-        self.number = 0
         self.current: tuple[int, int, bytes] | None = None  # upto, number, content
         self.base: tuple[int, int, bytes] | None = None
 
@@ -62,11 +60,10 @@ class History(RuleBasedStateMachine):
         except Undone:
             self.rows = before
 
-    def made(self, upto, array):
-        self.number += 1
-        made = (upto, self.number, array.tobytes())
-        self.current = max(self.current or made, made)
-        return made
+    def numbered(self, upto, array):
+        """A checkpoint has the number behind those that are kept."""
+        kept = [made[1] for made in (self.current, self.base) if made]
+        return upto, 1 + max(kept, default=0), array.tobytes()
 
     @rule(where=st.floats(0, 1), value=st.integers(0, 255), later=st.booleans())
     def commit(self, where, value, later):
@@ -74,15 +71,17 @@ class History(RuleBasedStateMachine):
         array = np.full((2, 3), value, "|u1")
         (self.store.commit_later if later else self.store.commit)({"x": array}, upto=upto)
         self.store.flush()
-        self.made(upto, array)
+        made = self.numbered(upto, array)
+        self.current = made if self.current is None or upto >= self.current[0] else self.current
 
-    @rule(where=st.floats(0, 1), value=st.integers(0, 255))
-    def compact(self, where, value):
-        self.commit(1.0, value, later=False)
+    @rule(where=st.floats(0, 1), value=st.integers(0, 255), with_newest=st.booleans())
+    def compact(self, where, value, with_newest):
         upto = self.compacted + int(where * (len(self.rows) - self.compacted))
         array = np.full((3, 2), value, "|u1")
-        self.store.compact({"x": array}, upto=upto)
-        self.base = self.made(upto, array)
+        self.store.compact({"x": array}, upto=upto, newest=({"x": array}, {}) if with_newest else None)
+        self.current = self.base = self.numbered(upto, array)
+        if with_newest:
+            self.current = self.numbered(len(self.rows), array)
 
     @rule()
     def refuse(self):
@@ -106,27 +105,29 @@ class History(RuleBasedStateMachine):
         """Abandon the store as it lies on the disk, perhaps within a commit, and go on from a copy."""
         copy = self.copied()
         if partial:
-            (copy / "generations" / "00000099.partial" / "x").mkdir(parents=True)
+            (copy / "checkpoints" / "00000099.partial" / "x").mkdir(parents=True)
         self.store = Store.open(copy)
-        assert not (copy / "generations" / "00000099.partial").exists()
+        assert not (copy / "checkpoints" / "00000099.partial").exists()
 
     def copied(self):
         self.lives += 1
         copy = self.home / str(self.lives)
-        shutil.copytree(self.store.path, copy, ignore=shutil.ignore_patterns("*-shm"))
+        shutil.copytree(self.store.path, copy, ignore=shutil.ignore_patterns("lock", "holder.json"))
         self.store.close()
         return copy
 
     @precondition(lambda self: len(self.rows) > max(self.compacted, self.current[0] if self.current else 0))
-    @rule(where=st.floats(0, 0.99))
-    def lose_a_row(self, where):
-        """Behind the current generation: then a repair keeps those before it."""
-        copy = self.copied()
+    @rule(where=st.floats(0, 0.99), arrays=st.booleans())
+    def lose_a_row(self, where, arrays):
+        """Behind the current checkpoint, and before another batch: then a repair keeps those before it."""
         first = (self.current[0] if self.current else 0) + 1
         lost = first + int(where * (len(self.rows) - first + 1))
-        with closing(sqlite3.connect(copy / "journal.sqlite")) as connection, connection:
-            connection.execute("DELETE FROM payload WHERE sequence = ?", (lost,))
+        self.put("after", np.arange(3, dtype="<i8"))
+        copy = self.copied()
+        flip_row(copy, lost, arrays=arrays)
         assert repair_store(copy).kept == lost - 1
+        if not self.compacted:
+            self.base = None  # one that stands for no rows
         self.rows = self.rows[: lost - 1]
         self.store = Store.open(copy)
 

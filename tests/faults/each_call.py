@@ -76,7 +76,10 @@ HISTORY: tuple[tuple[str, Operation, int], ...] = (
 
 @dataclass
 class Step:
-    """One step: how the memory lies on the disk before it, and what must be there before and after it."""
+    """One step: how the memory lies on the disk before it, and what must be there before and after it.
+
+    parts: what may be there where a batch ended early, because something could not be read.
+    """
 
     name: str
     operation: Operation
@@ -85,6 +88,7 @@ class Step:
     before: State
     then: State
     result: Any
+    parts: list[State] = field(default_factory=list)
     calls: Counter[str] = field(default_factory=Counter)
     outcomes: Counter[str] = field(default_factory=Counter)
 
@@ -107,7 +111,9 @@ def plan(home: Path, others: dict[str, Other]) -> list[Step]:
         ends = operation[0] in ("open", "close")
         then, result = (state, None) if ends else after(state, operation, others)
         if name:
-            steps.append(Step(name, operation, every, start, state, then, result))
+            done = range(1, len(operation[1])) if operation[0] == "batch" else ()
+            parts = [after(state, ("batch", operation[1][:count]), others)[0] for count in done]
+            steps.append(Step(name, operation, every, start, state, then, result, parts))
         if operation == ("open",) and learner is not None:
             leave_unfinished(start)
         elif operation == ("open",):
@@ -166,7 +172,7 @@ class Trial(Trials):
                 if outcome == SUCCESS:
                     outcome += ", warned" if warned else ""
                 self._count(step, how, hit, outcome)
-                self.examined(where, lambda: self._goes_on(where, step, attempt, outcome, number))
+                self.examined(where, lambda: self._goes_on(where, step, how, attempt, outcome, number))
             elif outcome != SUCCESS:
                 self.failures.append(f"{where}: {outcome} without a fault")
         if attempt.learner is not None:
@@ -178,22 +184,23 @@ class Trial(Trials):
         step.calls[hit.split(maxsplit=1)[0]] += 1
         step.outcomes[f"{how}: {outcome}"] += 1
 
-    def _goes_on(self, where: str, step: Step, attempt: Attempt, outcome: str, number: int) -> None:
+    def _goes_on(self, where: str, step: Step, how: str, attempt: Attempt, outcome: str, number: int) -> None:
+        parts = step.parts if how == "EIO in reading" else []
         if self._second_look(step, number):
             copied(self.path, crashed := self.home / "crashed")
             with opened(crashed, "read" if (crashed / "CURRENT").exists() else "write") as learner:
-                self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then])
+                self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then, *parts])
         if step.operation[0] == "close" or attempt.learner is None:
             attempt.learner = opened(self.path)
         self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [step.before])]
-        state = step.then if outcome.startswith(SUCCESS) else step.before
-        self.require(f"{where}: the learner, after {outcome}", attempt.learner, [state])
+        states = [step.then] if outcome.startswith(SUCCESS) else [*parts, step.before]
+        state = self.require(f"{where}: the learner, after {outcome}", attempt.learner, states)
         self._finish(where, step, attempt.learner, state, number)
 
     def _finish(self, where: str, step: Step, learner: Any, state: State, number: int) -> None:
         """Go on from a state as if nothing had been: what was not done is done again, and one more observation."""
         thorough = number % THOROUGH == 0
-        if state is not step.then and (thorough or step.operation[0] not in SLOW):
+        if state is step.before and state is not step.then and (thorough or step.operation[0] not in SLOW):
             if (again := perform(learner, step.operation, self.home)) != step.result:
                 self.failures.append(f"{where}: done again it gave {again}, expected {step.result}")
             state = step.then

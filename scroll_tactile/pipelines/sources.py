@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import capabilities_of
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
@@ -217,7 +217,9 @@ def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"
 
 
-def has_touches(sensor: Sensor, sources: Iterable[str], options: SourceOptions) -> bool:
-    """Whether there is anything to learn for a new memory of this sensor."""
-    learner = TactileLearner(sensor=sensor)
+def has_touches(
+    sensor: Sensor, sources: Iterable[str], options: SourceOptions, embedding: Embedding | None = None
+) -> bool:
+    """Whether there is anything to learn for a new memory of this sensor, and embedding."""
+    learner = TactileLearner(sensor=sensor, embedding=embedding)
     return any(isinstance(each, SourceTouch) for path in sources for each in source_touches(learner, path, options))

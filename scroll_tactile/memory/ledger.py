@@ -372,13 +372,14 @@ class Ledger:
         descriptions: Choice,
         progress: Callable[[str, int, int], object],
         clipped: Collection[bytes] = (),
+        said: str | None = None,
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         """Merge what was learned from sources: each touch once, and under its first name.
 
-        clipped: contents that clipping made. Returns also the rows there that are refused, and why. Raises
+        clipped: contents that clipping made. said: the source of touches that say none. Returns also the rows there that are refused, and why. Raises
         ObservationError where one cannot be left out, for what it was learned into was compacted.
         """
-        return self._merge(other, "once", descriptions, progress, one_name=True, clipped=clipped)
+        return self._merge(other, "once", descriptions, progress, one_name=True, clipped=clipped, said=said)
 
     def _merge(
         self,
@@ -389,6 +390,7 @@ class Ledger:
         *,
         one_name: bool,
         clipped: Collection[bytes] = (),
+        said: str | None = None,
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
@@ -404,6 +406,7 @@ class Ledger:
                     one_name=one_name,
                     descriptions=descriptions,
                     clipped=clipped,
+                    said=said,
                 )
                 before = memory.sequence
                 with self._mutation(), store.batch():

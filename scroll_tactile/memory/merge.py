@@ -146,8 +146,8 @@ class Incoming:
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
     that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
-    under another name, and why that is refused. descriptions: by material, those that we have not. Made by
-    `Incoming.of`.
+    under another name, and why that is refused. descriptions: by material, those that we have not. said: where
+    touches come from that do not say it. Made by `Incoming.of`.
     """
 
     source: MemoryStore
@@ -157,6 +157,7 @@ class Incoming:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
+    said: str | None = None
 
     @classmethod
     def of(
@@ -170,12 +171,13 @@ class Incoming:
         one_name: bool,
         descriptions: Choice,
         clipped: Collection[bytes] = (),
+        said: str | None = None,
     ) -> Incoming:
         """Look through both journals.
 
         contents: which touches we have. once: leave out streams that both observed, of one material with one content
         hash. one_name: refuse touches that are there under another name, or came under one before, and leave out those
-        that came before under theirs. clipped: contents that clipping made, of which the refusal says so. Raises
+        that came before under theirs. clipped: contents that clipping made, of which the refusal says so. said: see above. Raises
         MismatchError where theirs cannot be a part of ours, or describes a material otherwise and nobody chose,
         ObservationError where a touch cannot be left out, DamageError for what opening theirs refuses, and for a shared
         stream that is not what its key says, here or there.
@@ -207,7 +209,7 @@ class Incoming:
                 sequence = _row(contents, head) or 0
                 if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                     ours.record(sequence)
-        return cls(theirs, found, rows, len(both) + len(again), left_out, refused, described)
+        return cls(theirs, found, rows, len(both) + len(again), left_out, refused, described, said)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -253,11 +255,15 @@ class Incoming:
         for head in self.rows:
             if base is not None and head.sequence <= base.upto:
                 if head.kind != MERGE:  # a merge before the base is a part of it
-                    kept = {name: value for name, value in head.attributes.items() if name == SOURCE}
+                    kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
             else:
                 record = self.source.record(head.sequence)
-                yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
+                yield head.kind, head.label, head.key, self._said(head), record.arrays, head.time
+
+    def _said(self, head: Head) -> dict[str, Any]:
+        touch = head.kind in (OBSERVE, MEMBER) and self.said is not None
+        return {**({SOURCE: self.said} if touch else {}), **head.attributes}
 
 
 def _row(contents: Contents, head: Head) -> int | None:

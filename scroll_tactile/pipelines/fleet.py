@@ -35,11 +35,11 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.merge import Choice
 from scroll_tactile.memory.rows import SOURCE
 from scroll_tactile.pipelines.addresses import expand, fetched
-from scroll_tactile.pipelines.engines import Engine, engine
+from scroll_tactile.pipelines.engines import Engine, engine, require_workers
 from scroll_tactile.pipelines.jobs import Made, Making, hush, learn_job
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.runfile import alone_in
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches, said_of
 from scroll_tactile.pipelines.steps import NOTES, Step, Steps
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
@@ -122,6 +122,7 @@ def learn(
     at work for this destination; ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors:
     call again to go on.
     """
+    require_workers(workers)
     begun = time.perf_counter()
     place = Path(destination).absolute()
     found, missing = expand([os.fspath(source) for source in sources], patience)
@@ -142,6 +143,7 @@ def learn(
             )
         into = _Destination(place, making, held, stack, report, descriptions)
         steps = Steps(folder, making, afresh=not learned)
+        stack.callback(steps.leave)
         report.refused += steps.begin(found)
         run = _Run(steps, report, into, making, progress, found)
         if client is None and workers == 1 and patience is None:
@@ -197,11 +199,17 @@ class _Destination:
         self._report.refused += done.refused
         self._save()
 
-    def merge(self, path: Path, progress: Progress, clipped: Collection[bytes] = ()) -> list[tuple[Head, str]]:
-        """Merge a memory, each touch once; its rows that are refused, and why. Raises StoreError, MismatchError."""
+    def merge(
+        self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
+    ) -> list[tuple[Head, str]]:
+        """Merge a memory, each touch once; its rows that are refused, and why. Raises StoreError, MismatchError.
+
+        clipped: contents that clipping made. source: of touches that say none.
+        """
         begun, processor = time.perf_counter(), time.process_time()
         try:
-            merged, refused = self.opened()._ledger.merge_sources(path, self._descriptions, progress, clipped)
+            ledger = self.opened()._ledger
+            merged, refused = ledger.merge_sources(path, self._descriptions, progress, clipped, source)
             self._save()
         finally:
             self._report.merging += time.perf_counter() - begun
@@ -313,7 +321,7 @@ class _Run:
         place = Path(source)
         try:
             with fetched(source, self._patience) as place:
-                refused = self._into.merge(place, self._merging)
+                refused = self._into.merge(place, self._merging, source=said_of(source))
         except (InputError, MismatchError, StoreError, OSError) as error:
             if isinstance(error, StoreError) and not _is_of(error, place):
                 raise

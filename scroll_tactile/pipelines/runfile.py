@@ -40,7 +40,8 @@ class RunFile:
             self.notes = self._read(path)
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
             raise InputError(
-                f"{path.parent} holds other things, and no {path.name}: no run to resume. Take an empty folder, or move this one away"
+                f"{path.parent} holds other things, and no {path.name}: no run to resume. Take an empty folder, or "
+                "move this one away"
             )
         else:
             self._write()

@@ -64,7 +64,7 @@ class Steps:
         plan = {"run": "fleet", "identity": making.identity.to_json(), "options": repr(making.options)}
         self._notes = RunFile(folder / NOTES, plan)
         self._made: dict[tuple[str, ...], Made] = {}
-        self._noted_at, self._noting = -1.0, 0.0
+        self._noted_at, self._noting, self._unnoted = 0.0, 0.0, False
         self._read()
         if afresh:
             self.learned.clear()
@@ -180,10 +180,11 @@ class Steps:
             self.waiting.appendleft(step)
         return step.tries < TRIES
 
-    def _note(self) -> None:
-        """Note what was learned, unless that was just now: what is not noted is learned again, and counts once."""
+    def _note(self, *, now: bool = False) -> None:
+        """Note what was learned, unless that was just now: what a kill leaves unnoted is learned again, and once."""
         begun = time.monotonic()
-        if begun < self._noted_at + NOTING * self._noting:
+        self._unnoted = True
+        if not now and begun < self._noted_at + NOTING * self._noting:
             return
         self._notes.notes |= {
             "learned": sorted(self.learned),
@@ -191,12 +192,20 @@ class Steps:
         }
         self._notes.note("range_problem", self.range_problem)
         self._noted_at = time.monotonic()
-        self._noting = self._noted_at - begun
+        self._noting, self._unnoted = self._noted_at - begun, False
+
+    def leave(self) -> None:
+        """Note what is not noted yet, however the run ends."""
+        if self._unnoted:
+            try:
+                self._note(now=True)
+            except InputError as error:
+                logger.warning("%s", error)
 
     def end(self) -> None:
         """Note that all is learned, and remove what packed memories are left."""
-        self._made, self.range_problem, self._noting = {}, None, 0.0
-        self._note()
+        self._made, self.range_problem = {}, None
+        self._note(now=True)
         for path in self.folder.iterdir():
             if path.name.startswith("learned-") and path.suffix in (".part", ".partial"):
                 remove_tree(path)

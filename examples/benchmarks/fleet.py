@@ -20,8 +20,7 @@ from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.pipelines import learning
-from scroll_tactile.pipelines.fleet import FAN, learn
-from scroll_tactile.pipelines.partials import Making, SumJob, sum_partials
+from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import SourceOptions
 from scroll_tactile.statistics.moments import MOST_ROWS
 from store import StoreError

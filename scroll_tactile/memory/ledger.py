@@ -6,7 +6,7 @@ import itertools
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -362,15 +362,19 @@ class Ledger:
         return self._merge(other, shared, descriptions, progress, one_name=False)[0]
 
     def merge_sources(
-        self, other: str | os.PathLike[str], descriptions: Choice, progress: Callable[[str, int, int], object]
-    ) -> tuple[Merged, list[tuple[str, str]]]:
+        self,
+        other: str | os.PathLike[str],
+        descriptions: Choice,
+        progress: Callable[[str, int, int], object],
+        clipped: Collection[bytes] = (),
+        said: str | None = None,
+    ) -> tuple[Merged, list[tuple[Head, str]]]:
         """Merge what was learned from sources: each touch once, and under its first name.
 
-        Returns also of each touch that is refused where it came from, and why. Raises ObservationError where one
-        cannot be left out, for what it was learned into was compacted.
+        clipped: contents that clipping made. said: the source of touches that say none. Returns also the rows there that are refused, and why. Raises
+        ObservationError where one cannot be left out, for what it was learned into was compacted.
         """
-        merged, refused = self._merge(other, "once", descriptions, progress, one_name=True)
-        return merged, [(str(head.attributes.get(SOURCE, other)), why) for head, why in refused]
+        return self._merge(other, "once", descriptions, progress, one_name=True, clipped=clipped, said=said)
 
     def _merge(
         self,
@@ -380,6 +384,8 @@ class Ledger:
         progress: Callable[[str, int, int], object],
         *,
         one_name: bool,
+        clipped: Collection[bytes] = (),
+        said: str | None = None,
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
@@ -394,6 +400,8 @@ class Ledger:
                     once=shared == "once",
                     one_name=one_name,
                     descriptions=descriptions,
+                    clipped=clipped,
+                    said=said,
                 )
                 with self._mutation(), store.batch():
                     added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
@@ -479,8 +487,12 @@ class Ledger:
                 raise
 
     def _snapshot_if_due(self) -> None:
-        rows = max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW)
-        if self.store is None or not self.saves or self._batching or self._memory.sequence - self._saved < rows:
+        if self.saves:
+            self.save_behind(max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW))
+
+    def save_behind(self, rows: int) -> None:
+        """Write a checkpoint, in the background, where so many rows or more are behind the last; whatever `saves`."""
+        if self.store is None or self._batching or self._memory.sequence - self._saved < rows:
             return
         arrays, attributes = self._memory.to_arrays()
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -144,9 +144,10 @@ Choice = Literal["same", "ours", "theirs"]
 class Incoming:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed.
-    left_out: those of them that are counted once, and what is refused. refused: touches that are there under another
-    name, and why that is refused. descriptions: by material, those that we have not. Made by `Incoming.of`.
+    rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
+    that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
+    under another name, and why that is refused. descriptions: by material, those that we have not. said: where
+    touches come from that do not say it. Made by `Incoming.of`.
     """
 
     source: MemoryStore
@@ -156,6 +157,7 @@ class Incoming:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
+    said: str | None = None
 
     @classmethod
     def of(
@@ -168,14 +170,17 @@ class Incoming:
         once: bool,
         one_name: bool,
         descriptions: Choice,
+        clipped: Collection[bytes] = (),
+        said: str | None = None,
     ) -> Incoming:
         """Look through both journals.
 
         contents: which touches we have. once: leave out streams that both observed, of one material with one content
-        hash. one_name: refuse touches that are there under another name. Raises MismatchError where theirs cannot be a
-        part of ours, or describes a material otherwise and nobody chose, ObservationError where a touch cannot be left
-        out, DamageError for what opening theirs refuses, and for a shared stream that is not what its key says, here
-        or there.
+        hash. one_name: refuse touches that are there under another name, or came under one before, and leave out those
+        that came before under theirs. clipped: contents that clipping made, of which the refusal says so. said: see above. Raises
+        MismatchError where theirs cannot be a part of ours, or describes a material otherwise and nobody chose,
+        ObservationError where a touch cannot be left out, DamageError for what opening theirs refuses, and for a shared
+        stream that is not what its key says, here or there.
         """
         _require_mergeable(ours, memory, theirs)
         base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
@@ -183,8 +188,8 @@ class Incoming:
             require_counted(theirs.path, found, heads)
         incoming = standing(heads)
         both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
-        refused = list(_refused(incoming, contents)) if one_name else []
-        out = {*(both if once else ()), *(head.sequence for head, _ in refused)}
+        refused, again = _by_first_names(incoming, contents, base, clipped) if one_name else ([], set())
+        out = {*(both if once else ()), *again, *(head.sequence for head, _ in refused)}
         if fixed := [
             head for head in incoming if head.sequence in out and (head.sequence <= base or head.kind == MEMBER)
         ]:
@@ -204,7 +209,7 @@ class Incoming:
                 sequence = _row(contents, head) or 0
                 if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                     ours.record(sequence)
-        return cls(theirs, found, rows, len(both), left_out, refused, described)
+        return cls(theirs, found, rows, len(both) + len(again), left_out, refused, described, said)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -250,11 +255,15 @@ class Incoming:
         for head in self.rows:
             if base is not None and head.sequence <= base.upto:
                 if head.kind != MERGE:  # a merge before the base is a part of it
-                    kept = {name: value for name, value in head.attributes.items() if name == SOURCE}
+                    kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
             else:
                 record = self.source.record(head.sequence)
-                yield head.kind, head.label, head.key, head.attributes, record.arrays, head.time
+                yield head.kind, head.label, head.key, self._said(head), record.arrays, head.time
+
+    def _said(self, head: Head) -> dict[str, Any]:
+        touch = head.kind in (OBSERVE, MEMBER) and self.said is not None
+        return {**({SOURCE: self.said} if touch else {}), **head.attributes}
 
 
 def _row(contents: Contents | StoredContents, head: Head) -> int | None:
@@ -262,15 +271,26 @@ def _row(contents: Contents | StoredContents, head: Head) -> int | None:
     return contents.find(head.label, head.key)
 
 
-def _refused(incoming: Sequence[Head], contents: Contents | StoredContents) -> Iterator[tuple[Head, str]]:
-    """The touches that are there under another name, or came under another just before, and why they are refused."""
+def _by_first_names(
+    incoming: Sequence[Head], contents: Contents | StoredContents, base: int, clipped: Collection[bytes]
+) -> tuple[list[tuple[Head, str]], set[int]]:
+    """The touches that are there, or came just before, under another name, and why each is refused.
+
+    And the rows of those that came before under their own, where they can be left out.
+    """
     came: dict[bytes, str] = {}
+    refused: list[tuple[Head, str]] = []
+    again: set[int] = set()
     for head in incoming:
         if head.kind == MERGE:
             continue
-        names = contents.names(head.key) or [came.setdefault(head.key, head.label)]
-        if (why := refusal(names, head.label)) is not None:
-            yield head, why
+        known, before = contents.names(head.key), head.key in came
+        names = known or [came.setdefault(head.key, head.label)]
+        if (why := refusal(names, head.label, head.key in clipped)) is not None:
+            refused.append((head, why))
+        elif before and head.kind == OBSERVE and head.sequence > base:
+            again.add(head.sequence)
+    return refused, again
 
 
 def _cannot_be_left_out(

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from typing import TypeVar
 
+from scroll_tactile.errors import RecordingError
 from scroll_tactile.pipelines.sources import Refused, find_sources
-from scroll_tactile.recordings.locations import file_system, is_remote
+from scroll_tactile.recordings.locations import file_system, is_remote, local
 from store.archive import ARCHIVE_BYTES, is_archive
 from store.layout import CURRENT_FILE, holds_store
 
-__all__ = ["expand", "is_memory"]
+__all__ = ["expand", "fetched", "is_memory"]
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
 PACKED = (".part",)  # what is looked for in a remote folder: usual names of packed memories
@@ -80,6 +82,25 @@ def expand(paths: Sequence[str], patience: float | None = None) -> tuple[list[st
             refused += missing
         found |= dict.fromkeys(inside)
     return list(found), refused
+
+
+@contextmanager
+def fetched(address: str, patience: float | None = None) -> Iterator[Path]:
+    """The path of a memory, as `local` gives it; patience: seconds in which a remote one must be there.
+
+    Raises what `local` raises, and RecordingError where it takes longer.
+    """
+    fetch = local(address)
+    try:
+        place = _answered(fetch.__enter__, patience) if is_remote(address) else fetch.__enter__()
+    except TimeoutError as error:
+        raise RecordingError(
+            f"{address} cannot be fetched: {error}. Give it more time, or look at its server"
+        ) from error
+    try:
+        yield place
+    finally:
+        fetch.__exit__(None, None, None)
 
 
 def _answered(ask: Callable[[], T], patience: float | None) -> T:

@@ -15,7 +15,7 @@ from typing import Any
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.pipelines.jobs import LearnJob, Made, learn_job
 
-__all__ = ["Engine", "Processes", "engine"]
+__all__ = ["Engine", "Processes", "engine", "require_workers"]
 
 STARTS = 5  # of a worker: what starts it may have been killed as well, and takes a moment to be noticed
 PAUSE = 0.1
@@ -126,13 +126,14 @@ def _end_with_parent() -> None:
         threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
 
 
-def engine(client: Any, workers: int | None) -> Engine:
-    """Who runs the jobs: the caller's client or Executor, or so many processes.
-
-    Raises InputError for what is no client, and for workers that are no number.
-    """
+def require_workers(workers: object) -> None:
+    """Raise InputError for workers that are no number."""
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
         raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
+
+
+def engine(client: Any, workers: int | None) -> Engine:
+    """Who runs the jobs: the caller's client or Executor, or so many processes. Raises InputError for what is none."""
     if client is None:
         return Processes(workers or os.cpu_count() or 1)
     executor = client.get_executor() if hasattr(client, "get_executor") else client

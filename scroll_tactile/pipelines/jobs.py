@@ -6,24 +6,29 @@ import faulthandler
 import hashlib
 import json
 import os
+import re
 import time
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import RangeWarning
+from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.identity import Identity, usual_embedding
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
+from store.archive import Files, files_of, write_archive
+from store.exceptions import reported
 
-__all__ = ["LearnJob", "Made", "Making", "learn_job"]
+__all__ = ["LearnJob", "Made", "Making", "hush", "learn_job"]
+
+CONTENT = re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,25 @@ class Making:
     recall: int | None
     options: SourceOptions
     patience: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        held: TactileLearner | None,
+        sensor: Sensor | None,
+        embedding: Embedding | None,
+        settings: Mapping[str, Any],
+        options: SourceOptions,
+        patience: float | None,
+    ) -> Making:
+        """As a memory that is held was made; as is said of a new one. Raises InputError."""
+        if held is not None:
+            sensor, embedding, kept = held.sensor, held.embedding, held.settings
+            return cls(sensor, embedding, held.augmentation, kept.exemplars, kept.recall, options, patience)
+        if sensor is None:
+            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
+        chosen = usual_embedding(sensor) if embedding is None else embedding
+        return cls(sensor, chosen, **settings, options=options, patience=patience)
 
     @property
     def identity(self) -> Identity:
@@ -80,18 +104,56 @@ class LearnJob:
 class Made:
     """What a job made: a packed memory; path: "" where no touch was learned.
 
-    refused: what was not, and why; failed: the sources of that. repeated: touches that came before in the same job,
-    under their names. range_problem: of the first touch that does not fit the sensor's range. seconds, processor: what
-    it took.
+    identity: of its log, by which it is known again. rows: of each source of the job how many touches it has, which
+    follow each other in it. refused: what was not learned, and why; failed: the sources of that. clipped: in
+    hexadecimal the contents of touches all of whose values lay outside the sensor's range. range_problem: of the first
+    touch that does not fit it. processor: seconds that it took.
     """
 
     path: str
+    identity: str = ""
+    rows: list[int] = field(default_factory=list)
     refused: list[Refused] = field(default_factory=list)
-    failed: set[str] = field(default_factory=set)
-    repeated: int = 0
+    failed: list[str] = field(default_factory=list)
+    clipped: list[str] = field(default_factory=list)
     range_problem: str | None = None
-    seconds: float = 0.0
     processor: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """As a run notes it."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, noted: Any) -> Made:
+        """What was noted; raises TypeError, KeyError or ValueError for anything else."""
+        refused = [Refused(each["source"], each["why"]) for each in noted["refused"]]
+        return cls(**{**noted, "refused": refused})
+
+    def require(self, job: LearnJob) -> None:
+        """Raise MismatchError where a job cannot have made this, as far as nobody but its worker can know it."""
+        count = len(job.sources)
+        refused = _is_list(self.refused, Refused) and all(_is_list([r.source, r.why], str) for r in self.refused)
+        failed = _is_list(self.failed, str) and set(self.failed) <= set(job.sources)
+        rows = _is_list(self.rows, int) and len(self.rows) == count and min(self.rows, default=0) >= 0
+        clipped = _is_list(self.clipped, str) and all(map(CONTENT.fullmatch, self.clipped))
+        texts = isinstance(self.identity, str) and isinstance(self.range_problem, str | None)
+        if not (refused and failed and rows and clipped and texts and isinstance(self.processor, float)):
+            raise MismatchError(f"expected what a job learned and refused; came {self!r:.200}")
+        if self.path != (str(job.target) if any(self.rows) else ""):
+            raise MismatchError(f"expected the packed memory of a job in {job.target}; came {self.path!r:.200}")
+
+    def require_packed(self) -> None:
+        """Raise StoreError or MismatchError where its packed memory is not there, or another."""
+        files = files_of(Path(self.path))
+        try:
+            if not files.is_packed or files.current().log_identity.hex() != self.identity:
+                raise MismatchError(f"{self.path} is not the packed memory that was made there")
+        finally:
+            files.close()
+
+
+def _is_list(items: Any, kind: type) -> bool:
+    return isinstance(items, list) and all(isinstance(each, kind) and not isinstance(each, bool) for each in items)
 
 
 @contextmanager
@@ -111,28 +173,34 @@ def _within(patience: float | None) -> Iterator[None]:
 def learn_job(job: LearnJob) -> Made:
     """Learn the sources of a job; what cannot be read is listed. The packed memory appears whole, or not at all.
 
-    Raises CapacityError; StoreFullError, StoreError where it cannot be written.
+    It has a row for each touch, also for those that come twice, or under two names: only the memory that it is merged
+    into tells which come first. Raises CapacityError; StoreFullError, StoreError where it cannot be written.
     """
-    begun = time.perf_counter(), time.process_time()
-    with (
-        _within(job.making.patience),
-        TemporaryDirectory(dir=job.folder, prefix=f"{job.target.name}.", suffix=".partial") as place,
-        warnings.catch_warnings(record=True) as warned,
-    ):
-        warnings.simplefilter("always", RangeWarning)
-        learner = job.making.open(Path(place) / "memory")
-        learner._ledger.saves = False  # the packed memory is what is kept
-        with learner:
-            done = learn_sources(learner, job.sources, job.making.options)
-            if done.learned:
-                learner.pack(job.target)
-    problems = [str(each.message) for each in warned if issubclass(each.category, RangeWarning)]
+    begun, folder = time.process_time(), Path(job.folder)
+    with _within(job.making.patience), ExitStack() as stack:
+        with reported(folder, "making a folder for a job"):
+            made = TemporaryDirectory(dir=folder, prefix=f"{job.target.name}.", suffix=".partial")
+        place = Path(stack.enter_context(made)) / "memory"
+        with job.making.open(place) as learner:
+            hush(learner)
+            done = learn_sources(learner, job.sources, job.making.options, every=True)
+            learner._ledger.saves = True  # it is merged by its checkpoint
+        identity = ""
+        if done.learned:
+            write_archive(place, job.target)
+            identity = Files(place).current().log_identity.hex()
     return Made(
         str(job.target) if done.learned else "",
+        identity,
+        [done.rows[source] for source in job.sources],
         done.refused,
-        done.failed,
-        done.skipped,
-        problems[0] if problems else None,
-        time.perf_counter() - begun[0],
-        time.process_time() - begun[1],
+        sorted(done.failed),
+        sorted(content.hex() for content in done.clipped),
+        done.range_problem,
+        time.process_time() - begun,
     )
+
+
+def hush(learner: TactileLearner) -> None:
+    """Have a learner write no checkpoints, and say nothing of its sensor's range: a run does both, at its end."""
+    learner._ledger.saves, learner._range_said = False, True

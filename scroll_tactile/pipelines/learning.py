@@ -15,7 +15,7 @@ from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
 from scroll_tactile.results import Prediction
-from scroll_tactile.signals.ranges import all_clipped
+from scroll_tactile.signals.ranges import all_clipped, range_problem
 
 __all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources"]
 
@@ -31,7 +31,9 @@ class Learned:
     """What a pass over sources did.
 
     files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
-    name, by the hash of their content. refused: what was not learned; failed: the sources of that.
+    name, by the hash of their content. refused: what was not learned; failed: the sources of that. rows: source →
+    touches, whose rows follow each other. clipped: the contents of touches all of whose values lay outside the sensor's
+    range. range_problem: of the first touch that does not fit it.
     """
 
     files: int = 0
@@ -39,6 +41,9 @@ class Learned:
     skipped: int = 0
     refused: list[Refused] = field(default_factory=list)
     failed: set[str] = field(default_factory=set)
+    rows: Counter[str] = field(default_factory=Counter)
+    clipped: set[bytes] = field(default_factory=set)
+    range_problem: str | None = None
 
 
 def learn_sources(
@@ -46,15 +51,18 @@ def learn_sources(
     sources: Sequence[str],
     options: SourceOptions,
     progress: Progress = lambda what, done, of: None,
+    *,
+    every: bool = False,
 ) -> Learned:
     """Observe the touches in sources, each once: a pass that was cut short is gone on with by the same call.
 
     At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
-    has under another name is refused. progress: called with (what is being done, files done, files in all).
+    has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.
+    progress: called with (what is being done, files done, files in all).
 
     Raises StoreError and CapacityError; what was learned until then is kept.
     """
-    done, batch = Learned(), _Batch(learner)
+    done, batch = Learned(), _Batch(learner, every)
     for number, address in enumerate(sources):
         progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
         for touch in source_touches(learner, address, options):
@@ -72,8 +80,8 @@ def learn_sources(
 class _Batch:
     """Touches that are about to become durable together."""
 
-    def __init__(self, learner: TactileLearner) -> None:
-        self._learner = learner
+    def __init__(self, learner: TactileLearner, every: bool) -> None:
+        self._learner, self._every = learner, every
         self._touches: list[tuple[SourceTouch, str]] = []
         self._bytes = 0
         self._since = 0.0
@@ -91,21 +99,29 @@ class _Batch:
         touches, self._touches, self._bytes = self._touches, [], 0
         with self._learner.batch():
             for touch, address in touches:
-                material = str(touch.material)
-                names = self._learner.names_of(touch.stream)
+                material, clipped = str(touch.material), all_clipped(touch.stream)
+                names = [] if self._every else self._learner.names_of(touch.stream)
                 if material in names:
                     done.skipped += 1
                     continue
-                if (why := refusal(names, material, all_clipped(touch.stream))) is not None:
+                if (why := refusal(names, material, clipped)) is None:
+                    why = self._refused(material, touch)
+                if why is not None:
                     done.refused.append(Refused(touch.source, why))
                     done.failed.add(address)
                     continue
-                try:
-                    self._learner.observe(material, touch.stream, source=touch.source)
-                    done.learned[material] += 1
-                except InputError as error:  # one that is too long
-                    done.refused.append(Refused(touch.source, str(error)))
-                    done.failed.add(address)
+                done.learned[material] += 1
+                done.rows[address] += 1
+                done.clipped |= {touch.stream.key} if clipped else set()
+                done.range_problem = done.range_problem or range_problem(touch.stream)
+
+    def _refused(self, material: str, touch: SourceTouch) -> str | None:
+        """Observe a touch; why it cannot be, such as one that is too long."""
+        try:
+            self._learner.observe(material, touch.stream, source=touch.source, again=self._every)
+        except InputError as error:
+            return str(error)
+        return None
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from store.lock import flock
 __all__ = ["RunFile", "alone_in"]
 
 _FORMAT = 1
+BEGIN = "Move its folder away to begin anew"
 TRIES = 100  # to lock a folder that others remove as they end
 
 
@@ -39,7 +40,8 @@ class RunFile:
             self.notes = self._read(path)
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
             raise InputError(
-                f"{path.parent} holds other things, and no {path.name}: no run to resume. Take an empty folder"
+                f"{path.parent} holds other things, and no {path.name}: no run to resume. Take an empty folder, or "
+                "move this one away"
             )
         else:
             self._write()
@@ -52,9 +54,11 @@ class RunFile:
             plan, notes = kept["plan"], kept["notes"]
             version = kept["format"]
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"expected the notes of a run in {path}; they cannot be read: {error!r:.200}") from error
+            raise InputError(
+                f"expected the notes of a run in {path}; they cannot be read: {error!r:.200}. {BEGIN}"
+            ) from error
         if not isinstance(plan, dict):
-            raise InputError(f"expected the notes of a run in {path}; its plan is a {type(plan).__name__}")
+            raise InputError(f"expected the notes of a run in {path}; its plan is a {type(plan).__name__}. {BEGIN}")
         if version != _FORMAT:
             raise InputError(f"{path} was written in format {version}; this version reads {_FORMAT}")
         differing = [
@@ -68,7 +72,7 @@ class RunFile:
                 "Ask for the same, or take another folder"
             )
         if not isinstance(notes, dict):
-            raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}")
+            raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}. {BEGIN}")
         return notes
 
     def note(self, name: str, value: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import capabilities_of
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
@@ -32,6 +32,7 @@ __all__ = [
     "contact_spans",
     "find_sources",
     "has_touches",
+    "said_of",
     "source_touches",
 ]
 
@@ -213,11 +214,18 @@ def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
     whole = (touch.begin, touch.end) == (0, len(recording))
     where = recording.source + ("" if whole else f"[{touch.begin}:{touch.end}]")
     within = [recording.topic, recording.field] if recording.topic is not None else [options.field]
-    text = printable(" ".join([where, *(part for part in (*within, options.columns) if part)]))
+    return said_of(" ".join([where, *(part for part in (*within, options.columns) if part)]))
+
+
+def said_of(source: str) -> str:
+    """What a memory keeps of a source's name: printable, and bounded."""
+    text = printable(source)
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"
 
 
-def has_touches(sensor: Sensor, sources: Iterable[str], options: SourceOptions) -> bool:
-    """Whether there is anything to learn for a new memory of this sensor."""
-    learner = TactileLearner(sensor=sensor)
+def has_touches(
+    sensor: Sensor, sources: Iterable[str], options: SourceOptions, embedding: Embedding | None = None
+) -> bool:
+    """Whether there is anything to learn for a new memory of this sensor, and embedding."""
+    learner = TactileLearner(sensor=sensor, embedding=embedding)
     return any(isinstance(each, SourceTouch) for path in sources for each in source_touches(learner, path, options))

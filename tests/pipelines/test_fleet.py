@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -13,9 +14,11 @@ from touches import PAD, SETTINGS, fed, require_same, stream
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.pipelines import engines, fleet, partials
+from scroll_tactile.errors import InputError
+from scroll_tactile.memory.ledger import Ledger
+from scroll_tactile.pipelines import engines, fleet, jobs, steps
 from scroll_tactile.pipelines.fleet import learn
+from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import SourceOptions
 from store import StoreFullError
 
@@ -65,14 +68,14 @@ class TestSameBytes:
             assert done.digest == learner.digest() and done.held == 12
 
     @pytest.mark.parametrize("seed", range(12))
-    def test_random_workers_trees_ends_and_duplicates_change_no_byte(self, tmp_path, seed, monkeypatch):
+    def test_random_workers_ends_and_duplicates_change_no_byte(self, tmp_path, seed, monkeypatch):
         draw = random.Random(seed)
         touches = [draw.choice(TOUCHES) for _ in range(draw.randrange(1, 20))]
         touch_files(tmp_path / "in", touches)
-        monkeypatch.setattr(fleet, "MOST_SOURCES", draw.randrange(1, 6))
-        monkeypatch.setattr(fleet, "TRIES", 50)
+        monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 6))
+        monkeypatch.setattr(steps, "TRIES", 50)
         ends = DyingExecutor(draw.choice([0.0, 0.3, 0.6]), seed)
-        done = run(tmp_path / "m", [tmp_path / "in"], client=ends, fan=draw.randrange(2, 6))
+        done = run(tmp_path / "m", [tmp_path / "in"], client=ends)
         assert done.observations == len(set(touches)) and not done.refused
         assert done.digest == expected(touches).digest()
         with TactileLearner.open(tmp_path / "m") as learner:
@@ -105,7 +108,7 @@ class TestSameBytes:
             said = [row.source for row in learner.observations()]
             assert str(tmp_path / "folder.memory") in said
 
-    def test_partials_without_rows_come_in_as_one_and_one_that_shares_a_touch_is_refused(self, tmp_path):
+    def test_memories_without_rows_come_in_whole_and_one_that_shares_a_touch_is_refused(self, tmp_path):
         for name, part in {"x": TOUCHES[:4], "y": TOUCHES[4:9], "z": TOUCHES[8:], "w": TOUCHES[9:]}.items():
             with TactileLearner.open(tmp_path / f"{name}.memory", **SETTINGS) as learner:
                 for material, touch in part:
@@ -116,45 +119,136 @@ class TestSameBytes:
         assert "cannot be counted once" in done.refused[0].why
         require_learned(tmp_path / "m")
 
+    def test_a_touch_that_a_memory_has_twice_counts_once(self, tmp_path):
+        with TactileLearner.open(tmp_path / "twice", **SETTINGS) as learner:
+            for _ in range(2):
+                for material, touch in TOUCHES[:3]:
+                    learner.observe(material, stream(touch).astype(np.float32), again=True)
+            learner.pack(tmp_path / "packed")
+        for name in ("twice", "packed"):
+            done = run(tmp_path / f"m {name}", [tmp_path / name])
+            assert (done.observations, done.repeated) == (3, 3)
+            require_learned(tmp_path / f"m {name}", TOUCHES[:3])
+
+
+@pytest.fixture
+def full(monkeypatch):
+    """A disk that is full when so many steps were merged, until it is asked for 0."""
+    merge, merged = Ledger.merge_sources, []
+
+    def after(count):
+        def merging(self, other, *words):
+            if len(merged) >= count:
+                raise StoreFullError("full")
+            merged.append(other)
+            return merge(self, other, *words)
+
+        monkeypatch.setattr(Ledger, "merge_sources", merge if count is None else merging)
+
+    return after
+
+
+@pytest.fixture
+def learned(monkeypatch):
+    """The sources of all jobs that were begun."""
+    begun = []
+
+    def learning(learner, sources, *words, **named):
+        begun.extend(sources)
+        return learn_sources(learner, sources, *words, **named)
+
+    monkeypatch.setattr(jobs, "learn_sources", learning)
+    return begun
+
 
 class TestGoingOn:
-    def test_a_run_that_was_killed_goes_on_where_it_was(self, tmp_path, monkeypatch):
+    def test_a_run_that_was_killed_goes_on_where_it_was(self, tmp_path, monkeypatch, learned):
         touch_files(tmp_path / "in", TOUCHES)
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 1)
 
         class Killed(DyingExecutor):
-            jobs = 0
+            def __init__(self):
+                super().__init__()
+                self._max_workers, self.jobs = 1, 0
 
             def submit(self, what, *words):
                 self.jobs += 1
-                if self.jobs > 2:
+                if self.jobs > 6:  # four are handed over before the first is merged
                     raise KeyboardInterrupt
                 return super().submit(what, *words)
 
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "m", [tmp_path / "in"], client=Killed())
-        assert not (tmp_path / "m").exists()
-        learned = []
-        learn_again = partials._learn
-        monkeypatch.setattr(partials, "_learn", lambda job: learned.extend(job.sources) or learn_again(job))
+        before = len(learned)
+        with TactileLearner.open(tmp_path / "m") as learner:  # what was merged is durable
+            assert 0 < len(learner.observations()) <= before
         done = run(tmp_path / "m", [tmp_path / "in"])
-        assert 0 < len(learned) < 12 and done.observations == 12
+        assert 0 < before < 12 == len(learned) == len(set(learned))
+        assert done.sources == 12 and done.repeated == 0
         require_learned(tmp_path / "m")
         assert [path.name for path in (tmp_path / "m.fleet").iterdir()] == ["run.json"]
 
-    @pytest.mark.parametrize("place", [100, -9000, -9])
-    def test_a_partial_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, monkeypatch, place):
+    @pytest.mark.parametrize("place", [100, -9000, -9, None])
+    def test_a_packed_memory_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, full, learned, place):
         touch_files(tmp_path / "in", TOUCHES)
-        merge = TactileLearner.merge
-        monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+        full(0)
         with pytest.raises(StoreFullError):
             run(tmp_path / "m", [tmp_path / "in"])
-        monkeypatch.setattr(TactileLearner, "merge", merge)
-        path = next((tmp_path / "m.fleet").glob("learned-*.part"))
+        full(None)
+        path = min((tmp_path / "m.fleet").glob("learned-*.part"))
         whole = bytearray(path.read_bytes())
-        whole[place] ^= 1
-        path.write_bytes(bytes(whole))
+        if place is not None:
+            whole[place] ^= 1
+        path.write_bytes(bytes(whole if place is not None else whole[:-30]))
+        learned.clear()
+        done = run(tmp_path / "m", [tmp_path / "in"])
+        assert done.observations == 12 and done.deaths == 0 and 0 < len(learned) < 12
+        require_learned(tmp_path / "m")
+
+    @pytest.mark.parametrize("merged", range(4))
+    def test_a_full_disk_at_any_merge_costs_nothing(self, tmp_path, full, merged):
+        touch_files(tmp_path / "in", TOUCHES + [("z", touch) for _, touch in TOUCHES[:2]])
+        full(merged)
+        with pytest.raises(StoreFullError):
+            run(tmp_path / "m", [tmp_path / "in"])
+        full(None)
+        done = run(tmp_path / "m", [tmp_path / "in"])
+        assert done.held == 12 and len(done.refused) == 2
+        require_learned(tmp_path / "m")
+
+    def test_what_could_not_be_read_is_said_by_the_run_that_goes_on(self, tmp_path, full):
+        paths = touch_files(tmp_path / "in", TOUCHES[:4])
+        paths[0].write_bytes(b"")
+        full(0)
+        with pytest.raises(StoreFullError):
+            run(tmp_path / "m", [tmp_path / "in"], client=DyingExecutor(seed=1))
+        full(None)
+        done = run(tmp_path / "m", [tmp_path / "in"], client=DyingExecutor(seed=1))
+        assert [each.source for each in done.refused] == [str(paths[0])] and done.observations == 3
+
+    def test_a_memory_that_was_removed_is_learned_anew(self, tmp_path):
+        touch_files(tmp_path / "in", TOUCHES)
+        run(tmp_path / "m", [tmp_path / "in"])
+        shutil.rmtree(tmp_path / "m")
         assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
+        require_learned(tmp_path / "m")
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_a_run_that_was_cut_short_replays_little(self, tmp_path, monkeypatch, workers):
+        monkeypatch.setattr(fleet, "SAVED_EVERY", 4)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 2)
+        paths = touch_files(tmp_path / "in", TOUCHES)
+
+        def cut(what, done, of):
+            if done >= 8:
+                raise KeyboardInterrupt
+
+        client = None if workers == 1 else DyingExecutor()
+        with pytest.raises(KeyboardInterrupt):
+            learn(tmp_path / "m", paths, BY_FOLDER, workers=workers, client=client, progress=cut, **SETTINGS)
+        with TactileLearner.open(tmp_path / "m", mode="read") as learner:
+            assert learner.memory.saved >= 4 and 6 <= learner.memory.sequence < 12
+        assert run(tmp_path / "m", paths).held == 12
         require_learned(tmp_path / "m")
 
     def test_more_sources_go_into_the_memory_of_an_earlier_run_and_nothing_twice(self, tmp_path):
@@ -233,6 +327,16 @@ class TestWhatCannotBeLearned:
             run(tmp_path / "m", [tmp_path / "in"])
         assert not (tmp_path / "m").exists()
 
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_nor_does_a_memory_that_is_refused(self, tmp_path, workers):
+        other = PAD.model_copy(update={"name": "other pad"})
+        with TactileLearner.open(tmp_path / "other", **SETTINGS | {"sensor": other}) as learner:
+            learner.observe("a", stream((9, 60)))
+        client = None if workers == 1 else DyingExecutor()
+        with pytest.raises(InputError, match="no memory made: 1 sources were refused"):
+            learn(tmp_path / "m", [tmp_path / "other"], BY_FOLDER, workers=workers, client=client, **SETTINGS)
+        assert not (tmp_path / "m").exists()
+
     def test_a_source_that_ends_every_worker_is_named_and_the_others_are_learned(self, tmp_path, monkeypatch):
         paths = touch_files(tmp_path / "in", TOUCHES)
 
@@ -267,9 +371,10 @@ class TestWhatCannotBeLearned:
             with TactileLearner.open(tmp_path / name, **SETTINGS) as learner:
                 learner.observe("a", stream((ord(name), 60)))
                 learner.describe("a", {"cotton": share, "wool": 1 - share})
-        with pytest.raises(MismatchError, match="describe 'a' differently"):
-            run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"])
-        run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"], descriptions="theirs")
+        done = run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"])
+        assert [each.source for each in done.refused] == [str(tmp_path / "y")]
+        assert "Choose with descriptions='ours' or 'theirs'" in done.refused[0].why
+        assert run(tmp_path / "m", [tmp_path / "x", tmp_path / "y"], descriptions="theirs").observations == 1
         with TactileLearner.open(tmp_path / "m") as learner:
             assert learner.descriptions["a"]["cotton"] == 0.5
 
@@ -282,7 +387,7 @@ class TestWhatCannotBeLearned:
 class TestProcesses:
     def test_workers_that_are_killed_again_and_again_change_nothing(self, tmp_path, monkeypatch):
         touch_files(tmp_path / "in", TOUCHES)
-        monkeypatch.setattr(fleet, "TRIES", 50)
+        monkeypatch.setattr(steps, "TRIES", 50)
         killed = []
 
         def kill(what, done, of):
@@ -301,7 +406,7 @@ class TestProcesses:
         require_learned(tmp_path / "m")
 
     def test_a_job_that_takes_too_long_is_given_up(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(fleet, "TRIES", 1)
+        monkeypatch.setattr(steps, "TRIES", 1)
         touch_files(tmp_path / "in", TOUCHES[:2])
         os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
         done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=3.0, **SETTINGS)

@@ -12,16 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scroll_tactile.memory.partial import Partial, write_partial
+from scroll_tactile.pipelines.partials import Contained, Made, Making
 from test_fleet import BY_FOLDER, TOUCHES, expected, require_learned, run, touch_files
 from touches import SETTINGS
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.memory.partial import Partial, write_partial
 from scroll_tactile.pipelines import engines, fleet, partials, runfile
 from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.pipelines.partials import Contained, Made, Making
 from store import DamageError, LockedError, StoreFullError
 
 
@@ -49,7 +49,7 @@ class TestPatience:
         self, tmp_path, sources, monkeypatch, after
     ):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 1)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 1)
         with pytest.raises(ScrollTactileError, match="Silent has answered no job for 1 s"):
             run(tmp_path / "m", [tmp_path / "in"], client=Silent(after), patience=0.2)
         assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
@@ -57,7 +57,7 @@ class TestPatience:
 
     def test_a_job_that_is_never_answered_is_handed_over_again(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 2)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 2)
 
         class Forgetful(DyingExecutor):
             forgotten = 0
@@ -109,7 +109,7 @@ class TestGarbage:
         ],
     )
     def test_what_is_no_answer_is_asked_for_again_and_named_in_the_end(self, tmp_path, sources, monkeypatch, made):
-        monkeypatch.setattr(fleet, "TRIES", 3)
+        monkeypatch.setattr(steps, "TRIES", 3)
 
         class Garbage(DyingExecutor):
             def submit(self, what, job):
@@ -121,7 +121,7 @@ class TestGarbage:
             run(tmp_path / "m", [tmp_path / "in"], client=Garbage())
 
     def test_a_partial_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 6)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 6)
 
         class Mistaken(DyingExecutor):
             """Writes the partial of one job where the other's belongs, once."""
@@ -158,7 +158,7 @@ def renamed(path):
 
 class TestSpoilt:
     def test_a_partial_with_other_names_and_right_checksums_is_learned_again(self, tmp_path, sources, monkeypatch):
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 4)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 4)
         merge = TactileLearner.merge
         monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
         with pytest.raises(StoreFullError):
@@ -175,7 +175,7 @@ class TestSpoilt:
 
     @pytest.mark.parametrize("place", [None, -9, 100])
     def test_one_that_is_spoilt_while_the_run_goes_on_is_learned_again(self, tmp_path, sources, monkeypatch, place):
-        monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
+        monkeypatch.setattr(steps, "MOST_SOURCES", 3)
 
         class Spoiling(DyingExecutor):
             spoilt = 0
@@ -285,7 +285,7 @@ def test_processes_are_waited_for_unless_an_error_ends_the_block_whatever_the_ca
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork server")
 def test_a_fork_server_that_is_killed_is_begun_again(tmp_path, sources, monkeypatch):
-    monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
+    monkeypatch.setattr(steps, "MOST_SOURCES", 3)
     killed = []
     submit = engines.Processes.submit
 

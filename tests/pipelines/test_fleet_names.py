@@ -5,15 +5,17 @@ import random
 
 import numpy as np
 import pytest
-from test_fleet import BY_FOLDER, TOUCHES, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, full, run, touch_files
 from touches import SETTINGS, SmallSample, require_same, stream
 
 import scroll_tactile.memory.state
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
-from scroll_tactile.pipelines import fleet, learning
+from scroll_tactile.pipelines import learning, steps
 from scroll_tactile.pipelines.sources import find_sources
 from store import StoreFullError
+
+__all__ = ["full"]  # a fixture
 
 # Of the first touches twelve come once more, half of them under another name.
 TWICE = [*TOUCHES, *((name, touch) for name, touch in TOUCHES[:6]), *(("z", touch) for _, touch in TOUCHES[3:9])]
@@ -37,7 +39,7 @@ def by_one_process(path, sources, before=()):
     with TactileLearner.open(path, **SETTINGS) as learner:
         for name, touch in before:
             learner.observe(name, stream(touch).astype(np.float32))
-        done = learning.learn(learner, find_sources(list(map(str, sources)))[0], BY_FOLDER)
+        done = learning.learn_sources(learner, find_sources(list(map(str, sources)))[0], BY_FOLDER)
         refused = [(each.source, each.why) for each in done.refused]
         return seen(learner), learner.digest(), done.skipped, refused
 
@@ -49,9 +51,9 @@ def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path
     touches = draw.sample(TWICE, len(TWICE))
     paths = touch_files(tmp_path / "in", touches)
     draw.shuffle(paths)
-    monkeypatch.setattr(fleet, "MOST_SOURCES", draw.randrange(1, 5))
-    monkeypatch.setattr(fleet, "TRIES", 50)
-    done = run(tmp_path / "m", paths, client=Shuffled(seed), fan=draw.randrange(2, 6))
+    monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 5))
+    monkeypatch.setattr(steps, "TRIES", 50)
+    done = run(tmp_path / "m", paths, client=Shuffled(seed))
     rows, digest, skipped, refused = by_one_process(tmp_path / "one", paths)
     assert done.digest == digest and done.repeated == skipped
     assert [(each.source, each.why) for each in done.refused] == refused and len(refused) > 2
@@ -64,7 +66,7 @@ def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path
 
 def test_the_first_source_counts_also_where_its_worker_is_last(tmp_path, monkeypatch):
     a, b = touch_files(tmp_path / "in", [("a", (0, 60)), ("b", (0, 60))])
-    monkeypatch.setattr(fleet, "MOST_SOURCES", 1)
+    monkeypatch.setattr(steps, "MOST_SOURCES", 1)
     for number, sources in enumerate(itertools.permutations([a, b])):
         for late in (a, b):
 
@@ -105,15 +107,14 @@ def test_a_destination_that_has_it_under_another_name_comes_first(tmp_path):
     assert run(tmp_path / "m", [tmp_path / "in"]).refused == []
 
 
-def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(tmp_path, monkeypatch):
+def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(tmp_path, monkeypatch, full):
     paths = touch_files(tmp_path / "in", TWICE)
-    monkeypatch.setattr(fleet, "MOST_SOURCES", 3)
-    merge = TactileLearner.merge
-    monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+    monkeypatch.setattr(steps, "MOST_SOURCES", 3)
+    full(0)
     for some in (paths[3:14:2], paths[::-1]):
         with pytest.raises(StoreFullError):
             run(tmp_path / "m", some)
-    monkeypatch.setattr(TactileLearner, "merge", merge)
+    full(None)
     done = run(tmp_path / "m", paths)
     rows, digest, skipped, refused = by_one_process(tmp_path / "one", paths)
     assert (done.digest, done.repeated, len(done.refused)) == (digest, skipped, len(refused))
@@ -122,17 +123,16 @@ def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_run_that_was_cut_short_goes_on_with_its_sources_in_another_order(tmp_path, seed, monkeypatch):
+def test_a_run_that_was_cut_short_goes_on_with_its_sources_in_another_order(tmp_path, seed, monkeypatch, full):
     # Each of the two jobs has both copies of a touch; the one that its partial has no row of may come first now.
     x, y, z = TOUCHES[:3]
     paths = touch_files(tmp_path / "in", [x, y, x, z, ("d", x[1]), TOUCHES[3], x, TOUCHES[3]])
-    monkeypatch.setattr(fleet, "MOST_SOURCES", 4)
-    monkeypatch.setattr(fleet, "JOBS_A_WORKER", 1)
-    merge = TactileLearner.merge
-    monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+    monkeypatch.setattr(steps, "MOST_SOURCES", 4)
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)
+    full(0)
     with pytest.raises(StoreFullError):
         run(tmp_path / "m", paths, workers=1)
-    monkeypatch.setattr(TactileLearner, "merge", merge)
+    full(None)
     order = paths[::-1] if seed == 0 else random.Random(seed).sample(paths, len(paths))
     done = run(tmp_path / "m", order, workers=1)
     _, digest, skipped, refused = by_one_process(tmp_path / "one", order)
@@ -150,6 +150,6 @@ def test_memories_are_refused_touch_by_touch_where_they_have_rows_and_whole_wher
     done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
     assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
     assert all("as 'a' and not as 'z'" in each.why for each in done.refused)
-    assert "no rows" in done.refused[1].why
+    assert "none of them can be left out" in done.refused[1].why
     with TactileLearner.open(tmp_path / "m") as learner:
         assert learner.materials == {"a": 2, "b": 1, "c": 1, "z": 1}

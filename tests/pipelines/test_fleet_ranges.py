@@ -6,14 +6,16 @@ import warnings
 import numpy as np
 import pytest
 from commands import run as command
-from test_fleet import BY_FOLDER, TOUCHES, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, full, run, touch_files
 from touches import PAD, SETTINGS
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import RangeWarning
-from scroll_tactile.pipelines import fleet, learning
+from scroll_tactile.pipelines import learning, steps
 from scroll_tactile.pipelines.sources import find_sources
 from store import StoreFullError
+
+__all__ = ["full"]  # a fixture
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def test_it_says_and_refuses_what_one_process_does(tmp_path, beyond):
         pytest.warns(RangeWarning) as first,
         TactileLearner.open(tmp_path / "one", **SETTINGS) as learner,
     ):
-        one = learning.learn(learner, find_sources([str(beyond)])[0], BY_FOLDER)
+        one = learning.learn_sources(learner, find_sources([str(beyond)])[0], BY_FOLDER)
     with pytest.warns(RangeWarning, match="100 % of the values lie outside the range of sensor 'pad'") as met:
         done = run(tmp_path / "m", [beyond])
     assert [str(each.message) for each in met] == [str(each.message) for each in first] == [done.range_problem]
@@ -43,16 +45,15 @@ def test_it_says_and_refuses_what_one_process_does(tmp_path, beyond):
         assert "as 'a' and not as" in each.why and "low and high" in each.why
 
 
-def test_it_is_of_the_first_source_whatever_the_workers_and_said_also_after_a_cut(tmp_path, beyond, monkeypatch):
+def test_it_is_of_the_first_source_whatever_the_workers_and_said_also_after_a_cut(tmp_path, beyond, monkeypatch, full):
     paths = touch_files(tmp_path / "sound", TOUCHES[:2])
     np.save(beyond / "b" / "4.npy", np.linspace(0.2, 9, 120).reshape(60, 2))
     sources = [*paths, beyond / "b" / "4.npy", beyond]
-    monkeypatch.setattr(fleet, "MOST_SOURCES", 2)
-    merge = TactileLearner.merge
-    monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+    monkeypatch.setattr(steps, "MOST_SOURCES", 2)
+    full(0)
     with pytest.raises(StoreFullError):
         run(tmp_path / "m", sources)
-    monkeypatch.setattr(TactileLearner, "merge", merge)
+    full(None)
     with pytest.warns(RangeWarning, match="91 % of the values"):
         run(tmp_path / "m", sources)
 

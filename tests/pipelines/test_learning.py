@@ -15,7 +15,7 @@ from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import FieldError, InputError, MaterialError
 from scroll_tactile.pipelines import learning
-from scroll_tactile.pipelines.learning import evaluate_sources, learn
+from scroll_tactile.pipelines.learning import evaluate_sources, learn_sources
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
 from scroll_tactile.recordings import Interval
 from scroll_tactile.results import Prediction
@@ -129,7 +129,7 @@ class TestSources:
 
     def test_names_with_anything_in_them_are_kept_printable_and_bounded(self, tmp_path, learner):
         odd = put(tmp_path / ("fé[b]\x1b\n" + "x" * 200) / "=1+1 .npy", (0, 60))
-        done = learn(learner, [str(odd)], SourceOptions(material="[red]a"))
+        done = learn_sources(learner, [str(odd)], SourceOptions(material="[red]a"))
         assert done.learned == {"[red]a": 1} and not done.refused
         (row,) = learner.observations()
         assert row.source.isprintable() and r"fé[b]\x1b\n" in row.source and row.source.endswith("=1+1 .npy")
@@ -140,7 +140,7 @@ class TestSources:
 
 class TestLearn:
     def test_folders_are_learned_as_the_same_touches_observed(self, data, learner):
-        done = learn(learner, sources_of(data), FOLDERS)
+        done = learn_sources(learner, sources_of(data), FOLDERS)
         assert (done.files, done.learned, done.skipped, done.refused) == (6, {"a": 3, "b": 3}, 0, [])
         require_same(learner, EXPECTED)
         assert {row.source: row.material for row in learner.observations()} == {
@@ -150,22 +150,22 @@ class TestLearn:
     def test_a_touch_counts_once_by_its_content(self, data, learner, tmp_path):
         learner.observe("a", stream((0, 60)))
         put(tmp_path / "other" / "a" / "copy.npy", (4, 60))
-        done = learn(learner, sources_of(data, tmp_path / "other"), FOLDERS)
+        done = learn_sources(learner, sources_of(data, tmp_path / "other"), FOLDERS)
         assert (done.learned, done.skipped) == ({"a": 2, "b": 3}, 2)
-        again = learn(learner, sources_of(data), FOLDERS)
+        again = learn_sources(learner, sources_of(data), FOLDERS)
         assert (again.learned.total(), again.skipped) == (0, 6)
         require_same(learner, EXPECTED)
 
     def test_a_touch_under_two_names_is_refused(self, data, learner):
-        learn(learner, sources_of(data), FOLDERS)
+        learn_sources(learner, sources_of(data), FOLDERS)
         (row,) = (row for row in learner.observations() if row.source.endswith("/0.npy"))
         learner.relabel(row.sequence, "silk")
-        done = learn(learner, sources_of(data), FOLDERS)
+        done = learn_sources(learner, sources_of(data), FOLDERS)
         assert done.skipped == 5
         assert [each.source for each in done.refused] == [str(data / "a" / "0.npy")]
         assert "has this touch already, as 'silk' and not as 'a'" in done.refused[0].why
         learner.retract(learner.observations()[-1].sequence)
-        assert learn(learner, sources_of(data), FOLDERS).learned == {"a": 1}
+        assert learn_sources(learner, sources_of(data), FOLDERS).learned == {"a": 1}
         require_same(learner, EXPECTED)
 
     def test_what_is_wrong_in_one_file_costs_no_other(self, data, learner):
@@ -174,16 +174,16 @@ class TestLearn:
         np.save(data / "b" / "other.npy", np.zeros((60, 3)))
         np.save(data / "b" / "short.npy", np.zeros((1, 2)))
         np.save(data / "b" / "nan.npy", np.full((60, 2), np.nan))
-        done = learn(learner, sources_of(data), FOLDERS)
+        done = learn_sources(learner, sources_of(data), FOLDERS)
         require_same(learner, EXPECTED)
         why = {Path(each.source).name: each.why for each in done.refused}
         assert done.files == 11 and set(why) == {"bad.npy", "bad.csv", "other.npy", "short.npy", "nan.npy"}
-        assert "cannot be read" in why["bad.npy"] and "row 2, column 2" in why["bad.csv"]
+        assert "expected numbers, version 1 or 2" in why["bad.npy"] and "row 2, column 2" in why["bad.csv"]
         assert "another sensor's recording" in why["other.npy"] and "at least 2 readings" in why["short.npy"]
         assert "reading 0, channel 0 is nan" in why["nan.npy"]
 
     def test_what_nothing_names_is_refused(self, data, learner):
-        done = learn(learner, sources_of(data), SourceOptions())
+        done = learn_sources(learner, sources_of(data), SourceOptions())
         assert len(done.refused) == 6 and "nothing names it" in done.refused[0].why
         assert learner.observations() == []
 
@@ -197,10 +197,10 @@ class TestLearn:
 
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
             with pytest.raises(KeyboardInterrupt):
-                learn(learner, sources_of(data), FOLDERS, interrupt)
+                learn_sources(learner, sources_of(data), FOLDERS, interrupt)
             assert after - 2 < len(learner.observations()) <= after
         with TactileLearner.open(tmp_path / "m") as learner:
-            done = learn(learner, sources_of(data), FOLDERS)
+            done = learn_sources(learner, sources_of(data), FOLDERS)
             assert done.learned.total() + done.skipped == 6
             require_same(learner, EXPECTED)
 
@@ -212,7 +212,7 @@ class TestLearn:
         sizes = []
         batch = TactileLearner.batch
         monkeypatch.setattr(TactileLearner, "batch", lambda self: sizes.append(1) or batch(self))
-        done = learn(learner, [str(tmp_path / "d.h5")], SourceOptions(material="a"))
+        done = learn_sources(learner, [str(tmp_path / "d.h5")], SourceOptions(material="a"))
         assert done.learned == {"a": 5} and len(sizes) == 2  # of three touches, and two
         assert [row.source for row in learner.observations()][:2] == [
             f"{tmp_path}/d.h5[0:60]",
@@ -232,7 +232,7 @@ class TestLearn:
             Interval("t.csv", 1.19, 3, "b"),
             Interval("t.csv", 0, 0.01, "c"),
         )
-        done = learn(learner, [str(tmp_path / "t.csv")], SourceOptions(intervals=intervals))
+        done = learn_sources(learner, [str(tmp_path / "t.csv")], SourceOptions(intervals=intervals))
         assert done.learned == {"a": 1, "b": 1}
         assert [each.source for each in done.refused] == [f"{tmp_path}/t.csv[0:1]"]
         require_same(learner, [("a", (0, 60)), ("b", (1, 60))])
@@ -241,7 +241,7 @@ class TestLearn:
         rows = [*stream((0, 60)).tolist(), *stream((1, 60)).tolist()]
         lines = [f"{x!r},{y!r},{'ab'[i >= 60]}" for i, (x, y) in enumerate(rows)]
         (tmp_path / "t.csv").write_text("\n".join(["0,1,what", *lines]))
-        done = learn(learner, [str(tmp_path / "t.csv")], SourceOptions(labels="what"))
+        done = learn_sources(learner, [str(tmp_path / "t.csv")], SourceOptions(labels="what"))
         assert done.learned == {"a": 1, "b": 1}
         require_same(learner, [("a", (0, 60)), ("b", (1, 60))])
 
@@ -264,7 +264,7 @@ class TestLearn:
             (tmp_path / "bags" / material).mkdir(parents=True, exist_ok=True)
             write(tmp_path / "bags" / material / f"{i}.bag", store, {"/rh/tactile": messages}, form="bag")
         with TactileLearner.open(tmp_path / "m", **settings) as learner:
-            done = learn(learner, sources_of(tmp_path / "bags"), SourceOptions(by="folder", preset="biotac"))
+            done = learn_sources(learner, sources_of(tmp_path / "bags"), SourceOptions(by="folder", preset="biotac"))
             assert done.learned.total() == len(chosen) and not done.refused
             assert learner.digest() == plain.digest()
             source = learner.observations()[0].source
@@ -274,7 +274,7 @@ class TestLearn:
 class TestEvaluate:
     def test_figures_are_those_of_the_answers(self, data, learner, monkeypatch):
         said = {0: ("a", 0.9, True), 1: ("a", 0.8, True), 2: ("a", 0.7, False), 3: ("b", 1.0, True)}
-        learn(learner, sources_of(data), FOLDERS)
+        learn_sources(learner, sources_of(data), FOLDERS)
         for name in ("4", "5"):
             shutil.move(data / "ab"[name == "5"] / f"{name}.npy", data / f"{name}.npy")
         put(data / "new" / "6.npy", (6, 60))
@@ -298,7 +298,7 @@ class TestEvaluate:
         assert wrong == [("1.npy", "a"), ("6.npy", "a")]
 
     def test_a_memory_answers_what_it_learned_and_what_cannot_be_read_is_listed(self, data, learner):
-        learn(learner, sources_of(data), FOLDERS)
+        learn_sources(learner, sources_of(data), FOLDERS)
         before = learner.digest()
         np.save(data / "a" / "other.npy", np.zeros((60, 3)))
         put(data / "b" / "9.npy", (9, 60))
@@ -319,13 +319,13 @@ class TestEvaluate:
 
 def test_a_memory_without_a_path_learns_too(data):
     learner = TactileLearner(**SETTINGS)
-    learn(learner, sources_of(data), FOLDERS)
+    learn_sources(learner, sources_of(data), FOLDERS)
     assert learner.digest() == fed(EXPECTED).digest()
 
 
 def test_the_same_memory_whatever_the_order(data, tmp_path):
     with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-        learn(learner, sources_of(data)[::-1], FOLDERS)
+        learn_sources(learner, sources_of(data)[::-1], FOLDERS)
         other, _ = filled(tmp_path / "n", EXPECTED)
         with other:
             assert learner.digest() == other.digest()

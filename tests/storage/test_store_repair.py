@@ -145,7 +145,7 @@ def test_a_lost_head_of_a_compacted_row_is_left_out_and_no_more(compacted):
     assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 5])
     # They are named as lost once; another one that goes is damage.
     flip_row(compacted, 4)
-    with Store.open(compacted, mode="read") as opened, pytest.raises(DamageError, match="row 4 is missing"):
+    with Store.open(compacted, mode="read") as opened, pytest.raises(DamageError, match="rows 4 to 5 are missing"):
         list(opened.heads(3))
     repair_store(compacted)
     assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 4, 5])

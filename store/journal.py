@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from store.encoding import decode_payload
-from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
+from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, is_missing, reported
 from store.files import sync_folder
 from store.framing import Frame
 from store.layout import CURRENT_FILE, Current, log_path, read_current
@@ -71,6 +71,8 @@ class Rows:
                     yield log.place
                 return
             except DamageError as damage:
+                if damage.offset is None:
+                    raise  # of the whole file
                 self.damage.setdefault(len(self), []).append(damage)
                 log.resume()
 
@@ -208,8 +210,10 @@ class Journal:
             current = read_current(self.folder)
             try:
                 return _OpenLog(self.folder, current, write=self._write)
-            except FileNotFoundError as error:
+            except StoreError as error:
                 # A writer removes a log after another has taken its place.
+                if not is_missing(error):
+                    raise
                 if read_current(self.folder) == current:
                     path = log_path(self.folder, current.log)
                     raise DamageError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -140,15 +140,18 @@ class FoundLog:
     """A log as it was found: the sequences of its rows, each with what is wrong with it, and other damage.
 
     path: the log, or what an interrupted repair left of it. identity: the store's, None where that is lost.
-    compacted: the last row without arrays. damage: what is wrong with it but for rows.
+    compacted: the last row without arrays. damage: what is wrong with it but for rows. places: of those that are
+    sought the ones that are there, and the last row before each.
     """
 
-    def __init__(self, path: Path, identity: bytes | None, progress: Progress) -> None:
+    def __init__(self, path: Path, identity: bytes | None, progress: Progress, places: Collection[Place] = ()) -> None:
         self.path, self.damage = path, list[str]()
         self.identity: dict[str, JSON] | None = None
         self.rows: list[tuple[int, Fault | None]] = []
         self.torn: set[int] = set()
         self.compacted = 0
+        self.places: dict[Place, int] = {}
+        self._sought = frozenset(places)
         self._offsets: dict[int, tuple[int, int]] = {}
         self._reader: LogReader | None = None
         if not path.exists():
@@ -179,7 +182,9 @@ class FoundLog:
             except ValueError as error:
                 self.damage.append(f"the identity in {self.path} was never written so: {error}")
         rows = Rows()
-        for done, _ in enumerate(rows.take(log)):
+        self._note_place(log.place, rows)
+        for done, place in enumerate(rows.take(log)):
+            self._note_place(place, rows)
             if done % REPORT_EVERY == 0:
                 progress("batches", done, done)
         for index in range(len(rows) + 1):
@@ -189,6 +194,10 @@ class FoundLog:
                 if index % REPORT_EVERY == 0:
                     progress("rows", index, len(rows))
                 self._note_row(log, rows.sequences[index], rows.offsets[index], rows.sizes[index])
+
+    def _note_place(self, place: Place, rows: Rows) -> None:
+        if place in self._sought:
+            self.places[place] = rows.sequences[-1] if rows.sequences else 0
 
     def _note_damage(self, log: LogReader, damage: DamageError) -> None:
         """Note a damaged frame: as a row with a fault where its first bytes still say which."""
@@ -276,6 +285,7 @@ class Survey:
         if self.identity is None and self.sound:
             self.identity = self.sound[0].identity
         self._drop_foreign()
+        self._judge_places()
         self.compacted = self.log.compacted if self.current is None else self.current.compacted
         self._find_faults()
 
@@ -311,7 +321,8 @@ class Survey:
         """Return the log that counts: without `CURRENT` the newest for whose compacted rows a checkpoint stands."""
         if self.current is not None:
             path = log_path(self.folder, self.current.log)
-            return FoundLog(_or_aside(path), self.current.log_identity, self.progress)
+            places = [named.place for named in self.current.checkpoints]
+            return FoundLog(_or_aside(path), self.current.log_identity, self.progress, places)
         there = [log_path(self.folder, number) for number in reversed(log_numbers(self.folder))]
         there += sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}"), reverse=True)
         newest = self.sound[0].upto if self.sound else 0
@@ -335,6 +346,21 @@ class Survey:
                 wrong = DamageError(f"{found.folder} is a checkpoint of another store", path=found.folder)
                 self.checkpoints[i] = FoundCheckpoint(
                     found.number, found.folder, found.named, found.is_base, [wrong], None
+                )
+
+    def _judge_places(self) -> None:
+        """Note where reading would begin at a place that is none, or behind rows that the checkpoint has not."""
+        for named in () if self.current is None or self.log.damage else self.current.checkpoints:
+            before = self.log.places.get(named.place, -1)
+            if not 0 <= before <= named.upto:
+                what = "is not there" if before < 0 else f"is behind row {before}"
+                self.damage.append(
+                    Problem(
+                        self.folder / CURRENT_FILE,
+                        f"the place in {self.log.path} that {self.folder / CURRENT_FILE} names for checkpoint "
+                        f"{named.number} (up to row {named.upto}) {what}",
+                        "spare",
+                    )
                 )
 
     def _find_faults(self) -> None:

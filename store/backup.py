@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from tempfile import mkdtemp
 
-from store.exceptions import DamageError, NotAStoreError, StoreError, reported
+from store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
 from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
 from store.layout import (
     CURRENT_FILE,
@@ -55,8 +55,10 @@ def _copy(source: Path, draft: Path) -> None:
         current = read_current(source / CURRENT_FILE)
         try:
             _copy_named(source, draft, current)
-            failure = None
-        except (FileNotFoundError, StoreError) as error:
+            failure: Exception | None = None
+        except (OSError, StoreError) as error:
+            if not isinstance(error, DamageError) and not is_missing(error):
+                raise
             failure = error
         # A writer removes what it replaces only after `CURRENT` has ceased to name it.
         if read_current(source / CURRENT_FILE) == current:

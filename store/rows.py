@@ -85,6 +85,8 @@ class Rows:
                     yield log.place
                 return
             except DamageError as damage:
+                if damage.offset is None:
+                    raise  # of the whole file
                 noted = self.damage.setdefault(len(self), [])
                 if damage.offset in [earlier.offset for earlier in noted]:
                     return  # nothing can be read behind it

@@ -187,6 +187,7 @@ class FoundLog:
             except ValueError as error:
                 self.damage.append(f"the identity in {self.path} was never written so: {error}")
         rows = Rows()
+        self._note_place(log.place, rows)
         for done, _ in enumerate(rows.take(log)):
             if done % REPORT_EVERY == 0:
                 progress("batches", done, done)
@@ -427,10 +428,10 @@ class Survey:
             if self.current is not None or checkpoint.named is not None:
                 kind: Literal["lost", "spare"] = "spare" if self._is_spare(checkpoint) else "lost"
                 found += [Problem(damage.path, str(damage), kind) for damage in checkpoint.damage]
-        named = None if self.current is None else self.current.newest
-        if named is not None and self.log.is_read and not self.log.has_place(named):
-            what = f"{self.log.path} does not have the place where {self.folder / CURRENT_FILE} has it read on"
-            found.append(Problem(self.log.path, what, "spare"))
+        for named in () if self.current is None or not self.log.is_read else self.current.checkpoints:
+            if not self.log.has_place(named):
+                what = f"{self.log.path} has no place behind which are all rows behind checkpoint {named.number}, as "
+                found.append(Problem(self.log.path, f"{what}{self.folder / CURRENT_FILE} says", "spare"))
         if self.identity is None:
             found.append(Problem(self.folder, f"nothing in {self.folder} tells what the store is for", "lost"))
         return found

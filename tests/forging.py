@@ -247,6 +247,17 @@ def seal(path: Path, number: int, known: Mapping[str, Any]) -> None:
     set_current(path, **current)
 
 
+def refiled(path: Path, number: int) -> dict[str, Any]:
+    """What a checkpoint says of itself, with the digests of its files as they are now."""
+    known = described(path, number)
+    for name, about in known["arrays"].items():
+        top = group_of(path, number) / name / "c"
+        files = [top] if top.is_file() else [file for file in top.rglob("*") if file.is_file()]
+        files.sort(key=lambda file: [int(part) for part in file.relative_to(top).parts])
+        about["files"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    return known
+
+
 def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Write arrays into a checkpoint's group, in place of those of their names; what it then has to say of itself.
 

@@ -8,33 +8,36 @@ from __future__ import annotations
 import json
 import random
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from forging import (
-    as_text,
-    generations,
+    described,
+    get_current,
     get_identity,
     group_of,
-    name_generation,
+    log_of,
+    named_in,
     observation,
     pack,
     put_arrays,
     put_row,
     raw,
+    read_log,
     seal,
+    sealed,
     set_identity,
-    set_meta,
+    write_log,
 )
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
-from faults.places import Attack, Scene, hot_journal, other_schema, strange_file
+from faults.places import Attack, Scene, leftover, strange_file
 from scroll_tactile.memory.rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 from store.encoding import decode_payload, encode_payload
+from store.framing import FRAME_BYTES, read_frame
 
 KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "member", "x", "", "OBSERVE")
 
@@ -99,18 +102,21 @@ def made_row(rng: random.Random, path: Path, scene: Scene) -> tuple[str, dict[st
     if rng.random() < 0.03:
         row["size"] = rng.choice(NUMBERS[:18])
         told.append(f"size {row['size']}")
+    if rng.random() < 0.03:
+        row["kept"] = rng.choice((0, 1, 2, 255))
+        told.append(f"kept {row['kept']}")
     return ", ".join(told), row
 
 
 def _fill(rng: random.Random, row: dict[str, Any], path: Path, scene: Scene) -> str:
-    """Give a row attributes and arrays of an observation, or of a generation, of which some are others."""
+    """Give a row attributes and arrays of an observation, or of a checkpoint, of which some are others."""
     attributes, payload = observation(path)
     way = rng.choice(("arrays", "arrays", "arrays", "payload", "payload", "attributes", "sound"))
     if row["kind"] == "member" and way != "sound":
         way = "attributes"
     if row["kind"] == "merge":
-        named = [row for other in scene.others for row in generations(other) if row.base]
-        attributes = json.loads(named[0].attributes) if named else {}
+        bases = [(other, base["number"]) for other in scene.others if (base := get_current(other)["base"])]
+        attributes = described(*bases[0])["attributes"] if bases else {}
         payload = scene.codes["merge"]
     told = way
     arrays = decode_payload(payload)
@@ -147,66 +153,151 @@ def _right_key(path: Path, arrays: dict[str, np.ndarray]) -> bytes | None:
 
 
 def forged_identity(rng: random.Random, path: Path, scene: Scene) -> str:
-    """Another identity, or other rows of table meta, with right checksums."""
-    if rng.random() < 0.1:
-        key = rng.choice(("format", "created", "repaired", "x"))
-        spans = (
-            '{"heads":[[1,2]]}',
-            '{"heads":[[1,1000000000000]]}',
-            '{"heads":"x"}',
-            '{"heads":[[5,1]]}',
-            "[" * 100_000,
-        )
-        value = rng.choice((*spans, "2", "0", "", "x", "-1", "null", '{"heads":[[1,2]],"generations":5}'))
-        set_meta(path, key, value)
-        return f"{key} {value[:30]}"
+    """Another identity, with right checksums."""
     told, text = mutated_json(rng, get_identity(path))
     set_identity(path, text)
     return told
 
 
-def forged_generation(rng: random.Random, path: Path, scene: Scene) -> str:
-    """A generation whose row, description and arrays agree with each other, and are not what a memory has."""
-    named = generations(path)
-    row = rng.choice(named)
-    way = rng.choice(("attributes", "attributes", "content", "arrays", "arrays", "arrays", "metadata", "row"))
+def forged_checkpoint(rng: random.Random, path: Path, scene: Scene) -> str:
+    """A checkpoint whose description, arrays and place in `CURRENT` agree, and are not what a memory has."""
+    number = rng.choice(named_in(path))["number"]
+    known = described(path, number)
+    way = rng.choice(("attributes", "attributes", "known", "arrays", "arrays", "arrays", "metadata"))
     if way == "attributes":
-        told, text = mutated_json(rng, json.loads(row.attributes))
-        seal(path, replace(row, attributes=text))
-    elif way == "content":
-        told, text = mutated_json(rng, json.loads(row.content))
-        seal(path, replace(row, content=text))
+        told, text = mutated_json(rng, known["attributes"])
+        with suppress(ValueError, RecursionError):
+            seal(path, number, known | {"attributes": json.loads(text)})
+    elif way == "known":
+        told, text = mutated_json(rng, known)
+        with suppress(ValueError, RecursionError, TypeError):
+            seal(path, number, json.loads(text))
     elif way == "arrays":
-        arrays = _group_arrays(path, row)
+        arrays = _group_arrays(path, number)
         told, changed = mutated_arrays(rng, arrays)
-        content = json.loads(row.content)
-        for name in set(arrays) - set(changed):
-            del content["arrays"][name]
         new = {name: array for name, array in changed.items() if array is not arrays.get(name) and _is_name(name)}
-        seal(path, put_arrays(path, replace(row, content=as_text(content)), new))
-    elif way == "metadata":
-        header = rng.choice(sorted(group_of(path, row).rglob("zarr.json")))
+        known = put_arrays(path, number, new)
+        for name in set(arrays) - set(changed):
+            del known["arrays"][name]
+        seal(path, number, known)
+    else:
+        header = rng.choice(sorted(group_of(path, number).rglob("zarr.json")))
         told, text = mutated_json(rng, json.loads(header.read_text(encoding="utf-8")))
         header.write_text(text, encoding="utf-8")
-    else:
-        column, value = rng.choice(
-            (("number", 2**40), ("number", -1), ("upto", 10**9), ("upto", -1), ("upto", 0), ("base", 1))
-        )
-        told = f"{column} {value}"
-        name_generation(path, replace(row, **{column: value}))
     return f"{way}: {told}"
+
+
+def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
+    """A `CURRENT` that verifies, and names something else."""
+    current = get_current(path)
+    named = [name for name in ("newest", "base") if current[name]]
+    way = rng.choice(("place", "place", "number", "swap", "log", "json")) if named else rng.choice(("log", "json"))
+    name = rng.choice(named) if named else ""
+    told = name
+    if way == "place":
+        at = rng.randrange(3)
+        there = _places(path)
+        value = rng.choice((*NUMBERS, "00" * 16, "x")) if rng.random() < 0.3 else None
+        if value is None:
+            current[name]["place"] = rng.choice(there)
+        else:
+            current[name]["place"][at] = value
+        told += f" {current[name]['place']}"
+    elif way == "number":
+        key = rng.choice(("number", "upto", "sha256"))
+        current[name][key] = rng.choice((*NUMBERS, "0" * 64, None, 1, 2, 3, 4, 5))
+        told += f" {key} {current[name][key]}"
+    elif way == "swap":
+        current["newest"], current["base"] = rng.choice(
+            ((None, current["newest"]), (current["newest"],) * 2, (current["base"], current["newest"]), (None, None))
+        )
+    elif way == "log":
+        current["log"] = rng.choice(
+            ([1, rng.randbytes(8).hex()], [2, current["log"][1]], [2**63, current["log"][1]], [], [1], "x", None)
+        )
+        told = str(current["log"])
+    else:
+        told, text = mutated_json(rng, {key: value for key, value in current.items() if key != "sha256"})
+        with suppress(ValueError, RecursionError, TypeError, AttributeError):
+            current = json.loads(text)
+    with suppress(TypeError, AttributeError, UnicodeEncodeError):
+        current = sealed(current)
+    (path / "CURRENT").write_text(json.dumps(current), encoding="utf-8")
+    return f"{way}: {told}"
+
+
+def _frames(path: Path) -> list[bytes]:
+    """The frames of a log as they are."""
+    data, at, found = log_of(path).read_bytes(), 0, []
+    while read_frame(data[at : at + FRAME_BYTES], at) is not None:
+        end = at + FRAME_BYTES + int.from_bytes(data[at + 36 : at + 40], "little")
+        found.append(data[at:end])
+        at = end
+    return found
+
+
+def _places(path: Path) -> list[Any]:
+    at, places = 0, []
+    for number, frame in enumerate(_frames(path), 1):
+        at += len(frame)
+        places.append([at, number, frame[72:88].hex()])
+    return places
+
+
+def spoiled_frames(rng: random.Random, path: Path, scene: Scene) -> str:
+    """The frames of a log, as they are, in another order: swapped, doubled, taken out, of another log, cut off."""
+    frames, data = _frames(path), log_of(path).read_bytes()
+    rest = data[sum(map(len, frames)) :]
+    i, j = rng.randrange(len(frames)), rng.randrange(len(frames))
+    way = rng.choice(("swapped", "doubled", "taken out", "other", "cut", "zeros", "behind"))
+    if way == "swapped":
+        frames[i], frames[j] = frames[j], frames[i]
+    elif way == "doubled":
+        frames.insert(j, frames[i])
+    elif way == "taken out":
+        del frames[min(i, j) : max(i, j) + 1]
+    elif way == "other":
+        frames[i : i + 1] = [*rng.choice((frames[i : i + 1], [])), rng.choice(_frames(rng.choice(scene.others)))]
+    elif way == "cut":
+        del frames[i:]
+        rest = b""
+    elif way == "zeros":
+        frames[i] = bytes(len(frames[i]))
+    else:
+        rest = rng.choice((b"".join(_frames(rng.choice(scene.others))), rng.randbytes(5000), bytes(2**20)))
+    log_of(path).write_bytes(b"".join(frames) + rest)
+    return f"{way}: {i}, {j} of {len(frames)}"
+
+
+def forged_log(rng: random.Random, path: Path, scene: Scene) -> str:
+    """The rows of a log in another order, with right checksums: swapped, doubled, taken out, of another memory."""
+    rows = read_log(path)[1]
+    i, j = rng.randrange(len(rows)), rng.randrange(len(rows))
+    way = rng.choice(("swapped", "doubled", "taken out", "other", "bytes"))
+    if way == "swapped":
+        rows[i], rows[j] = rows[j], rows[i]
+    elif way == "doubled":
+        rows.insert(j, rows[i])
+    elif way == "taken out":
+        del rows[min(i, j) : max(i, j) + 1]
+    elif way == "other":
+        rows[i : i + 1] = [*rng.choice((rows[i : i + 1], [])), rng.choice(read_log(rng.choice(scene.others))[1])]
+    else:
+        way, rows[i] = mutated_bytes(rng, rows[i], rows)
+    write_log(path, rows)
+    return f"{way}: {i}, {j} of {len(rows)}"
 
 
 def _is_name(name: str) -> bool:
     return bool(name) and all(letter.isalnum() or letter in "-_." for letter in name) and name[0] not in "._-"
 
 
-def _group_arrays(path: Path, row: Any) -> dict[str, np.ndarray]:
+def _group_arrays(path: Path, number: int) -> dict[str, np.ndarray]:
     import zarr
 
-    described = json.loads(row.content)["arrays"]
-    group = zarr.open_group(group_of(path, row), mode="r")
-    return {name: np.asarray(group[name][...]) for name in described if described[name]["dtype"] in DTYPES[:12]}
+    about = described(path, number)["arrays"]
+    group = zarr.open_group(group_of(path, number), mode="r")
+    return {name: np.asarray(group[name][...]) for name in about if about[name]["dtype"] in DTYPES[:12]}
 
 
 def spoiled_bytes(rng: random.Random, path: Path, scene: Scene) -> str:
@@ -217,30 +308,16 @@ def spoiled_bytes(rng: random.Random, path: Path, scene: Scene) -> str:
     name = file.relative_to(path)
     others = [(other / name).read_bytes() for other in scene.others if (other / name).is_file()]
     told, data = mutated_bytes(rng, file.read_bytes(), others)
-    while file.name == "journal.sqlite" and data in others:  # which is another memory, and no damage to this one
-        told, data = mutated_bytes(rng, file.read_bytes(), others)
     file.write_bytes(data)
     return f"{name}: {told}"
 
 
-def foreign_log(rng: random.Random, path: Path, scene: Scene) -> str:
-    """The log of another memory, whole or mutated, or one that was made up."""
-    logs = [other / "journal.sqlite-wal" for other in scene.others if (other / "journal.sqlite-wal").is_file()]
-    data = rng.choice(logs).read_bytes() if logs else b"7\x7f\x06\x82" + rng.randbytes(28)
-    told = "as it is"
-    if rng.random() < 0.7:
-        told, data = mutated_bytes(rng, data, [])
-    name = rng.choice(("-wal", "-wal", "-shm"))
-    (path / f"journal.sqlite{name}").write_bytes(data)
-    return f"{name}: {told}"
-
-
 CLASSES: dict[str, tuple[Attack, ...]] = {
-    "rows": (forged_row,),
+    "rows": (forged_row,) * 9 + (forged_log,),
     "identities": (forged_identity,),
-    "generations": (forged_generation,),
-    "bytes": (spoiled_bytes,) * 9 + (foreign_log,),
-    "files": (strange_file,) * 9 + (hot_journal,),
-    "tables": (other_schema,),
+    "checkpoints": (forged_checkpoint,),
+    "currents": (forged_current,),
+    "bytes": (spoiled_bytes,) * 2 + (spoiled_frames,),
+    "files": (strange_file,) * 4 + (leftover,),
 }
-FORGED = ("rows", "identities", "generations")
+FORGED = ("rows", "identities", "checkpoints", "currents")

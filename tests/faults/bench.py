@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
+from forging import named_in
 from touches import stream
 
 from faults.attacks import CLASSES, FORGED, made_row
@@ -48,9 +49,9 @@ from store.records import from_json
 SECONDS = 10  # of work in one case
 SPARE = 256 * 2**20  # bytes beyond the memory's own
 ADDRESSES = 3 * 2**30  # of which no case can take more, so that the machine lives
-KINDS = ("frames", "records", "rows", "bytes", "identities", "generations", "files", "tables")
-SHARES = (50, 32, 11, 3, 1, 2, 0.5, 0.5)
-QUICK = (64, 24, 8, 1.5, 1, 0.5, 0.5, 0.5)
+KINDS = ("frames", "records", "rows", "bytes", "identities", "checkpoints", "currents", "files")
+SHARES = (50, 31, 10, 4, 1, 2, 1, 1)
+QUICK = (64, 24, 7, 2, 1, 0.5, 1, 0.5)
 
 Finding = tuple[str, str]  # what it is, and where
 
@@ -127,7 +128,7 @@ class Bench:
             return self._frame(number, rng)
         if kind == "records":
             return self._record(number, rng)
-        fitting = [m for m in self.memories if kind != "generations" or (m.path / "generations" / "00000001").exists()]
+        fitting = [m for m in self.memories if kind != "checkpoints" or named_in(m.path)]
         first = [memory for memory in fitting if memory.name in ("rows", "crashed")] if kind == "rows" else []
         memory = rng.choice(first if first and rng.random() < 0.8 else fitting)
         attack, state = rng.choice(CLASSES[kind]), rng.getrandbits(64)
@@ -139,7 +140,7 @@ class Bench:
             readers.append(rng.choice((*READING, *WRITING)))
         try:
             self._begin(memory, told, lambda path: attack(random.Random(state), path, scene))
-        except Exception as error:  # the attack itself cannot be: SQLite refuses a row of it, say
+        except Exception as error:  # the attack itself cannot be: no row can be packed so, say
             told.outcomes.append(f"no attack: {type(error).__name__}")
             return told
         for reader in readers:
@@ -161,9 +162,6 @@ class Bench:
         (self.own / "out").mkdir()
         shutil.copytree(memory.path, self.own / "memory")
         told.about += f": {attack(self.own / 'memory')}"[:300]
-        for file in (self.own / "memory").glob("journal.sqlite*"):
-            if file.is_file() and not file.is_symlink():
-                os.utime(file, (1e9, 1e9))  # as of one that was not written just now
 
     def _read(self, reader: Reader, case: Case, told: Told) -> None:
         """Have one reader at it, and look at what it left."""
@@ -233,6 +231,7 @@ class Bench:
 
         made: dict[str, Any] = {"sequence": learner.memory.sequence + 1, "attributes": {}, "time": 0.0, **row}
         text, payload = made["attributes"], made.pop("payload", b"")
+        made.pop("kept", None)
         made["size"] = len(payload)
         try:
             made["attributes"] = from_json(text) if isinstance(text, str) else text

@@ -1,17 +1,16 @@
 """Single bits flipped: `python tests/faults/bit_flips.py --flips 1200`.
 
-Of a memory that was closed, and of one left as after a crash, with a log. Each flip, on a copy of its own:
+Of a memory that was closed, and of one left as after a crash. Each flip, on a copy of its own:
 
 1. `check_store` looks at it, and must change nothing.
 2. It is opened to write. It is refused with a StoreError, or passed over with a warning, or not noticed.
 3. Where it opens, what can be seen of it must be right. Then rows are read again: one observation and one material
    are retracted, and all must be right, or refused with a StoreError.
 
-Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Of a
-damaged log SQLite drops the end (FORMAT.md): where the memory is then as it was at an earlier instant, without a
-word, that is counted apart. So is a damaged row of a base: what was compacted is then not known. An f* in a damaged
-generation is gone, with the warning, where an older one is taken; and with a damaged base, with a warning, exemplars
-are those that are left.
+Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Damage
+in the very last batch of the log looks as a power cut does (LOG.md): where the memory is then as it was before that,
+without a word, that is counted apart. An f* in a damaged checkpoint is gone, with the warning, where the base is taken;
+and with a damaged base, with a warning, exemplars are those that are left.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ import argparse
 import hashlib
 import random
 import shutil
-import sqlite3
 import sys
 from collections import Counter
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from forging import log_of, named_in
 
 import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
@@ -42,6 +41,7 @@ except ImportError:  # a release without it
     check_store = None  # type: ignore[assignment]
 
 NEVER = 2**40
+SOME = 500  # bytes
 
 HISTORY: tuple[Operation, ...] = (
     ("batch", tuple(("observe", name, (i, 90)) for i in range(3) for name in "abc")),
@@ -51,7 +51,7 @@ HISTORY: tuple[Operation, ...] = (
     ("compact", 4),
     ("observe", "a", (4, 90)),
     ("observe", "ü", (4, 40)),
-    ("generation",),
+    ("checkpoint",),
     ("observe", "b", (5, 25)),
     ("fine_tune",),
     ("forget", "ü"),
@@ -78,45 +78,43 @@ def prepared(home: Path, others: dict[str, Other]) -> list[Memory]:
     path, states = home / "memory", [State()]
     learner = opened(path)
     for operation in HISTORY:
-        if operation == ("generation",):
+        if operation == ("checkpoint",):
             learner._ledger._snapshot()
             continue
         state, result = after(states[-1], operation, others)
         assert perform(learner, operation, home) == result
         states.append(state)
-    shutil.copytree(path, home / "crashed", ignore=shutil.ignore_patterns("*-shm"))
+    shutil.copytree(path, home / "crashed")
+    log = log_of(home / "crashed")
+    log.write_bytes(log.read_bytes().rstrip(b"\0") + bytes(SOME))  # of zeros ahead a mebibyte would take most flips
     learner.close()
     path.rename(home / "closed")
     memories = [Memory(name, home / name, states[-1], states[:-1]) for name in ("closed", "crashed")]
     for memory in memories:
-        shutil.copytree(memory.path, home / "looked-at")
-        memory.roles = roles_of(home / "looked-at")
-        shutil.rmtree(home / "looked-at")
+        memory.roles = roles_of(memory.path)
         memory.files = sorted(file for file in memory.path.rglob("*") if file.is_file() and file.stat().st_size)
     return memories
 
 
 def roles_of(path: Path) -> dict[str, str]:
-    """Folder of a generation → what it is to the memory."""
-    with closing(sqlite3.connect(path / "journal.sqlite")) as journal:
-        rows = journal.execute("SELECT number, base FROM generation ORDER BY upto DESC, number DESC").fetchall()
-    roles = {f"{number:08d}": "base" if base else "older generation" for number, base in rows}
-    return roles | {f"{rows[0][0]:08d}": "newest generation"}
+    """Folder of a checkpoint → what it is to the memory."""
+    newest, base = named_in(path)
+    return {f"{base['number']:08d}": "base", f"{newest['number']:08d}": "newest checkpoint"}
 
 
 def kind_of(file: Path, roles: dict[str, str]) -> str:
     """What a file is to the memory."""
-    if file.parts[0] == "generations":
+    if file.parts[0] == "checkpoints":
         return f"{roles[file.parts[1]]}: {'metadata' if file.name == 'zarr.json' else 'values'}"
-    return file.name
+    return "log" if file.name.startswith("log-") else file.name
 
 
 def fingerprint(path: Path) -> dict[str, str]:
-    """The contents of all files that are not SQLite's own shared memory, or an empty log."""
+    """The contents of all files."""
     return {
         str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(path.rglob("*"))
-        if file.is_file() and not file.name.endswith("-shm") and file.stat().st_size
+        if file.is_file()
     }
 
 
@@ -134,7 +132,7 @@ class Flipping:
     def once(self) -> None:
         """Flip one bit, and look."""
         memory = self.rng.choice(self.memories)
-        # Half of them by bytes, which are mostly the journal's, and half by files, which are mostly generations'.
+        # Half of them by bytes, which are mostly the log's, and half by files, which are mostly checkpoints'.
         sizes = [file.stat().st_size for file in memory.files] if self.flips % 2 else None
         file = self.rng.choices(memory.files, sizes)[0]
         bit = self.rng.randrange(8 * file.stat().st_size)
@@ -197,15 +195,13 @@ class Flipping:
         told = expected(memory.state) | ({"names": found["names"]} if warned and _fewer(found, memory.state) else {})
         if found == told:
             return "warned and right" if warned else "right", memory.state
-        if found | {"base": 0} == told | {"base": 0}:
-            return "right, but what was compacted is not known", memory.state
         differ = {key for key in found if found[key] != told[key]}
         if warned and differ == {"tuned"}:
             return "warned, and f* is gone", None
         if warned and differ <= {"exemplars", "pool"} and kind.startswith("base"):
             return "warned, and samples could not be chosen again", None
-        if kind.endswith("-wal") and any(found == expected(state) for state in memory.earlier):
-            return "the end of the log dropped" + (", warned" if warned else ", in silence"), None
+        if kind == "log" and found == expected(memory.earlier[-1]):
+            return "the last batch dropped" + (", warned" if warned else ", in silence"), None
         return None
 
     def _worked_with(self, path: Path, state: State, where: str) -> str:
@@ -235,7 +231,7 @@ class Flipping:
 
     def _require(self, where: str, what: str, learner: Any, state: State, *, right: bool) -> None:
         found = seen(learner)
-        known = {"base": 0} | ({"names": None} if _fewer(found, state) else {})
+        known = {"names": None} if _fewer(found, state) else {}
         if not right or found | known != expected(state) | known:
             self.failures.append(f"{where}: then wrong: {what}")
 

@@ -12,8 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from forging import Packed, pack, raw, unpack
-from numcodecs import blosc
+from forging import pack, unpack
 
 NUMBERS = (0, 1, -1, 2, 3, 7, 255, 256, 4095, 4096, 65535, 65536, 2**30, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1)
 NUMBERS += (2**63, 2**64 - 1, -(2**31), -(2**63), 10**30)
@@ -178,8 +177,6 @@ def mutated_payload(rng: random.Random, payload: bytes) -> tuple[str, bytes]:
     if rng.random() < 0.15 or not arrays:
         told, out = mutated_bytes(rng, payload, [])
         return f"payload: {told}", out
-    if rng.random() < 0.4:
-        version, arrays = 1, [_in_blosc(rng, array) for array in arrays]
     at = rng.randrange(len(arrays))
     array = arrays[at]
     kind = rng.choice(("shape", "codec", "size", "stored", "name", "dtype", "version", "count", *["frame"] * 6))
@@ -215,21 +212,6 @@ def mutated_payload(rng: random.Random, payload: bytes) -> tuple[str, bytes]:
     number = rng.choice((0, 2, 3, 255)) if kind == "version" else version
     count = rng.choice((0, 1, 255, 65535)) if kind == "count" else None
     return kind, pack(arrays, number, count)
-
-
-def _in_blosc(rng: random.Random, array: Packed) -> Packed:
-    """The array as a Blosc frame, as earlier releases wrote them; as it is, where what it holds is not known."""
-    if array.codec or not array.size or array.size != len(array.buffer):
-        try:
-            plain = np.zeros(array.shape, array.dtype)
-        except (ValueError, TypeError, MemoryError):
-            return array
-        array = raw(array.name, plain)
-    item = np.frombuffer(array.buffer, np.uint8)
-    shuffle = rng.choice((blosc.NOSHUFFLE, blosc.SHUFFLE, blosc.BITSHUFFLE))
-    codec = rng.choice((b"zstd", b"lz4", b"blosclz", b"zlib", b"lz4hc"))
-    frame = blosc.compress(item, codec, rng.choice((0, 1, 9)), shuffle)
-    return replace(array, codec=1, buffer=frame)
 
 
 def mutated_frame(rng: random.Random, frame: bytes) -> tuple[str, bytes]:

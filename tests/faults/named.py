@@ -1,6 +1,6 @@
 """Attacks that were found by hand, one by one, before anything withstood them: D1 to D7 and D12 of issue 17.
 
-Each is done to a copy of the memory "snapshot", which has a generation; `REFUSED` names those that nobody may take in.
+Each is done to a copy of the memory "snapshot", which has a checkpoint; `REFUSED` names those that nobody may take in.
 """
 
 from __future__ import annotations
@@ -10,34 +10,42 @@ import os
 import shutil
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from forging import (
     Packed,
-    as_text,
-    connected,
-    generations,
+    described,
+    get_current,
     get_identity,
     group_of,
-    name_generation,
+    log_of,
+    named_in,
     observation,
     pack,
     put_row,
     raw,
+    read_log,
+    refiled,
     seal,
+    set_current,
     set_identity,
-    set_meta,
     unpack,
+    write_log,
 )
 from numcodecs import zstd
 
-from faults.places import SCHEMAS, Scene, hot_journal
+from faults.places import Scene
 from scroll_tactile.memory.rows import pack_codes
 
 Named = Callable[[Path, Scene], None]
+
+
+def newest(path: Path) -> int:
+    """The number of the newest checkpoint."""
+    return int(named_in(path)[0]["number"])
+
 
 BLOSC = struct.pack("<BBBBIII", 2, 1, 0x20, 1, 65536, 65536, 2**31 - 1) + struct.pack("<i", 2**30)
 COPIED = struct.pack("<BBBBIII", 2, 1, 2, 1, 65536, 65536, 65552)  # 16 bytes that claim 65536 behind them
@@ -54,13 +62,14 @@ def frames() -> dict[str, Named]:
 
     def chunk(flags: int) -> Named:
         def spoil(path: Path, _: Scene) -> None:
-            for file in group_of(path, generations(path)[0]).glob("*/c/**/[0-9]*"):
+            for file in group_of(path, newest(path)).glob("*/c/**/[0-9]*"):
                 data = file.read_bytes() if file.is_file() else b""
                 if len(data) > 16:
                     size = data[4:8]
                     file.write_bytes(
                         struct.pack("<BBBB", 2, 1, flags, 1) + size * 2 + struct.pack("<Ii", 2**31 - 1, 2**30)
                     )
+            seal(path, newest(path), refiled(path, newest(path)))
 
         return spoil
 
@@ -80,28 +89,15 @@ def links() -> dict[str, Named]:
         return link
 
     return {
-        "generations": instead("generations", "."),
+        "checkpoints": instead("checkpoints", "."),
         "holder": instead("holder.json.new", "file"),
-        "journal": instead("journal.sqlite", "memory/journal.sqlite"),
-        "log": instead("journal.sqlite-wal", "file"),
-        "generation": instead("generations/00000001", "12345"),
-        "partial": instead("generations/00000009.partial", "12345"),
-        "draft": instead("journal.sqlite.new", "file"),
-        "super-journal": lambda path, scene: hot_journal(_Fixed(), path, scene) and None,  # type: ignore[arg-type]
+        "log": instead("log-00000001", "memory/log-00000001"),
+        "draft of a log": instead("log-00000002.new", "file"),
+        "current": instead("CURRENT", "memory/CURRENT"),
+        "draft of current": instead("CURRENT.new", "file"),
+        "checkpoint": instead("checkpoints/00000001", "12345"),
+        "partial": instead("checkpoints/00000009.partial", "12345"),
     }
-
-
-class _Fixed:
-    """A random generator that is none."""
-
-    def randrange(self, first: int, _: int) -> int:
-        return first
-
-    def randbytes(self, count: int) -> bytes:
-        return bytes(count)
-
-    def choice(self, choices: Any) -> Any:
-        return choices[0]
 
 
 def sizes() -> dict[str, Named]:
@@ -112,32 +108,32 @@ def sizes() -> dict[str, Named]:
 
     def meta(shape: list[int], chunk: list[int], named: bool) -> Named:
         def write(path: Path, _: Scene) -> None:
-            generation = generations(path)[0]
-            folder = group_of(path, generation) / "rows-15"
+            number = newest(path)
+            folder = group_of(path, number) / "rows-15"
             about = json.loads((folder / "zarr.json").read_text())
             about["shape"], about["chunk_grid"]["configuration"]["chunk_shape"] = shape, chunk
             (folder / "zarr.json").write_text(json.dumps(about))
             shutil.rmtree(folder / "c")
             if named:
-                content = json.loads(generation.content)
-                content["arrays"]["rows-15"]["shape"] = shape
-                seal(path, replace(generation, content=as_text(content)))
+                known = described(path, number)
+                known["arrays"]["rows-15"]["shape"] = shape
+                seal(path, number, known)
 
         return write
 
     def special(name: str, *, pipe: bool) -> Named:
         def make(path: Path, _: Scene) -> None:
-            place = path / name.replace("ARRAY", str(group_of(path, generations(path)[0]) / "rows-15"))
+            place = path / name.replace("ARRAY", str(group_of(path, newest(path)) / "rows-15"))
             place.unlink(missing_ok=True)
             os.mkfifo(place) if pipe else place.symlink_to("/dev/zero")
 
         return make
 
     large = zstd.compress(bytes(2**28), 1)
-    many = [Packed(f"codes-{i}", "|u1", (2**28,), 2, 2**28, large) for i in range(60)]
-    one = [Packed("codes-15", "<i4", (2**20, 64), 2, 2**28, large)]
+    many = [Packed(f"codes-{i}", "|u1", (2**28,), 1, 2**28, large) for i in range(60)]
+    one = [Packed("codes-15", "<i4", (2**20, 64), 1, 2**28, large)]
     made = {
-        "one array": row(payload=pack(one, 2), attributes={"columns": 30}),
+        "one array": row(payload=pack(one), attributes={"columns": 30}),
         "spans": row(kind="retract", label="", attributes={"sequences": [[1, 10**12]]}),
         "columns": lambda path, _: (
             put_row(path, attributes={"columns": 10**9, "nbytes": 240}, payload=observation(path)[1]) and None
@@ -145,11 +141,12 @@ def sizes() -> dict[str, Named]:
         "shape": meta([2**29], [2**29], named=True),
         "shape, not named": meta([2**29], [2**29], named=False),
         "chunks": meta([2**28], [1], named=True),
-        "60 arrays": row(payload=pack(many, 2), attributes={"columns": 30}),
+        "60 arrays": row(payload=pack(many), attributes={"columns": 30}),
         "tebibyte": row(payload=pack([Packed("x", "|u1", (2**40,), 0, 2**40, b"", 2**40)]), attributes={"columns": 30}),
-        "lost heads": lambda path, _: set_meta(path, "repaired", '{"heads":[[1,1000000000000]]}'),
+        "a sequence": row(sequence=2**62),
+        "a log with a hole": lambda path, _: os.truncate(log_of(path), 2**40),
     }
-    for name in ("ARRAY/zarr.json", "ARRAY/c/0", "journal.sqlite-wal", "holder.json"):
+    for name in ("ARRAY/zarr.json", "ARRAY/c/0", "log-00000001", "CURRENT", "holder.json"):
         made |= {f"zeros {name}": special(name, pipe=False), f"pipe {name}": special(name, pipe=True)}
     return made
 
@@ -211,20 +208,35 @@ def poison() -> dict[str, Named]:
     }
 
 
-def schemas() -> dict[str, Named]:
-    """D5: what SQLite would run."""
+def currents() -> dict[str, Named]:
+    """D5: a `CURRENT` that verifies, and says what cannot be."""
 
-    def run(statement: str) -> Named:
-        def change(path: Path, _: Scene) -> None:
-            with connected(path) as connection:
-                connection.execute(statement)
+    def change(**changes: Any) -> Named:
+        return lambda path, _: set_current(path, **changes)
 
-        return change
+    def newest_is(**changes: Any) -> Named:
+        return lambda path, _: set_current(path, newest=get_current(path)["newest"] | changes)
+
+    def other_log(path: Path, _: Scene) -> None:
+        set_current(path, log=[1, "00" * 8])
+
+    def doubled(path: Path, _: Scene) -> None:
+        rows = read_log(path)[1]
+        write_log(path, [*rows, *rows])
 
     return {
-        statement[:60]: run(statement)
-        for statement in SCHEMAS
-        if statement.startswith("CREATE") and "sqlite_x" not in statement and "random" not in statement
+        "another log": other_log,
+        "a log that is not there": lambda path, _: set_current(path, log=[9, get_current(path)["log"][1]]),
+        "a log of number 2^63 - 1": lambda path, _: set_current(path, log=[2**63 - 1, get_current(path)["log"][1]]),
+        "a place behind the end": newest_is(place=[2**62, 2**62, "00" * 16]),
+        "a place at the beginning": newest_is(place=[0, 0, "00" * 16]),
+        "a checkpoint of another number": newest_is(number=7),
+        "a checkpoint up to 2^62": newest_is(upto=2**62),
+        "no checkpoint": change(newest=None),
+        "a base": lambda path, _: set_current(path, base=get_current(path)["newest"]),
+        "rows that come twice": doubled,
+        "a text": change(newest="x"),
+        "a number that is none": newest_is(upto=True),
     }
 
 
@@ -239,8 +251,13 @@ def untyped() -> dict[str, Named]:
             path, (about := get_identity(path)) | {"embedding": {**about["embedding"], "dimension": dimension}}
         )
 
-    def content(text: str) -> Named:
-        return lambda path, _: name_generation(path, replace(generations(path)[0], content=text))
+    def content(**changes: Any) -> Named:
+        return lambda path, _: seal(path, newest(path), described(path, newest(path)) | changes)
+
+    def without(name: str) -> Named:
+        return lambda path, _: seal(
+            path, newest(path), {key: value for key, value in described(path, newest(path)).items() if key != name}
+        )
 
     def row(**changes: Any) -> Named:
         return lambda path, _: put_row(path, **changes) and None
@@ -260,18 +277,17 @@ def untyped() -> dict[str, Named]:
         "augmentation": identity(augmentation="x"),
         "unknown augmentation": identity(augmentation={"x": 1}),
         **{f"dimension {size}": embedding(size) for size in (0, -5, 10**9, True)},
-        "content without format": content('{"arrays":{}}'),
-        "content of format x": content('{"format":"x","arrays":{}}'),
-        "content of a list": content("[]"),
-        "deep content": content(deep),
-        "arrays of a list": content('{"format":1,"arrays":[1]}'),
-        "no attributes of a generation": lambda path, _: seal(path, replace(generations(path)[0], attributes="{}")),
+        "content without format": without("format"),
+        "content without arrays": without("arrays"),
+        "content of format x": content(format="x"),
+        "content of a newer format": content(format=2),
+        "arrays of a list": content(arrays=[1]),
+        "no attributes of a checkpoint": content(attributes={}),
         "too many materials": lambda path, _: seal(
             path,
-            replace(
-                generations(path)[0],
-                attributes=as_text(json.loads(generations(path)[0].attributes) | {"materials": ["a", "b", "c", "d"]}),
-            ),
+            newest(path),
+            (about := described(path, newest(path)))
+            | {"attributes": about["attributes"] | {"materials": ["a", "b", "c", "d"]}},
         ),
     }
 
@@ -293,7 +309,7 @@ NAMED: dict[str, Named] = {
         "D2": links(),
         "D3": sizes(),
         "D4": poison(),
-        "D5": schemas(),
+        "D5": currents(),
         "D6": untyped(),
         "D12": dates(),
     }.items()
@@ -301,20 +317,17 @@ NAMED: dict[str, Named] = {
 }
 """By name, all of them."""
 
-# Of these nothing can be taken in. Others are to be passed over: a generation of no use, with a warning, or a link
+# Of these nothing can be taken in. Others are to be passed over: a checkpoint of no use, with a warning, or a link
 # in the place of what a writer removes.
 REFUSED = frozenset(
     name
     for name in NAMED
-    if (
-        name.startswith(("D4", "D5"))
-        or name in ("D1: stream", "D1: copied", "D3: spans", "D3: columns", "D3: tebibyte")
-    )
+    if (name.startswith("D4") or name in ("D1: stream", "D1: copied", "D3: spans", "D3: columns", "D3: tebibyte"))
     or (
         name.startswith("D6")
         and "content" not in name
         and "arrays" not in name
-        and "generation" not in name
+        and "checkpoint" not in name
         and "materials" not in name
     )
 )

@@ -5,9 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from forging import spoil_row
+from forging import get_current, log_of, set_current, spoil_row
 
-from store import Store, check_store
+import store.backup
+import store.journal
+from store import DamageError, Store, check_store, repair_store
+from store.layout import read_current
 
 
 @pytest.fixture
@@ -27,3 +30,50 @@ def test_a_check_leaves_no_file_open(path):
         check_store(path)
         opened = [os.path.realpath(file) for file in Path("/proc/self/fd").iterdir()]
         assert not [name for name in opened if name.startswith(str(path))]
+
+
+@pytest.mark.parametrize("module", [store.journal, store.backup], ids=["a reader", "a backup"])
+def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(path, monkeypatch, module):
+    before = [read_current(path)]
+    with Store.open(path) as writer:
+        writer.compact({}, upto=2)
+    with Store.open(path, mode="read") as reader:
+        monkeypatch.setattr(module, "read_current", lambda folder: before.pop() if before else read_current(folder))
+        if module is store.backup:
+            reader.backup(path.parent / "copy")
+            path = path.parent / "copy"
+        with Store.open(path, mode="read") as again:
+            assert (again.last, again.compacted, before) == (3, 2, [])
+
+
+def test_a_log_that_is_not_there_is_damage(path):
+    log_of(path).unlink()
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="is not there"):
+            Store.open(path, mode=mode)
+
+
+def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
+    with Store.open(path, mode="read") as reader:
+        os.truncate(log_of(path), 2**40)
+        with pytest.raises(DamageError, match="nothing of it was read"):
+            reader.last  # noqa: B018
+
+
+@pytest.mark.parametrize("named", [1, 3])
+def test_a_place_that_is_none_or_behind_other_rows_is_found_and_mended(path, named):
+    with Store.open(path) as writer:
+        writer.commit({}, upto=named)
+    assert check_store(path) == []
+    newest = get_current(path)["newest"]
+    with Store.open(path) as writer:
+        writer.append("kind", "label", b"")
+        writer.commit({}, upto=4)
+    later = get_current(path)["newest"]
+    place = later["place"] if named == 1 else [newest["place"][0] + 1, *newest["place"][1:]]
+    set_current(path, newest=later | {"place": place, **({"upto": 3} if named == 1 else {})})
+    assert any("the place" in problem.what for problem in check_store(path))
+    repair_store(path)
+    assert check_store(path) == [] or all(problem.kind == "leftover" for problem in check_store(path))
+    with Store.open(path) as again:
+        assert [head.sequence for head in again.heads()] == [1, 2, 3, 4]

@@ -14,11 +14,10 @@ from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import TouchFeatures, TrainingSample, TunedReader, adapted
-from scroll_tactile.memory.identity import Identity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
-from store import Store, StoreError
+from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
 SCENE = Scene(sensor=PAD)
@@ -314,22 +313,6 @@ def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, mon
     learner.close()
     with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS["kernels"]()) as again:
         assert again.tuned_digest() == before
-
-
-def test_a_memory_from_before_exemplars_takes_a_size_once_and_keeps_it(tmp_path):
-    embedding = EMBEDDINGS["kernels"]()
-    identity = Identity.of(PAD, embedding, None).to_json()
-    del identity["exemplars"]
-    Store.open(tmp_path / "m", identity=identity).close()
-    with TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=8) as learner:
-        for name, stream in touches:
-            learner.observe(name, stream)
-        exemplars = learner.exemplars
-    with pytest.raises(errors.MismatchError, match="exemplars=8"):
-        TactileLearner.open(tmp_path / "m", embedding=embedding, exemplars=0)
-    with TactileLearner.open(tmp_path / "m", embedding=embedding) as again:
-        assert again.exemplars == exemplars
-        assert sum(map(len, exemplars.values())) == 8
 
 
 def test_a_memory_open_for_reading_is_not_trained_on(tmp_path):

@@ -467,7 +467,8 @@ def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
 def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
     attributes, arrays = checkpoint_of(path)
-    arrays["observations"] = arrays["observations"] + 1
+    for name in ("observations", "rows-1048576", "rows-1048577"):
+        arrays[name] = arrays[name] + 1
     arrays["lengths"][0, 1] += len(arrays["observations"])
     put_checkpoint(path, attributes, arrays, base=True)
     assert any("its journal names 4" in found for found in check_memory(path))

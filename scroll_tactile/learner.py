@@ -28,7 +28,8 @@ from scroll_tactile.memory.gate import open_store
 from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars, usual_recall
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
-from scroll_tactile.memory.merge import Choice, observations
+from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.observations import observations
 from scroll_tactile.memory.reembed import finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory

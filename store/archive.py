@@ -24,8 +24,13 @@ NAMES = re.compile(
 )
 LOCAL = struct.Struct("<4s22xHH")  # of the header before each file: its mark, and the bytes of its name and of more
 ARCHIVE_BYTES = LOCAL.size + len(CURRENT_FILE)
+END = struct.Struct("<4s8xI4xH")  # what a zip ends with: its mark, the bytes of its list of files, and of a comment
+LOCATOR, END_64 = struct.Struct("<4s4xQ4x"), struct.Struct("<4s36xQ8x")  # before it, where that is too large for it
+UNSAID = 2**32 - 1
+ENTRY_BYTES = 128  # of a file in the list, on average, at most
+AGAIN = "fetch it again from where it was packed"
 LINK = 0o120000  # of a file's mode
-MOST_FILES = 2**18
+MOST_FILES = 2**16
 DATE = (1980, 1, 1, 0, 0, 0)  # zip's earliest: the same bytes whenever it is written
 
 
@@ -79,13 +84,16 @@ class Archive(Files):
                 raise
 
     def _listed(self) -> dict[str, tuple[int, int]]:
+        self._require_bounded()
         try:
             with os.fdopen(open_regular(self.folder, os.O_RDONLY), "rb") as file, zipfile.ZipFile(file) as listed:
                 entries = listed.infolist()
         except (zipfile.BadZipFile, ValueError, struct.error, NotImplementedError, OverflowError) as error:
-            raise NotAStoreError(f"{self.folder} is no packed store: {error}") from error
+            raise NotAStoreError(f"{self.folder} is no packed store ({error}): {AGAIN}") from error
         if not any(entry.filename == CURRENT_FILE for entry in entries):
-            raise NotAStoreError(f"{self.folder} is a zip, and no packed store: it holds no {CURRENT_FILE}")
+            raise NotAStoreError(
+                f"{self.folder} is a zip, and no packed store: it holds no {CURRENT_FILE}. Give another path"
+            )
         ranges: dict[str, tuple[int, int]] = {}
         for entry in entries:
             plain = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
@@ -99,6 +107,23 @@ class Archive(Files):
             raise self._damage("lists files that overlap, or end behind its own end")
         return ranges
 
+    def _require_bounded(self) -> None:
+        """Refuse what does not begin and end as it was written, and a list of files that would fill the memory."""
+        end = self._file.read(max(0, self._size - END.size), END.size)
+        mark, size, comment = END.unpack(end) if len(end) == END.size else (b"", 0, 0)
+        if not is_archive(self._file.read(0, ARCHIVE_BYTES)) or mark != b"PK\5\6" or comment:
+            raise NotAStoreError(f"{self.folder} is no packed store, or was cut off or added to: {AGAIN}")
+        before = max(0, self._size - END.size - LOCATOR.size)
+        locator = self._file.read(before, LOCATOR.size)
+        if locator[:4] == b"PK\6\7":
+            place = LOCATOR.unpack(locator)[1]
+            record = self._file.read(place, END_64.size) if place < before else b""
+            if len(record) < END_64.size:
+                raise self._damage("says nowhere where its list of files lies")
+            size = END_64.unpack(record)[1] if size == UNSAID else max(size, END_64.unpack(record)[1])
+        if size > MOST_FILES * ENTRY_BYTES:
+            raise self._damage(f"says that its list of files takes {size} bytes")
+
     def _begin(self, entry: zipfile.ZipInfo) -> int:
         head = self._file.read(entry.header_offset, LOCAL.size) if 0 <= entry.header_offset < self._size else b""
         if len(head) == LOCAL.size:
@@ -110,7 +135,7 @@ class Archive(Files):
 
     def _damage(self, what: str) -> DamageError:
         return DamageError(
-            f"{self.folder} {what}: it is damaged or was made to harm. Fetch it again from where it was packed",
+            f"{self.folder} {what}: it is damaged or was made to harm. {AGAIN.capitalize()}",
             path=self.folder,
         )
 

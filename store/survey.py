@@ -187,7 +187,6 @@ class FoundLog:
             except ValueError as error:
                 self.damage.append(f"the identity in {self.path} was never written so: {error}")
         rows = Rows()
-        self._note_place(log.place, rows)
         for done, _ in enumerate(rows.take(log)):
             if done % REPORT_EVERY == 0:
                 progress("batches", done, done)

@@ -170,7 +170,7 @@ def list_observations(
 ) -> None:
     """List the observations: number, material, time, what became of it (kept, compacted, retracted), and source."""
     from scroll_tactile.memory.gate import MemoryStore
-    from scroll_tactile.memory.merge import observations
+    from scroll_tactile.memory.observations import observations
     from scroll_tactile.pipelines.plain_export import date_of
 
     with MemoryStore.open(folder, mode="read") as store:

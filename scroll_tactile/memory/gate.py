@@ -97,7 +97,9 @@ class Gate:
 
     def _most_rows(self) -> int:
         """How many rows the journal can hold, by its size."""
-        return sum(file_size(log_path(self._path, number)) for number in log_numbers(self._path)) // SMALLEST_ROW
+        packed = self._path.is_file()
+        logs = [self._path] if packed else [log_path(self._path, number) for number in log_numbers(self._path)]
+        return sum(map(file_size, logs)) // SMALLEST_ROW
 
 
 class MemoryStore(Store):

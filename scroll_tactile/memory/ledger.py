@@ -20,14 +20,8 @@ from scroll_tactile.memory.contents import Contents, StoredContents
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.merge import (
-    Choice,
-    Incoming,
-    compaction_point,
-    observation_of,
-    observations_from,
-    observations_of,
-)
+from scroll_tactile.memory.merge import Choice, Incoming
+from scroll_tactile.memory.observations import compaction_point, observation_of, observations_from, observations_of
 from scroll_tactile.memory.packing import pack_memory
 from scroll_tactile.memory.rows import (
     DESCRIBE,
@@ -371,8 +365,9 @@ class Ledger:
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         """Merge what was learned from sources: each touch once, and under its first name.
 
-        clipped: contents that clipping made. said: the source of touches that say none. Returns also the rows there that are refused, and why. Raises
-        ObservationError where one cannot be left out, for what it was learned into was compacted.
+        clipped: contents that clipping made. said: the source of touches that say none. Returns also the rows there
+        that are refused, and why. Raises ObservationError where one cannot be left out, for what it was learned into
+        was compacted.
         """
         return self._merge(other, "once", descriptions, progress, one_name=True, clipped=clipped, said=said)
 

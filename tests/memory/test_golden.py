@@ -179,7 +179,7 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
 
 def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
     monkeypatch.setattr(store.layout, "FORMAT_VERSION", 2)
-    write_current(golden, read_current(golden))
+    write_current(golden, read_current(golden / "CURRENT"))
     monkeypatch.undo()
     before = {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()}
     for mode in ("write", "read"):

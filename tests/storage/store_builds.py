@@ -67,15 +67,15 @@ def folders(path):
 
 
 def log_of(path):
-    return log_path(path, read_current(path).log)
+    return log_path(path, read_current(path / "CURRENT").log)
 
 
 def newest(path):
-    return checkpoint_path(path, read_current(path).newest.number)
+    return checkpoint_path(path, read_current(path / "CURRENT").newest.number)
 
 
 def base(path):
-    return checkpoint_path(path, read_current(path).base.number)
+    return checkpoint_path(path, read_current(path / "CURRENT").base.number)
 
 
 def flip(file, place=-9, bit=2):
@@ -113,7 +113,7 @@ def flip_row(path, number, *, arrays=False):
 
 def write_log(path, payloads, *, header=None, kind=ROW):
     """Write the log anew, each of these payloads in a batch of its own, with right checksums and right places."""
-    file, current = log_of(path), read_current(path)
+    file, current = log_of(path), read_current(path / "CURRENT")
     with LogReader(file) as log:
         identity, header = log.identity, log.header if header is None else header
     data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)

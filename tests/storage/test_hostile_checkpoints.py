@@ -91,7 +91,7 @@ def test_what_is_stored_is_verified_before_it_is_decompressed(path, monkeypatch)
 
     monkeypatch.setattr(store_chunks, "decompress_zstd", reached)
     with pytest.raises(DamageError, match="sha256 differs"):
-        CheckpointReader(newest(path)).arrays(["rows"])
+        CheckpointReader(newest(path), Files(path)).arrays(["rows"])
 
 
 def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(path, monkeypatch):
@@ -256,7 +256,7 @@ def test_a_harmed_checkpoint_is_damage_or_what_it_was(kept, tmp_path_factory, se
         del data[int(rng.integers(len(data))) :]
     file.write_bytes(data)
     try:
-        found = CheckpointReader(folder).arrays()
+        found = CheckpointReader(folder, Files(path)).arrays()
     except (DamageError, VersionError):
         return
     assert all(found[name].tobytes() == ARRAYS[name].tobytes() for name in found)

@@ -34,11 +34,13 @@ def test_a_check_leaves_no_file_open(path):
 
 @pytest.mark.parametrize("module", [store.journal, store.backup], ids=["a reader", "a backup"])
 def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(path, monkeypatch, module):
-    before = [read_current(path)]
+    before = [read_current(path / "CURRENT")]
     with Store.open(path) as writer:
         writer.compact({}, upto=2)
     with Store.open(path, mode="read") as reader:
-        monkeypatch.setattr(module, "read_current", lambda folder: before.pop() if before else read_current(folder))
+        monkeypatch.setattr(
+            module, "read_current", lambda folder: before.pop() if before else read_current(folder / "CURRENT")
+        )
         if module is store.backup:
             reader.backup(path.parent / "copy")
             path = path.parent / "copy"

@@ -1,0 +1,118 @@
+"""What a journal says of observations: what became of them, and which of them can be retracted."""
+
+from __future__ import annotations
+
+from typing import Literal, cast
+
+from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory.rows import MEMBER, OBSERVE, SOURCE, retracted_by, standing
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.results import Observation, Receipt
+from store import Head, Record, Store
+
+__all__ = ["compaction_point", "observation_of", "observations", "observations_from", "observations_of"]
+
+
+def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
+    """The journal's row of an observation that can be retracted.
+
+    Raises ObservationError where there is none, it was retracted before, or compacted.
+    """
+    sequence = receipt.sequence if isinstance(receipt, Receipt) else receipt
+    if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= store.last:
+        raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
+    if sequence in memory.retracted:
+        raise ObservationError(f"observation {sequence} of {store.path} was retracted already")
+    if sequence <= memory.base:
+        raise ObservationError(
+            f"observation {sequence} of {store.path} cannot be retracted: rows 1 to {memory.base} were compacted, and "
+            "their features given up"
+        )
+    record = store.record(sequence)
+    if record.kind != OBSERVE:
+        raise ObservationError(f"row {sequence} of {store.path} is no observation, but of kind {record.kind!r}")
+    if isinstance(receipt, Receipt) and (receipt.material, receipt.key) != (record.label, record.key):
+        raise ObservationError(
+            f"the receipt is of another memory: it says that observation {sequence} is of {receipt.material!r} "
+            f"({receipt.key.hex()[:12]}); in {store.path} it is of {record.label!r} ({record.key.hex()[:12]})"
+        )
+    return record
+
+
+def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
+    """The sequences of all observations of a material, ascending.
+
+    Raises UnknownMaterialError for one never observed, and ObservationError where some were compacted.
+    """
+    count = memory.statistics.materials.get(material, 0)
+    if not count:
+        raise UnknownMaterialError(
+            f"{material!r} was never observed; observed were {list(memory.statistics.materials)[:30]}"
+        )
+    found = [head.sequence for head in memory.retractable(store, material)]
+    if len(found) != count:
+        raise ObservationError(
+            f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
+            "compacted, and their features given up. Retract the others one by one, by their receipts"
+        )
+    return found
+
+
+def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
+    """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
+
+    Raises ObservationError where there are none, and where some were compacted.
+    """
+    mine = [
+        head for head in standing(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
+    ]
+    held = {head.sequence for head in memory.retractable(store)}
+    if not mine:
+        raise ObservationError(
+            f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
+        )
+    if gone := [head for head in mine if head.sequence not in held]:
+        raise ObservationError(
+            f"what comes from {source!r} cannot be forgotten: {len(gone)} of its {len(mine)} observations in "
+            f"{store.path} were compacted, there or before they were merged, and their features given up"
+        )
+    return [head.sequence for head in mine]
+
+
+def is_from(said: str | None, source: str) -> bool:
+    """Whether an observation that says where it comes from comes from there: a file, or what it lies in."""
+    place = source.rstrip("/")
+    # Behind a file's name come readings in brackets, or a topic; behind a folder's a file.
+    ends = "/[ " if "." in place.rpartition("/")[2] else "/"
+    return said is not None and (said == source or said.startswith(tuple(place + end for end in ends)))
+
+
+def observations(store: Store) -> list[Observation]:
+    """All observations of a journal, in order, and what became of them."""
+    heads, compacted = list(store.heads()), store.compacted
+    retracted = retracted_by(heads)
+
+    def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
+        if head.sequence in retracted:
+            return "retracted"
+        return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
+
+    return [
+        Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head))
+        for head in heads
+        if head.kind in (OBSERVE, MEMBER)
+    ]
+
+
+def _source(head: Head) -> str | None:
+    return cast("str | None", head.attributes.get(SOURCE))
+
+
+def compaction_point(store: Store, memory: Memory, keep: int) -> int:
+    """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
+    if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
+        raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
+    if keep == 0:
+        return store.last
+    sequences = [head.sequence for head in memory.retractable(store)]
+    return memory.base if len(sequences) <= keep else sequences[-keep] - 1

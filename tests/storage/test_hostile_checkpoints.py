@@ -17,6 +17,7 @@ from store_builds import flip, known_current, newest, put_current, put_row
 from store import DamageError, RecordError, Store, StoreError, VersionError, check_store
 from store import chunks as store_chunks
 from store import records as store_records
+from store.archive import Files
 from store.checkpoint_files import CheckpointReader
 
 ARRAYS = {
@@ -67,6 +68,9 @@ def test_zarr_reads_what_is_written_without_a_warning(path):
     group = zarr.open_group(newest(path), mode="r")
     for name, array in ARRAYS.items():
         found = np.asarray(group[name][...])
+        if array.dtype.kind in "iu" and array.itemsize >= 4:  # byte by byte, the lowest first
+            assert found.shape == (array.itemsize, *array.shape)
+            found = np.moveaxis(found, 0, -1)
         assert found.tobytes() == array.tobytes()
         assert found.shape[: array.ndim] == array.shape
         assert group[name].attrs["dtype"] == array.dtype.str

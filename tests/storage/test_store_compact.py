@@ -26,7 +26,7 @@ def add(opened, number):
 
 
 def sums(upto):
-    return {"sum": np.array(upto * (upto + 1) // 2), "bulk": np.full(500, upto)}
+    return {"sum": np.array(upto * (upto + 1) // 2), "bulk": np.full(500, upto, np.float64)}
 
 
 def compact(opened, upto, **options):

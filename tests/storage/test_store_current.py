@@ -152,7 +152,7 @@ def test_what_it_never_said_is_named_and_repaired(plain, forge):
 def test_a_place_behind_rows_that_its_checkpoint_does_not_contain_is_found(plain):
     """Only a forger writes it: who opens the store does not read what is before the place."""
     put_current(plain, **behind_all(plain))
-    assert "does not have the place" in damage(plain)[0].what
+    assert "has no place behind which" in damage(plain)[0].what
     assert repair_store(plain).kept == LAST
     assert is_whole(plain, 0)
 

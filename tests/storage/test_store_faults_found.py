@@ -8,7 +8,7 @@ import pytest
 from forging import get_current, log_of, set_current, spoil_row
 
 import store.backup
-import store.journal
+import store.archive
 from store import DamageError, Store, check_store, repair_store
 from store.layout import read_current
 
@@ -32,15 +32,13 @@ def test_a_check_leaves_no_file_open(path):
         assert not [name for name in opened if name.startswith(str(path))]
 
 
-@pytest.mark.parametrize("module", [store.journal, store.backup], ids=["a reader", "a backup"])
+@pytest.mark.parametrize("module", [store.archive, store.backup], ids=["a reader", "a backup"])
 def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(path, monkeypatch, module):
     before = [read_current(path / "CURRENT")]
     with Store.open(path) as writer:
         writer.compact({}, upto=2)
     with Store.open(path, mode="read") as reader:
-        monkeypatch.setattr(
-            module, "read_current", lambda folder: before.pop() if before else read_current(folder / "CURRENT")
-        )
+        monkeypatch.setattr(module, "read_current", lambda *given: before.pop() if before else read_current(*given))
         if module is store.backup:
             reader.backup(path.parent / "copy")
             path = path.parent / "copy"
@@ -74,7 +72,7 @@ def test_a_place_that_is_none_or_behind_other_rows_is_found_and_mended(path, nam
     later = get_current(path)["newest"]
     place = later["place"] if named == 1 else [newest["place"][0] + 1, *newest["place"][1:]]
     set_current(path, newest=later | {"place": place, **({"upto": 3} if named == 1 else {})})
-    assert any("the place" in problem.what for problem in check_store(path))
+    assert any("no place behind which" in problem.what for problem in check_store(path))
     repair_store(path)
     assert check_store(path) == [] or all(problem.kind == "leftover" for problem in check_store(path))
     with Store.open(path) as again:

@@ -103,11 +103,13 @@ def test_awkward_arrays_come_back_in_both_places(kept):
 
 
 def test_large_arrays_are_chunked_along_the_first_axis(kept):
-    rows = np.arange(3 * 700_000).reshape(3, 700_000)
+    rows = np.arange(3 * 700_000, dtype=np.float64).reshape(3, 700_000)
     kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, upto=kept.last)
     assert same(kept.latest().arrays, {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)})
     chunks = kept.path / "checkpoints" / f"{kept.latest().number:08d}" / "rows" / "c"
     assert sorted(chunk.name for chunk in chunks.iterdir()) == ["0", "1", "2"]
+    kept.commit({"rows": rows.astype(np.int64)}, upto=kept.last)  # byte by byte: an axis more
+    assert same(kept.latest().arrays, {"rows": rows.astype(np.int64)})
 
 
 def test_what_is_returned_is_the_callers_own(kept):

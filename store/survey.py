@@ -169,6 +169,8 @@ class FoundLog:
             return
         try:
             self._read(self._reader, progress)
+        except DamageError as error:  # nothing more of the file can be read
+            self.damage.append(str(error))
         except BaseException:
             self.close()
             raise

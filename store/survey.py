@@ -174,6 +174,8 @@ class FoundLog:
             return
         try:
             self._read(self._reader, progress)
+        except DamageError as error:  # nothing more of the file can be read
+            self.damage.append(str(error))
         except BaseException:
             self.close()
             raise

@@ -172,7 +172,10 @@ class Trial(Trials):
                 if outcome == SUCCESS:
                     outcome += ", warned" if warned else ""
                 self._count(step, how, hit, outcome)
-                self.examined(where, lambda: self._goes_on(where, step, how, attempt, outcome, number))
+                parts = step.parts if how == "EIO in reading" else []
+                if step.operation[0] == "compact" and hit == f"fsync {self.path}":
+                    parts = [step.then]  # `CURRENT` has its new name; whether on the disk, too, nobody knows
+                self.examined(where, lambda: self._goes_on(where, step, parts, attempt, outcome, number))
             elif outcome != SUCCESS:
                 self.failures.append(f"{where}: {outcome} without a fault")
         if attempt.learner is not None:
@@ -184,8 +187,7 @@ class Trial(Trials):
         step.calls[hit.split(maxsplit=1)[0]] += 1
         step.outcomes[f"{how}: {outcome}"] += 1
 
-    def _goes_on(self, where: str, step: Step, how: str, attempt: Attempt, outcome: str, number: int) -> None:
-        parts = step.parts if how == "EIO in reading" else []
+    def _goes_on(self, where: str, step: Step, parts: list[State], attempt: Attempt, outcome: str, number: int) -> None:
         if self._second_look(step, number):
             copied(self.path, crashed := self.home / "crashed")
             with opened(crashed, "read" if (crashed / "CURRENT").exists() else "write") as learner:

@@ -58,6 +58,7 @@ def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
         os.truncate(log_of(path), 2**40)
         with pytest.raises(DamageError, match="nothing of it was read"):
             reader.last  # noqa: B018
+    assert any("nothing of it was read" in problem.what for problem in check_store(path))
 
 
 @pytest.mark.parametrize("named", [1, 3])

@@ -236,21 +236,23 @@ def log(
 @app.command()
 def fleet(
     context: typer.Context,
-    touches: Annotated[int, typer.Option(min=20, help="Recordings, simulated, learned three times.")] = 20_000,
-    partials: Annotated[int, typer.Option(min=2, help="Of a default memory, summed up.")] = 1000,
+    touches: Annotated[int, typer.Option(min=20, help="Recordings, simulated, learned three times.")] = 2000,
     runs: Annotated[int, typer.Option(min=1, help="With workers that die and touches that come twice.")] = 200,
-    flips: Annotated[int, typer.Option(min=1, help="Of one bit of a partial.")] = 500,
+    flips: Annotated[int, typer.Option(min=1, help="Of one bit of a packed memory.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated touches.")] = 0,
     json: Json = None,
 ) -> None:
-    """Measure a fleet's memory: workers against a plain loop, sums of partials, and what thousands would take."""
+    """Measure a fleet's memory: workers against a plain loop, merges by size, and what can go wrong."""
     require_folders(json)
     with progress_bar() as progress:
-        result = run_fleet(touches, partials, runs, flips, seed, note=lambda what: progress(what, 0, 1))
-    shares = {name: result[name] for name in ("overhead", "speed_up", "speed_up_wall", "merge_share")}
-    for name, value in {**shares, **result["sums"]}.items():
-        say(f"{name.replace('_', ' ')}: {value:.4g}")
-    say(f"equal: {result['equal_runs']} of {result['runs']} runs; refused: {result['refused_flips']} of {flips} flips")
+        result = run_fleet(touches, runs, flips, seed, note=lambda what: progress(what, 0, 1))
+    for name in ("plain", "workers_1", "workers_2"):
+        for what, value in result[name].items():
+            say(f"{name}, {what}: {value:.4g}".replace("_", " "))
+    for merge in result["merges"]:
+        say(f"{merge['touches']} touches, {merge['bytes']} bytes: merged in {merge['seconds']:.3f} s")
+    sound = sum(result["sound_flips"].values())
+    say(f"equal: {result['equal_runs']} of {result['runs']} runs; sound: {sound} of {flips} flips")
     _written(context, json, result)
 
 

@@ -362,14 +362,17 @@ class Ledger:
         progress: Callable[[str, int, int], object],
         clipped: Collection[bytes] = (),
         said: str | None = None,
+        thorough: bool = True,
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         """Merge what was learned from sources: each touch once, and under its first name.
 
-        clipped: contents that clipping made. said: the source of touches that say none. Returns also the rows there
-        that are refused, and why. Raises ObservationError where one cannot be left out, for what it was learned into
-        was compacted.
+        clipped: contents that clipping made. said: the source of touches that say none. thorough: see `Gate`. Returns
+        also the rows there that are refused, and why. Raises ObservationError where one cannot be left out, for what it
+        was learned into was compacted.
         """
-        return self._merge(other, "once", descriptions, progress, one_name=True, clipped=clipped, said=said)
+        return self._merge(
+            other, "once", descriptions, progress, one_name=True, clipped=clipped, said=said, thorough=thorough
+        )
 
     def _merge(
         self,
@@ -381,12 +384,13 @@ class Ledger:
         one_name: bool,
         clipped: Collection[bytes] = (),
         said: str | None = None,
+        thorough: bool = True,
     ) -> tuple[Merged, list[tuple[Head, str]]]:
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
             self._require_no_batch("a merge")
             with MemoryStore.open(other, mode="read") as source:
-                source.read_with(memory.plan, thorough=True)
+                source.read_with(memory.plan, thorough=thorough)
                 incoming = Incoming.of(
                     store,
                     memory,

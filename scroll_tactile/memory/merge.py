@@ -31,8 +31,8 @@ class Incoming:
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
     that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
-    under another name, and why that is refused. descriptions: by material, those that we have not. said: where
-    touches come from that do not say it. Made by `Incoming.of`.
+    under another name, and why that is refused. descriptions: by material, those that we have not. newest:
+    what a packed memory sums up. said: where touches come from that do not say it. Made by `Incoming.of`.
     """
 
     source: MemoryStore
@@ -42,6 +42,7 @@ class Incoming:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
+    newest: Checkpoint | None = None
     said: str | None = None
 
     @classmethod
@@ -90,13 +91,16 @@ class Incoming:
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
         described = _descriptions(ours, memory, theirs, found, descriptions)
-        _require_sound(theirs, heads, coming={head.sequence for head in rows})
+        newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
         if once:
             for head in (head for head in incoming if head.sequence in both):
                 sequence = _row(contents, head) or 0
                 if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                     ours.record(sequence)
-        return cls(theirs, found, rows, len(both) + len(again), left_out, refused, described, said)
+        shared = len(both) + len(again)
+        return cls(
+            theirs, found, rows, shared, left_out, refused, described, newest if theirs.is_packed else None, said
+        )
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -127,11 +131,11 @@ class Incoming:
     def _sums(self, memory: Memory) -> Memory | None:
         """What the rows taught, of those that are not left out; None where only replaying them tells."""
         source = self.source
-        if not source.is_packed or source.compacted:
+        if self.newest is None or source.compacted:
             return None
         if memory.kept is not None and Identity.read(source).recall != memory.kept.capacity:
             return None
-        return sums_without(source, memory, {head.sequence for head in self.left_out})
+        return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
 
     def _rows_to_append(self, base: Checkpoint | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:
@@ -237,14 +241,14 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
         )
 
 
-def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> None:
-    """Raise DamageError where what does not come in would not pass the gate when theirs is opened."""
+def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
+    """Their newest checkpoint. Raises DamageError where what does not come in would not pass the gate of theirs."""
     for wrong in wrong_retractions(theirs.path, heads):
         raise wrong
-    theirs.latest()
     for head in heads:
         if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
             theirs.record(head.sequence)
+    return theirs.latest()
 
 
 def _without_configuration(part: Any) -> Any:

@@ -15,7 +15,7 @@ from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, standing
 from scroll_tactile.memory.state import Memory
-from store import DamageError, Head, Store
+from store import Checkpoint, DamageError, Head, Store
 from store.archive import write_archive
 from store.exceptions import reported
 
@@ -72,13 +72,13 @@ def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
     return exemplars
 
 
-def sums_without(source: MemoryStore, memory: Memory, left_out: Collection[int]) -> Memory | None:
+def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_out: Collection[int]) -> Memory | None:
     """What the touches of a packed memory taught, without some of them, exactly; None where only replaying them tells.
 
-    memory: any of that making. Raises DamageError, also where the sums are not those of the touches that it names.
+    found: its newest checkpoint. memory: any of that making. Raises DamageError, also where the sums are not those of
+    the touches that it names.
     """
-    found = source.latest()
-    if not source.is_packed or found is None or source.compacted or found.upto != source.last:
+    if found.upto != source.last:
         return None
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]

@@ -209,7 +209,10 @@ class _Destination:
         begun, processor = time.perf_counter(), time.process_time()
         try:
             ledger = self.opened()._ledger
-            merged, refused = ledger.merge_sources(path, self._descriptions, progress, clipped, source)
+            # What our own workers made is taken as what this memory holds itself.
+            merged, refused = ledger.merge_sources(
+                path, self._descriptions, progress, clipped, source, thorough=source is not None
+            )
             self._save()
         finally:
             self._report.merging += time.perf_counter() - begun

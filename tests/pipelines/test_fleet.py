@@ -137,11 +137,11 @@ def full(monkeypatch):
     merge, merged = Ledger.merge_sources, []
 
     def after(count):
-        def merging(self, other, *words):
+        def merging(self, other, *words, **named):
             if len(merged) >= count:
                 raise StoreFullError("full")
             merged.append(other)
-            return merge(self, other, *words)
+            return merge(self, other, *words, **named)
 
         monkeypatch.setattr(Ledger, "merge_sources", merge if count is None else merging)
 

@@ -8,21 +8,22 @@ import signal
 import threading
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from scroll_tactile.memory.partial import Partial, write_partial
-from scroll_tactile.pipelines.partials import Contained, Made, Making
-from test_fleet import BY_FOLDER, TOUCHES, expected, require_learned, run, touch_files
-from touches import SETTINGS
+from test_fleet import BY_FOLDER, TOUCHES, expected, full, learned, require_learned, run, touch_files
+from touches import SETTINGS, stream
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.pipelines import engines, fleet, partials, runfile
+from scroll_tactile.pipelines import engines, fleet, runfile, steps
 from scroll_tactile.pipelines.fleet import learn
+from scroll_tactile.pipelines.jobs import Made
+from scroll_tactile.pipelines.sources import Refused
 from store import DamageError, LockedError, StoreFullError
+
+__all__ = ["full", "learned"]  # fixtures
 
 
 @pytest.fixture
@@ -50,9 +51,10 @@ class TestPatience:
     ):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
         monkeypatch.setattr(steps, "MOST_SOURCES", 1)
-        with pytest.raises(ScrollTactileError, match="Silent has answered no job for 1 s"):
-            run(tmp_path / "m", [tmp_path / "in"], client=Silent(after), patience=0.2)
-        assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
+        with pytest.raises(ScrollTactileError, match="Silent has answered no job for 6 s"):
+            run(tmp_path / "m", [tmp_path / "in"], client=Silent(after), patience=3)
+        done = run(tmp_path / "m", [tmp_path / "in"])
+        assert (done.observations, done.held, done.repeated) == (12 - after, 12, 0)  # what was learned before came in
         require_learned(tmp_path / "m")
 
     def test_a_job_that_is_never_answered_is_handed_over_again(self, tmp_path, sources, monkeypatch):
@@ -70,7 +72,7 @@ class TestPatience:
                 threading.Timer(0.1, lambda: future.set_result(what(job))).start()
                 return future
 
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Forgetful(), patience=0.5)
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Forgetful(), patience=3)
         assert done.deaths == 1 and done.digest == expected().digest() and not done.refused
 
     def test_a_worker_that_is_stopped_is_ended_and_its_job_done_by_another(self, tmp_path, sources, monkeypatch):
@@ -104,8 +106,17 @@ class TestGarbage:
             {},
             Made("/etc/passwd", processor=1.0),
             Made("", processor=1.0),
-            Made("x", refused="all"),
-            Made(None, refused=[1]),
+            Made("", rows=[0], processor="1"),
+            Made("", rows=[-1], processor=1.0),
+            Made("", rows=[True], processor=1.0),
+            Made("", rows=[1], processor=1.0),
+            Made("", rows=[0], refused="all", processor=1.0),
+            Made("", rows=[0], refused=[1], processor=1.0),
+            Made("", rows=[0], refused=[Refused("x", 5)], processor=1.0),
+            Made("", rows=[0], failed=["/etc/passwd"], processor=1.0),
+            Made("", rows=[0], clipped=["x"], processor=1.0),
+            Made("", rows=[0], range_problem=5, processor=1.0),
+            Made(None, rows=[0], processor=1.0),
         ],
     )
     def test_what_is_no_answer_is_asked_for_again_and_named_in_the_end(self, tmp_path, sources, monkeypatch, made):
@@ -117,63 +128,70 @@ class TestGarbage:
                 future.set_result(made)
                 return future
 
-        with pytest.raises(InputError, match=r"nothing was learned.*12 sources were refused.*MismatchError: expected"):
-            run(tmp_path / "m", [tmp_path / "in"], client=Garbage())
+        with pytest.raises(InputError, match=r"nothing was learned.*2 sources were refused.*MismatchError: expected"):
+            run(tmp_path / "m", sources[:2], client=Garbage())
 
-    def test_a_partial_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
+    def test_a_packed_memory_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_SOURCES", 6)
 
         class Mistaken(DyingExecutor):
-            """Writes the partial of one job where the other's belongs, once."""
+            """Writes what one job learned where what the other did belongs, once."""
 
             done = 0
 
             def submit(self, what, job):
                 future = super().submit(what, job)
-                if what is partials.learn_partial:
-                    self.done += 1
-                    if self.done == 2:
-                        first = next(Path(job.folder).glob("learned-*.part"))
-                        job.target.write_bytes(first.read_bytes())
+                self.done += 1
+                if self.done == 2:
+                    first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
+                    job.target.write_bytes(first.read_bytes())
                 return future
 
         done = run(tmp_path / "m", [tmp_path / "in"], client=Mistaken())
         assert done.observations == 12 and done.digest == expected().digest()
 
+    def test_one_that_is_never_there_is_named_in_the_end(self, tmp_path, sources, monkeypatch):
+        monkeypatch.setattr(steps, "TRIES", 2)
+
+        class Elsewhere(DyingExecutor):
+            """Has a folder of its own under this name."""
+
+            def submit(self, what, job):
+                future = super().submit(what, job)
+                job.target.unlink()
+                return future
+
+        with pytest.raises(InputError, match=r"2 sources were refused.*while they learned it, again and again"):
+            run(tmp_path / "m", sources[:2], client=Elsewhere())
+
 
 def renamed(path):
-    """Write the partial in a file again, with another name for a touch, and right checksums."""
-    settings = {name: SETTINGS[name] for name in ("sensor", "embedding", "exemplars")}
-    making = Making(**settings, augmentation=None, recall=None, options=BY_FOLDER)
-    draft = path.with_suffix(".draft")
-    with Partial(path) as packed, write_partial(draft) as written:
-        packed.read_with(making.memory().plan)
-        sums = packed.sums()
-        for head in packed.named:
-            other = {"a": "b", "b": "c", "c": "a"}[head.label] if head.sequence == 1 else head.label
-            written.touch(replace(head, label=other), packed.record(head.sequence).arrays)
-        written.finish(packed.identity, making.memory().of_sums(sums.arrays, sums.attributes), None, packed.note)
-    draft.replace(path)
+    """Put a memory of as many touches under other names, with right checksums, in the place of a packed one."""
+    with TactileLearner.open(path, mode="read") as learner:
+        count = len(learner.observations())
+    with TactileLearner.open(path.with_suffix(".other"), **SETTINGS) as learner:
+        for number in range(count):
+            learner.observe("c", stream((100 + number, 60)), source=str(number))
+        learner.pack(path)
 
 
 class TestSpoilt:
-    def test_a_partial_with_other_names_and_right_checksums_is_learned_again(self, tmp_path, sources, monkeypatch):
+    def test_a_packed_memory_of_other_touches_and_right_checksums_is_learned_again(
+        self, tmp_path, sources, monkeypatch, full, learned
+    ):
         monkeypatch.setattr(steps, "MOST_SOURCES", 4)
-        merge = TactileLearner.merge
-        monkeypatch.setattr(TactileLearner, "merge", lambda *_, **__: (_ for _ in ()).throw(StoreFullError("full")))
+        full(0)
         with pytest.raises(StoreFullError):
             run(tmp_path / "m", [tmp_path / "in"])
-        monkeypatch.setattr(TactileLearner, "merge", merge)
+        full(None)
         path = min((tmp_path / "m.fleet").glob("learned-*.part"))
         renamed(path)
-        learned = []
-        learn_again = partials._learn
-        monkeypatch.setattr(partials, "_learn", lambda job: learned.extend(job.sources) or learn_again(job))
+        learned.clear()
         done = run(tmp_path / "m", [tmp_path / "in"])
         assert 0 < len(learned) < 12 and done.deaths == 0 and not done.refused
         require_learned(tmp_path / "m")
 
-    @pytest.mark.parametrize("place", [None, -9, 100])
+    @pytest.mark.parametrize("place", [None, -9, 100, 3000])
     def test_one_that_is_spoilt_while_the_run_goes_on_is_learned_again(self, tmp_path, sources, monkeypatch, place):
         monkeypatch.setattr(steps, "MOST_SOURCES", 3)
 
@@ -182,22 +200,17 @@ class TestSpoilt:
 
             def submit(self, what, job):
                 future = super().submit(what, job)
-                if what is partials.learn_partial:
-                    self.spoilt += 1
-                    if self.spoilt == 3:
-                        if place is None:
-                            renamed(job.target)
-                        else:
-                            whole = bytearray(job.target.read_bytes())
-                            whole[place] ^= 1
-                            job.target.write_bytes(bytes(whole))
+                self.spoilt += 1
+                if self.spoilt == 3:
+                    if place is None:
+                        renamed(job.target)
+                    else:
+                        whole = bytearray(job.target.read_bytes())
+                        whole[place] ^= 1
+                        job.target.write_bytes(bytes(whole))
                 return future
 
-        client = Spoiling()
-        if place == 100:  # in a row, which is read last
-            with pytest.raises(DamageError, match="call again: its sources are learned again"):
-                run(tmp_path / "m", [tmp_path / "in"], client=client, fan=2)
-        done = run(tmp_path / "m", [tmp_path / "in"], client=client, fan=2)
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Spoiling())
         assert done.observations == 12 and not done.refused and done.sources == 12
         require_learned(tmp_path / "m")
 
@@ -213,21 +226,26 @@ class TestNotes:
             ("[" * 100_000, "cannot be read"),
             ('{"format": 1, "plan": 5, "notes": {}}', "its plan is a int"),
             ("[1, 2]", "cannot be read"),
-            (None, "sources that a run learned"),
+            (None, "what a run learned in .*; it cannot be read: .* begin with add=True"),
         ],
     )
     def test_notes_that_are_none(self, tmp_path, sources, text, match):
         run(tmp_path / "m", sources[:2])
         notes = tmp_path / "m.fleet" / "run.json"
         kept = json.loads(notes.read_text())
-        for learned in (5, [5], {"a": 1}):
-            kept["notes"]["learned"] = learned
-            notes.write_text(json.dumps(kept) if text is None else text)
-            with pytest.raises(InputError, match=match):
+        made = {"sources": [str(sources[3])], "made": {"path": "/etc/passwd", "refused": []}}
+        wrong = [("learned", [5]), ("learned", {"a": 1}), ("made", 5), ("made", [5]), ("made", [{}]), ("made", [made])]
+        for name, value in [("learned", 5), *wrong, ("range_problem", 5)] if text is None else [("learned", 5)]:
+            said = kept | {"notes": kept["notes"] | {name: value}}
+            notes.write_text(json.dumps(said) if text is None else text)
+            with pytest.raises(InputError, match=match) as raised:
                 run(tmp_path / "m", sources)
+            assert "ove" in str(raised.value) and "away" in str(raised.value)
+        (tmp_path / "m.fleet").rename(tmp_path / "away")
+        assert run(tmp_path / "m", sources, add=True).observations == 10
 
     @pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
-    @pytest.mark.parametrize("name", ["learned-0.part", "run.json", "x.partial"])
+    @pytest.mark.parametrize("name", ["learned-0.part", "run.json"])
     def test_what_is_no_file_is_named_before_anything_is_learned(self, tmp_path, sources, make, name):
         run(tmp_path / "m", sources[:2])
         place = tmp_path / "m.fleet" / name
@@ -235,6 +253,24 @@ class TestNotes:
         make(place)
         with pytest.raises(InputError, match="move it away"):
             run(tmp_path / "m", sources)
+
+    def test_what_a_worker_left_that_was_killed_is_removed_and_nothing_else(self, tmp_path, sources):
+        run(tmp_path / "m", sources[:2])
+        left = tmp_path / "m.fleet" / "learned-0.part.x.partial"
+        (left / "memory").mkdir(parents=True)
+        (tmp_path / "m.fleet" / "mine.txt").write_text("any")
+        run(tmp_path / "m", sources)
+        assert sorted(path.name for path in (tmp_path / "m.fleet").iterdir()) == ["mine.txt", "run.json"]
+
+    def test_notes_are_few_where_noting_takes_long(self, tmp_path, sources, monkeypatch):
+        monkeypatch.setattr(steps, "MOST_SOURCES", 1)
+        monkeypatch.setattr(steps, "NOTING", 10**9)
+        written = []
+        write = runfile.RunFile._write
+        monkeypatch.setattr(runfile.RunFile, "_write", lambda self: written.append(1) or write(self))
+        run(tmp_path / "m", sources)
+        assert len(written) == 3  # as it began, at the first step and at the end
+        assert len(json.loads((tmp_path / "m.fleet" / "run.json").read_text())["notes"]["learned"]) == 12
 
     def test_two_runs_for_one_destination(self, tmp_path, sources):
         class Second(DyingExecutor):
@@ -300,37 +336,3 @@ def test_a_fork_server_that_is_killed_is_begun_again(tmp_path, sources, monkeypa
     monkeypatch.setattr(engines.Processes, "submit", killing)
     done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=2, **SETTINGS)
     assert killed and done.observations == 12 and done.digest == expected().digest()
-
-
-def test_what_a_partial_notes_of_itself_is_looked_at(tmp_path, sources):
-    class Keeping(DyingExecutor):
-        made = None
-
-        def submit(self, what, job):
-            future = super().submit(what, job)
-            if what is partials.learn_partial and not self.made:
-                type(self).made = job.making, job.target.read_bytes()
-            return future
-
-    run(tmp_path / "m", sources[:3], client=Keeping())
-    making, content = Keeping.made
-    path = tmp_path / "p.part"
-    path.write_bytes(content)
-    good = Contained.of(path, making, thorough=True)
-    assert good.touches and good.sources
-    empty = {"sources": [], "again": []}
-    with Partial(path) as packed:
-        noted = dict(packed.note)
-    strange = [noted | {"clipped": 5}, noted | {"range_problem": 5}, noted | {"again": [["x", "x", "x", "00"]]}]
-    strange.append(noted | {"again": [[good.sources[0], "x", "of no row", "00" * 32]]})
-    for note in ({}, {"read": 5}, {"read": [[1, 2]]} | empty, {"read": []} | empty, *strange):
-        with pytest.MonkeyPatch.context() as patch:
-            read = Partial._read
-
-            def other(self, note=note, read=read):
-                read(self)
-                self.note = note
-
-            patch.setattr(Partial, "_read", other)
-            with pytest.raises(ScrollTactileError, match="none of a fleet's run"):
-                Contained.of(path, making)

@@ -10,10 +10,10 @@ import numpy as np
 
 from store import Store, check_store
 from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
-from store.rows import Rows
 from store.layout import checkpoint_path, log_path, read_current, write_current
 from store.log import LogReader, Place
 from store.row_encoding import ROW, encode_row
+from store.rows import Rows
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from forging import get_current, log_of, set_current, spoil_row
 
-import store.backup
 import store.archive
+import store.backup
 from store import DamageError, Store, check_store, repair_store
 from store.layout import read_current
 

@@ -152,6 +152,10 @@ class World:
         for machine in self.machines:
             self.drop(machine)
 
+    @staticmethod
+    def _problems(path: Path) -> list[Any]:
+        return [one for one in check_store(path) if one.kind != "leftover"]
+
     def drop(self, machine: Machine) -> None:
         """The processes of a machine are gone."""
         for learner in [machine.learner, *machine.readers]:
@@ -472,7 +476,7 @@ class World:
             if acknowledged:
                 raise Wrong(f"{path.name} of {machine.name} is gone")
             return
-        if problems := [one for one in check_store(path) if one.kind != "leftover"]:
+        if problems := self._problems(path):
             raise Wrong(f"{path.name} of {machine.name}: {problems}")
         if rng.random() < 0.5:
             self._shut(machine)
@@ -611,27 +615,38 @@ class World:
         finally:
             self.disks.go(self.disks.end())
         if machine.learner is not None:
-            self.look(machine, machine.learner, f"opened after a bit of {hurt.name} changed", settle=True)
-            self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
-            return
+            try:
+                self.look(machine, machine.learner, f"opened after a bit of {hurt.name} changed", settle=True)
+                self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
+                if not self._problems(machine.path):
+                    return
+                self.counts["rot: named by a check alone"] += 1
+                self.drop(machine)
+            except StoreError as error:
+                self.counts["rot: refused when it was read"] += 1
+                self.say(f"    reading what was opened: {error!r:.150}")
+                self.drop(machine)
         self._repair(machine, whole, hurt)
 
     def _repair(self, machine: Machine, whole: Rows, hurt: Path) -> None:
+        refused = None
         self.disks.begin()
         try:
             repair = repair_store(machine.path)
         except StoreError as error:
-            self.say(f"    repairing: {error!r:.200}")
+            refused = error
+        finally:
+            self.disks.go(self.disks.end())
+        if refused is not None:
+            self.say(f"    repairing: {refused!r:.200}")
             self.counts["rot: not repaired"] += 1
             self._replace(machine)
             return
-        finally:
-            self.disks.go(self.disks.end())
         self.say(f"    repaired: {repair!r:.300}")
         self.counts["rot: repaired"] += 1
         rows = whole.cut(repair.kept)
-        if not repair.lost and hurt.name != "CURRENT":
-            raise Wrong(f"a repair of {hurt.name} tells of no loss, and opening refused it")
+        if not repair.lost and repair.kept < len(whole.rows):
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows, and tells of no loss")
         if repair.kept < whole.base:  # the base is lost: with it all that it stood for
             self._replace(machine)
             return
@@ -685,13 +700,15 @@ class World:
             self.crash(machine, rng, "cut")
             if not machine.made:
                 continue
-            learner = self._open(machine, machine.path, machine.candidates, "write")
-            machine.learner = learner
-            self.look(machine, learner, "at the end", settle=True)
+            self.disks.begin()
+            try:
+                machine.learner = self._open(machine, machine.path, machine.candidates)
+            finally:
+                self.disks.go(self.disks.end())
+            self.look(machine, machine.learner, "at the end", settle=True)
             self._shut(machine)
-            if problems := check_store(machine.path):
-                if any(one.kind != "leftover" for one in problems):
-                    raise Wrong(f"at the end {machine.name} has {problems}")
+            if problems := self._problems(machine.path):
+                raise Wrong(f"at the end {machine.name} has {problems}")
             for path, (rows, acknowledged) in machine.copies.items():
                 if acknowledged and not path.exists():
                     raise Wrong(f"{path.name} of {machine.name} is gone")

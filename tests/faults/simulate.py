@@ -78,7 +78,7 @@ class Simulation:
         shutil.rmtree(self._home, ignore_errors=True)
         world = World(self._home, self._shim, self._log, self.counts)
         try:
-            with warnings_told(lambda text: None):
+            with warnings_told(world.warned.append):
                 for kind, seed in events:
                     world.play(kind, seed)
                 world.finish(random.Random(len(events)))

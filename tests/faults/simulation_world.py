@@ -11,7 +11,7 @@ import functools
 import random
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ TOUCHES = 9
 SAID = (None, (("silk", 1.0),), (("silk", 0.25), ("wool", 0.75)), (("soft", True),))
 SNAPSHOT_EVERY = 7
 PAD = Sensor(name="tiny", channels=1, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.16)
+KEPT = ("kept", "pool", "exemplars")
 MOST = 24  # touches of a memory that is merged
 ERRORS = (errno.ENOSPC, errno.ENOSPC, errno.EIO)
 
@@ -141,6 +142,7 @@ class World:
         self.flying: list[tuple[int, str, tuple[bytes, Rows]]] = []
         self.step = 0
         self.counts = counts
+        self.warned: list[str] = []
         self.told: list[str] = []
 
     def say(self, text: str) -> None:
@@ -245,13 +247,13 @@ class World:
             machine.candidates = [after]
         return result
 
-    def look(self, machine: Machine, learner: Any, where: str, *, settle: bool = False) -> None:
-        """What is seen of a memory is one of its candidates; settle: from now on it is that one."""
+    def look(self, machine: Machine, learner: Any, where: str, *, settle: bool = False, but: Sequence[str] = ()) -> None:
+        """What is seen of a memory is one of its candidates; settle: no other any more; but: what may differ."""
         found = model.seen(learner)
         differ = []
         for rows in machine.candidates:
             wanted = EXPECTED(rows)
-            differ.append([name for name, value in found.items() if value != wanted[name]])
+            differ.append([name for name, value in found.items() if value != wanted[name] and name not in but])
             if not differ[-1]:
                 others = [] if settle else [other for other in machine.candidates if other is not rows]
                 if learner is machine.learner:
@@ -599,9 +601,16 @@ class World:
         if hurt.name.startswith("log-") and machine.sure < len(whole.rows):
             allowed.append(whole.cut(max(machine.sure, whole.base)))
         machine.candidates = allowed
+        self.warned.clear()
+
+        def look(learner: Any, where: str, *, settle: bool = False) -> None:
+            # Of a damaged base a warning tells that nothing can take the place of what is retracted.
+            named = any("no other touch can take the place" in text for text in self.warned)
+            self.look(machine, learner, f"{where} after a bit of {hurt.name} changed", settle=settle, but=KEPT * named)
+
         try:
             learner = self._open(machine, machine.path, allowed, "read")
-            self.look(machine, learner, f"read after a bit of {hurt.name} changed")
+            look(learner, "read")
             learner.close()
         except StoreError as error:
             self.counts["rot: refused to read"] += 1
@@ -616,7 +625,7 @@ class World:
             self.disks.go(self.disks.end())
         if machine.learner is not None:
             try:
-                self.look(machine, machine.learner, f"opened after a bit of {hurt.name} changed", settle=True)
+                look(machine.learner, "opened", settle=True)
                 self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
                 if not self._problems(machine.path):
                     return

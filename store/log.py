@@ -168,10 +168,13 @@ class LogReader:
     first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
     file: the log, where it is open already.
 
+    durable: a place that its writer noted elsewhere. Where it is in the log, what is before it is no torn batch.
+
     Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
     """
 
     WRITES = False
+    durable: Place | None = None
 
     def __init__(
         self,
@@ -326,6 +329,9 @@ class LogReader:
             found = read_frame(self._file.read(known.offset, FRAME_BYTES), known.offset)
             if found == known:
                 return known
+        if self.durable is not None and torn.offset < self.durable.offset:
+            with suppress(DamageError):
+                return self._commit_before(self.durable)
         proofs = (frame for frame in self._frames(torn.offset) if not torn.can_be_torn_before(frame))
         self._proved = next(proofs, None)
         return self._proved

@@ -146,10 +146,12 @@ class FoundLog:
     """A log as it was found: the sequences of its rows, each with what is wrong with it, and other damage.
 
     path: the log, or what an interrupted repair left of it. identity: the store's, None where that is lost.
-    compacted: the last row without arrays. damage: what is wrong with it but for rows.
+    compacted: the last row without arrays. damage: what is wrong with it but for rows. durable: as of `LogReader`.
     """
 
-    def __init__(self, files: Files, path: Path, identity: bytes | None, progress: Progress) -> None:
+    def __init__(
+        self, files: Files, path: Path, identity: bytes | None, progress: Progress, durable: Place | None = None
+    ) -> None:
         self.path, self.damage = path, list[str]()
         self._open = partial(files.open_log, path)
         self.identity: dict[str, JSON] | None = None
@@ -161,6 +163,7 @@ class FoundLog:
         try:
             known = find_identity(self._open()) if identity is None else identity
             self._reader = LogReader(path, identity=known, file=self._open())
+            self._reader.durable = durable
         except FileNotFoundError:
             self.damage.append(f"{path} is gone")
             return
@@ -344,7 +347,8 @@ class Survey:
         else:
             named = _or_aside(log_path(self.folder, self.current.log))
             if self.files.is_packed or named.exists():
-                return FoundLog(self.files, named, self.current.log_identity, self.progress)
+                durable = None if self.current.newest is None else self.current.newest.place
+                return FoundLog(self.files, named, self.current.log_identity, self.progress, durable)
         there = [log_path(self.folder, number) for number in log_numbers(self.folder)]
         newest = self.sound[0].upto if self.sound else 0
         found = [FoundLog(self.files, path, None, self.progress) for path in there or aside[-1:]]

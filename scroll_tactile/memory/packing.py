@@ -38,7 +38,10 @@ def pack_memory(
         packed.capacity = 0
     with reported(path, "packing a memory"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        made = TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.", suffix=".partial")
+        # What a failing disk does not let go of says nothing of what was packed.
+        made = TemporaryDirectory(
+            dir=path.parent, prefix=f"{path.name}.", suffix=".partial", ignore_cleanup_errors=True
+        )
     with made as folder:
         with Store.open(folder, identity=identity) as into:
             with into.batch():

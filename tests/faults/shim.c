@@ -41,7 +41,8 @@ static void *real(const char *name) {
     return found;
 }
 
-/* Fail (or end at, or tear) the calls numbered first to last of the classes in `what`; 0 for none. */
+/* Fail (or end at, or tear) the calls numbered first to last of the classes in `what`; 0 for none. LOG writes down the
+   others, too. */
 void shim_arm(const char *folder, int how, int what, long from, long to, int number) {
     pthread_mutex_lock(&lock);
     snprintf(root, sizeof root, "%s", folder);
@@ -82,7 +83,7 @@ static const char *absolute(int folder, const char *path, char *space) {
 
 static enum verdict judge(const char *call, int what, const char *path, long file, size_t length) {
     int tears = (what & TEARABLE) && length > 1;
-    if (mode == LOG || !(what & watched) || (mode == TEAR && !tears)) return GO_ON;
+    if (!(what & watched) || (mode == TEAR && !tears)) return GO_ON;
     if (halved_file >= 0 && halved_file == file && tears) {
         halved_file = -1;
         errno = error_given;

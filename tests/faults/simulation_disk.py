@@ -1,0 +1,200 @@
+"""Machines' disks in a simulation: all that is written goes through disks.py, and comes back as a power cut leaves it."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numcodecs import zstd
+
+import store.checkpoint_files
+import store.checkpoints
+import store.journal
+import store.log_writer
+import store.rows
+from faults import shim as watch
+from faults.disks import STYLES, Disk, Event, Folder, _apply, _rebuild, events
+from faults.shim import Shim
+from store.checkpoint_files import Draft
+from store.content import ArrayContent
+from store.encoding import flat_bytes
+
+AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
+EVERY = 4  # rows that are put into an index
+ARRAY = {"zarr_format": 3, "node_type": "array", "fill_value": 0, "storage_transformers": []}
+
+
+class Disks(Disk):
+    """The disks of machines, a folder each, and the shim that writes down what is done to them."""
+
+    def __init__(self, root: Path, shim: Shim, log: Path) -> None:
+        super().__init__(root)
+        self._shim, self._log = shim, log
+
+    def begin(self, fail: tuple[int, int, int] | None = None) -> None:
+        """Write down from here; fail: the first and last of the writing calls that fail, and with which error."""
+        os.truncate(self._log, 0)
+        first, last, error = fail or (0, 0, 0)
+        self._shim.arm(self.root, watch.LOG, first=first, last=last, error=error)
+
+    def end(self) -> list[Event]:
+        """What was done since."""
+        self._shim.disarm()
+        return list(events(self._log))
+
+    def go(self, done: list[Event]) -> None:
+        """Take in what was done."""
+        for event in done:
+            self.apply(event)
+
+    def cut(self, name: str, rng: random.Random) -> str:
+        """Pull the plug of a machine; how its disk was left."""
+        style = rng.choice(STYLES)
+        path = self._cleared(name)
+        node = self.top.now[name]
+        assert isinstance(node, Folder)
+        _rebuild(node, path, rng, style)
+        self.settle(name)
+        return style
+
+    def kill(self, name: str) -> None:
+        """Have a machine's files be what was written to them so far, none safer than it was."""
+        node = self.top.now[name]
+        assert isinstance(node, Folder)
+        self._write(node, self._cleared(name))
+
+    def _cleared(self, name: str) -> Path:
+        path = self.root / name
+        shutil.rmtree(path, ignore_errors=True)
+        return path
+
+    def _write(self, folder: Folder, to: Path) -> None:
+        to.mkdir()
+        for name, node in folder.now.items():
+            if isinstance(node, Folder):
+                self._write(node, to / name)
+                continue
+            data = bytearray(node.safe)
+            for change in node.since:
+                _apply(data, change)
+            (to / name).write_bytes(data)
+            self.inodes[(to / name).stat().st_ino] = node
+
+    def settle(self, name: str) -> None:
+        """Take a machine's files as they are now for safe."""
+        self.top.now[name] = self._scanned(self.root / name)
+        self.top.sync()
+
+
+class Job:
+    """A background commit that waits for its turn."""
+
+    def __init__(self, held: Held) -> None:
+        self._held = held
+
+    def wait(self) -> None:
+        """Do what waits."""
+        self._held.run()
+
+
+class Held:
+    """In the place of the thread of background commits: they run when the schedule says so, or never."""
+
+    at_once = False
+
+    def __init__(self, *_: Any) -> None:
+        self.jobs: list[Any] = []
+
+    def submit(self, job: Any) -> Job:
+        """Take a job."""
+        self.jobs.append(job)
+        if Held.at_once:
+            self.run()
+        return Job(self)
+
+    def run(self) -> None:
+        """Do all that waits."""
+        while self.jobs:
+            self.jobs.pop(0)()
+
+    def shutdown(self) -> None:
+        """As closing does: wait."""
+        self.run()
+
+
+class _Group:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def update_attributes(self, known: Mapping[str, Any]) -> None:
+        text = json.dumps({"attributes": known, "zarr_format": 3, "node_type": "group"})
+        (self._path / "zarr.json").write_text(text)
+
+
+def write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], level: int | None) -> Any:
+    """What zarr writes, file for file, a hundred times as fast; the arrays are of one chunk."""
+    path.mkdir()
+    for name, array in draft.arrays.items():
+        content = described[name]
+        plain: dict[str, Any] = {"name": "bytes"}
+        if content.plain.itemsize > 1:
+            plain["configuration"] = {"endian": "little"}
+        packer = [] if level is None else [{"name": "zstd", "configuration": {"level": level, "checksum": False}}]
+        about = ARRAY | {
+            "shape": list(content.plain_shape),
+            "data_type": content.plain.name,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(content.chunk)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "codecs": [plain, *packer],
+            "attributes": {"dtype": array.dtype.str},
+        }
+        (path / name).mkdir()
+        (path / name / "zarr.json").write_text(json.dumps(about))
+        places = list(content.places(content.chunk))
+        assert len(places) <= 1, "a simulated array has one chunk"
+        for place in places:
+            file = (path / name).joinpath("c", *map(str, place))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            data = np.ascontiguousarray(flat_bytes(array)).tobytes()
+            file.write_bytes(data if level is None else zstd.compress(data, level))
+    return _Group(path)
+
+
+def prepare() -> None:
+    """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
+    store.log_writer.AHEAD = AHEAD
+    store.rows.EVERY = store.journal.EVERY = EVERY
+    store.checkpoint_files._write_zarr = write_zarr
+    store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
+    store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
+
+
+def abandon(learner: Any) -> None:
+    """Let go of a memory as a process does that is killed: nothing more is written."""
+    held = learner._ledger.store
+    held._checkpoints._worker.jobs.clear()
+    with suppress(Exception):
+        at = held._journal._open
+        if at is not None:
+            at.log._file.close()
+        held._files.close()
+    if held._lock is not None:
+        held._lock._lock.release()
+    held._closed = True
+
+
+def flip(path: Path, rng: random.Random) -> None:
+    """One bit of a file becomes another."""
+    data = bytearray(path.read_bytes())
+    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    path.write_bytes(data)
+
+
+__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "prepare"]

@@ -184,6 +184,8 @@ class Cutting:
                 self.counts["begun, and found " + ("done" if state is candidates[1] else "not done")] += 1
             if self.rng.random() < 0.3:
                 operation = draw(self.rng, state, self.others, self.rng.choice(KINDS))
+                if operation[0] == "pack":  # the history that is cut reads its own again
+                    operation = ("pack", f"{operation[1]}-{self.disks}", *operation[2:])
                 state, foretold = after(state, operation, self.others)
                 if (result := perform(learner, operation, self.home)) != foretold or seen(learner) != expected(state):
                     self.failures.append(f"{where}: going on, {operation} gave {result}, expected {foretold}")

@@ -202,10 +202,7 @@ class _Destination:
     def merge(
         self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
     ) -> list[tuple[Head, str]]:
-        """Merge a memory, each touch once; its rows that are refused, and why. Raises StoreError, MismatchError.
-
-        clipped: contents that clipping made. source: of touches that say none.
-        """
+        """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge_sources`."""
         begun, processor = time.perf_counter(), time.process_time()
         try:
             ledger = self.opened()._ledger

@@ -271,7 +271,7 @@ class LogReader:
                     self.place = Place.behind(self._last)
                 else:
                     return
-                if batch or damage is None:
+                if batch:
                     yield batch
             raise damage
 

@@ -133,13 +133,13 @@ class LogWriter(LogReader):
         self._allocated = max(self._allocated, ahead)
         self._written, self._staged = end, bytearray()
 
-    def commit(self) -> None:
+    def commit(self, *, empty: bool = False) -> None:
         """Make the staged frames durable, all of them or none; without any it does nothing.
 
-        Raises StoreFullError or another StoreError, and then the log is as it was at the last commit.
+        empty: without any it ends an empty batch, which proves that what is before it was durable. Raises StoreFullError or another StoreError, and then the log is as it was at the last commit.
         """
         with self._writing, reported(self.path, "making a batch durable"):
-            if self._next == self.place:
+            if self._next == self.place and not empty:
                 return
             try:
                 last = self._pack(COMMIT, b"")
@@ -216,11 +216,14 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
             with os.fdopen(descriptor, "wb") as file:
                 file.write(pack_frame(os.urandom(IDENTITY_BYTES), 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
             with LogWriter(draft) as log:
+                count = 0
                 for count, (kind, payload) in enumerate(frames, 1):
                     log.stage(kind, payload)
                     if count % TOGETHER == 0:
                         log.commit()
                 log.commit()
+                # Its rows were durable one by one. All in a last batch, one damaged frame would be a torn tail.
+                log.commit(empty=count > 0)
             sync_file(draft)
             draft.replace(path)
             sync_folder(path.parent)

@@ -13,6 +13,7 @@ That it is harsh enough shows `--plant NAME`: the bug of that name (see planted.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import random
 import shutil
@@ -35,16 +36,16 @@ from faults.simulation_world import World
 from scroll_tactile.errors import RangeWarning
 
 WEIGHTS = {
-    "small": 34,
+    "small": 36,
     "batch": 6,
     "relabel": 4,
     "compact": 3,
     "reembed": 0.4,
     "tick": 6,
     "close": 4,
-    "cut": 4,
+    "cut": 3,
     "kill": 4,
-    "reader": 4,
+    "reader": 3,
     "refresh": 10,
     "leave": 2,
     "backup": 1.5,
@@ -116,6 +117,8 @@ class Simulation:
 
 def prepare() -> None:
     """Have everything small, quick and in the hands of the schedule."""
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 100)
     simulation_disk.prepare()
     simulation_world.prepare()
     warnings.simplefilter("ignore", RangeWarning)

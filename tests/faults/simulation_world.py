@@ -11,7 +11,8 @@ import functools
 import random
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 
 import scroll_tactile.memory.ledger
 import scroll_tactile.memory.state
+import store.backup
 from faults import simulation_model as model
 from faults.shim import Shim
 from faults.simulation_disk import Disks, Held, abandon, flip
@@ -99,6 +101,33 @@ def key_of(touch: int) -> bytes:
 EXPECTED = Expected(fed, key_of)
 
 
+@contextmanager
+def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
+    """While it lasts, do something just before the so many-th file is copied; 0: before the log is read."""
+    copy, reader = store.backup.copy_regular, store.backup.LogReader
+    left = [place] if place >= 0 else []
+
+    def due(now: bool) -> None:
+        if left and now:
+            left.clear()
+            between()
+
+    def copied(*given: Any) -> None:
+        due(left == [1])
+        left[:] = [count - 1 for count in left]
+        copy(*given)
+
+    def read(*given: Any, **named: Any) -> Any:
+        due(True)
+        return reader(*given, **named)
+
+    store.backup.copy_regular, store.backup.LogReader = copied, read  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        store.backup.copy_regular, store.backup.LogReader = copy, reader  # type: ignore[misc]
+
+
 class Wrong(Exception):
     """What must not be."""
 
@@ -116,7 +145,7 @@ class Machine:
     learner: Any = None
     readers: list[Any] = field(default_factory=list)
     sure: int = 0
-    copies: dict[Path, tuple[Rows, bool]] = field(default_factory=dict)
+    copies: dict[Path, tuple[list[Rows], bool]] = field(default_factory=dict)
     made: bool = False
 
     @property
@@ -204,6 +233,8 @@ class World:
         kind, about = ("", None) if either else self.fate(rng)
         Held.at_once = rng.random() < 0.3
         before, (after, foretold) = machine.rows, then
+        held = None if machine.learner is None else machine.learner._ledger.store
+        late = held is not None and held._checkpoints._failure is not None  # closing tells of it
         fail = None
         if kind == "full":
             first = 1 + int(about[0] ** 3 * 400) if rng.random() < 0.5 else rng.randint(1, 12)
@@ -229,13 +260,13 @@ class World:
         self.disks.go(done)
         if isinstance(result, StoreError):
             self.counts["refused by a full disk"] += kind == "full"
-            if kind != "full":
+            if kind != "full" and not (late and what.startswith(("close", "reembed"))):
                 raise Wrong(f"{what} said {result!r}")
             if after != before:
                 machine.candidates = [*machine.candidates, after]
             if machine.learner is not None and not machine.learner._ledger._closed:
                 self.look(machine, machine.learner, f"after {what} failed")
-                if machine.rows != before and not what.startswith("compact"):
+                if machine.rows != before and not what.startswith(("compact", "backup")):
                     raise Wrong(f"{what} said {result!r}, and was done")
             return None
         if either is not None and result == either[1]:
@@ -465,8 +496,23 @@ class World:
         if self.opened(machine, rng) is None:
             return
         rows, to = machine.rows, machine.path.with_name(f"copy-{self.step}")
-        done = self._do(machine, rng, f"backup {to.name}", lambda learner: learner.backup(to) or "done", lambda _: (rows, "done"))
-        machine.copies[to] = rows, done == "done"
+        # While it copies, the memory goes on.
+        then, place = rows, rng.choice((-1, 0, 1, 5, 20))
+        if place >= 0:
+            material, touch = rng.choice(MATERIALS), rng.randrange(TOUCHES)
+            then, sequence = model.observe(rows, material, touch, True)
+
+        def do(learner: Any) -> str:
+            def between() -> None:
+                learner.observe(material, stream(touch), again=True)
+                learner._ledger._snapshot()
+
+            with interleaved(place, between):
+                learner.backup(to)
+            return "done"
+
+        done = self._do(machine, rng, f"backup {to.name}, going on at {place}", do, lambda _: (then, "done"))
+        machine.copies[to] = [rows, then], done == "done"
 
     def _restore(self, machine: Machine, rng: random.Random) -> None:
         """A copy is whole; now and then it takes the memory's place."""
@@ -487,13 +533,13 @@ class World:
             shutil.copytree(path, machine.path)
             self.disks.end()
             self.disks.settle(machine.name)
-            machine.candidates, machine.sure = [rows], 0
+            machine.candidates, machine.sure = rows, 0
             machine.made = True
             self.say(f"  {machine.name}: restored {path.name}")
             self.counts["restored"] += 1
         else:
-            learner = self._open(machine, path, [rows], "read")
-            self.look(Machine(path.name, path, [rows]), learner, "a backup")
+            learner = self._open(machine, path, rows, "read")
+            self.look(Machine(path.name, path, rows), learner, "a backup")
             learner.close()
 
     # What goes from one memory to another.
@@ -706,9 +752,9 @@ class World:
     def finish(self, rng: random.Random) -> None:
         """The power of all is cut once more; then all is sound, and in one of the ways it may be."""
         for machine in self.machines:
-            self.crash(machine, rng, "cut")
             if not machine.made:
                 continue
+            self.crash(machine, rng, "cut")
             self.disks.begin()
             try:
                 machine.learner = self._open(machine, machine.path, machine.candidates)

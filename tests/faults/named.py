@@ -123,7 +123,8 @@ def sizes() -> dict[str, Named]:
 
     def special(name: str, *, pipe: bool) -> Named:
         def make(path: Path, _: Scene) -> None:
-            place = path / name.replace("ARRAY", str(group_of(path, newest(path)) / "rows-15"))
+            files = sorted(file for file in group_of(path, newest(path)).glob("*/c/0") if file.is_file())
+            place = path / name.replace("ARRAY", str(files[0].parents[1]))
             place.unlink(missing_ok=True)
             os.mkfifo(place) if pipe else place.symlink_to("/dev/zero")
 

@@ -98,6 +98,8 @@ def corpus(home: Path) -> list[Memory]:
             (home / "copy").rename(home / name)
         made.append(Memory(name, home / name, earlier[-1], earlier[:-1]))
     shutil.unpack_archive(GOLDEN, home / "golden")
+    with TactileLearner.open(home / "golden") as learner:  # closing it writes a checkpoint of all
+        learner.digest()
     with TactileLearner.open(home / "golden", mode="read") as learner:
         made.append(Memory("golden", home / "golden", glance(learner)))
     return made

@@ -12,7 +12,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from store.exceptions import DamageError, NotAStoreError, reported
-from store.files import open_regular, read_regular, remove_tree, sync_folder
+from store.files import is_file, open_regular, read_regular, remove_tree, sync_folder
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
 from store.log import LogFile
 
@@ -89,7 +89,7 @@ class Archive(Files):
             with os.fdopen(open_regular(self.folder, os.O_RDONLY), "rb") as file, zipfile.ZipFile(file) as listed:
                 entries = listed.infolist()
         except (zipfile.BadZipFile, ValueError, struct.error, NotImplementedError, OverflowError) as error:
-            raise NotAStoreError(f"{self.folder} is no packed store ({error}): {AGAIN}") from error
+            raise NotAStoreError(f"{self.folder} is a file, and no packed store ({error}): {AGAIN}") from error
         if not any(entry.filename == CURRENT_FILE for entry in entries):
             raise NotAStoreError(
                 f"{self.folder} is a zip, and no packed store: it holds no {CURRENT_FILE}. Give another path"
@@ -112,7 +112,7 @@ class Archive(Files):
         end = self._file.read(max(0, self._size - END.size), END.size)
         mark, size, comment = END.unpack(end) if len(end) == END.size else (b"", 0, 0)
         if not is_archive(self._file.read(0, ARCHIVE_BYTES)) or mark != b"PK\5\6" or comment:
-            raise NotAStoreError(f"{self.folder} is no packed store, or was cut off or added to: {AGAIN}")
+            raise NotAStoreError(f"{self.folder} is a file, and no packed store, or was cut off or added to: {AGAIN}")
         before = max(0, self._size - END.size - LOCATOR.size)
         locator = self._file.read(before, LOCATOR.size)
         if locator[:4] == b"PK\6\7":
@@ -173,7 +173,7 @@ def is_archive(begin: bytes) -> bool:
 
 def files_of(path: Path) -> Files:
     """Return the files of the store at `path`, a folder or a zip."""
-    return Archive(path) if path.is_file() else Files(path)
+    return Archive(path) if is_file(path) else Files(path)
 
 
 def write_archive(folder: Path, path: Path) -> None:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from store.exceptions import DamageError, NotAStoreError, StoreFullError
+from store.exceptions import DamageError, NotAStoreError
 
 try:
     import fcntl
@@ -23,12 +23,12 @@ __all__ = [
     "CAREFULLY",
     "copy_regular",
     "file_size",
+    "is_file",
     "is_real_folder",
     "is_there",
     "open_regular",
     "read_regular",
     "remove_tree",
-    "require_room",
     "same_folder",
     "store_folder",
     "sync_file",
@@ -112,6 +112,14 @@ def is_there(path: Path) -> bool:
         return False
 
 
+def is_file(path: Path) -> bool:
+    """Return whether a regular file is there, also by a link; not where nothing can be."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
 def is_real_folder(path: Path) -> bool:
     """Return whether a folder is there, and not a link to one."""
     try:
@@ -160,16 +168,6 @@ def open_regular(path: Path, flags: int) -> int:
         os.close(descriptor)
         raise DamageError(f"{path} is no regular file", path=path)
     return descriptor
-
-
-def require_room(folder: Path, *files: Path) -> None:
-    """Raise StoreFullError where `folder` has no room for copies of the files, which may be full of holes."""
-    size, free = sum(map(file_size, files)), shutil.disk_usage(folder).free
-    if size > free:
-        raise StoreFullError(
-            f"to read {files[0]} as it is takes a copy of {size} bytes, for which {folder} has no room ({free} are "
-            "free): free some, or, where it was only not closed, open the store to write and close it"
-        )
 
 
 def store_folder(path: str | os.PathLike[str]) -> Path:

@@ -27,7 +27,7 @@ from store.exceptions import (
     StoreError,
     reported,
 )
-from store.files import store_folder, sync_folder
+from store.files import is_file, store_folder, sync_folder
 from store.journal import Journal
 from store.layout import CHECKPOINTS, Current, holds_store, log_path, require_unshared, write_current
 from store.lock import WriterLock
@@ -72,9 +72,9 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        if folder.is_file() and mode == "write":
+        if is_file(folder) and mode == "write":
             raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
-        if not folder.is_file() and not holds_store(folder) and (mode == "read" or kept is None):
+        if not is_file(folder) and not holds_store(folder) and (mode == "read" or kept is None):
             hint = "" if mode == "read" else "; give an identity to make one"
             raise NotAStoreError(f"{folder} holds no store{hint}")
         return cls(folder, kept, mode)

@@ -193,7 +193,7 @@ def _disk(bench: _Bench, memory: str, sides: Sides, touches: int, whole: str, ro
     paths = {name: bench.folder / name for name in sides}
     taken = {name: disk_bytes(path) / MEGABYTE for name, path in paths.items()}
     bench.size(memory, "disk after closing", "MB", taken, whole)
-    rows = {name: disk_bytes(path, "journal*") / touches / 1e3 for name, path in paths.items()}
+    rows = {name: disk_bytes(path, "log-*") / touches / 1e3 for name, path in paths.items()}
     bench.size(memory, "journal, a touch with its readings", "kB", rows, row)
 
 

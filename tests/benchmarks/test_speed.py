@@ -105,7 +105,7 @@ def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(tmp_path
             for i in range(3):
                 worker.call("observe", touch=i)
             assert worker.memory() <= worker.memory("peak")
-    assert disk_bytes(tmp_path / "memory") > disk_bytes(tmp_path / "memory", "journal*") > 3 * 100 * 8
+    assert disk_bytes(tmp_path / "memory") > disk_bytes(tmp_path / "memory", "log-*") > 3 * 100 * 8
     assert READ_BYTES == NAME_BYTES
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from touches import SmallSample
 
 import scroll_tactile.memory.ledger
 import scroll_tactile.memory.state
@@ -31,7 +32,6 @@ from scroll_tactile.embeddings.protocol import Capabilities
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.prediction.features import FeatureExtractor
 from store import StoreError, check_store, repair_store
-from touches import SmallSample
 
 MACHINES = ("robot-1", "robot-2", "central")
 MATERIALS = ("a", "b", "ü")
@@ -270,7 +270,10 @@ class World:
                     raise Wrong(f"{what} said {result!r}, and was done")
             return None
         if either is not None and result == either[1]:
-            (after, foretold), self.counts["damaged on the way: the same"] = either, 1 + self.counts["damaged on the way: the same"]
+            (after, foretold), self.counts["damaged on the way: the same"] = (
+                either,
+                1 + self.counts["damaged on the way: the same"],
+            )
         if result != foretold:
             raise Wrong(f"{what} gave {result!r}, expected {foretold!r}")
         if after != before:
@@ -278,7 +281,9 @@ class World:
             machine.candidates = [after]
         return result
 
-    def look(self, machine: Machine, learner: Any, where: str, *, settle: bool = False, but: Sequence[str] = ()) -> None:
+    def look(
+        self, machine: Machine, learner: Any, where: str, *, settle: bool = False, but: Sequence[str] = ()
+    ) -> None:
         """What is seen of a memory is one of its candidates; settle: no other any more; but: what may differ."""
         found = model.seen(learner)
         differ = []
@@ -557,7 +562,9 @@ class World:
         drawn = rng.random()
         for _ in range(0 if drawn < 0.1 else 2 if drawn < 0.25 else 1):
             self.flying.append((self.step + rng.choice((0, 0, 1, 5, 20)), name, sent))
-        self.counts["packed memories lost" if drawn < 0.1 else "packed memories doubled" if drawn < 0.25 else "sent"] += 1
+        self.counts[
+            "packed memories lost" if drawn < 0.1 else "packed memories doubled" if drawn < 0.25 else "sent"
+        ] += 1
 
     def _listed(self, rng: random.Random) -> list[tuple[str, bytes, Rows]]:
         """The bucket as a listing says: some are missing, some old, some there twice."""

@@ -136,7 +136,9 @@ class LogWriter(LogReader):
     def commit(self, *, empty: bool = False) -> None:
         """Make the staged frames durable, all of them or none; without any it does nothing.
 
-        empty: without any it ends an empty batch, which proves that what is before it was durable. Raises StoreFullError or another StoreError, and then the log is as it was at the last commit.
+        empty: without any it ends an empty batch, which proves that what is before it was durable.
+
+        Raises StoreFullError or another StoreError, and then the log is as it was at the last commit.
         """
         with self._writing, reported(self.path, "making a batch durable"):
             if self._next == self.place and not empty:

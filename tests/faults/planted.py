@@ -9,26 +9,15 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import scroll_tactile.memory.ledger as ledger
-import scroll_tactile.memory.merge as merge
-import scroll_tactile.memory.packing as packing
-import store.backup as backup
-import store.checkpoint_files as checkpoint_files
-import store.checkpoints as checkpoints
-import store.chunks as chunks
-import store.journal as journal
-import store.layout as layout
-import store.log as log
-import store.log_writer as log_writer
-import store.repair as repair
-import store.rows as rows
+from scroll_tactile.memory import ledger, merge, packing
 from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.memory.state import Memory
+from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, log_writer, repair, rows
 from store.files import sync_file
 from store.layout import Current
 
@@ -42,7 +31,13 @@ class Patches:
     def __call__(self, where: Any, name: str, make: Callable[[Any], Any]) -> None:
         """Replace something by what `make` makes of it."""
         raw = vars(where)[name]
-        before = raw.__func__ if isinstance(raw, classmethod | staticmethod) else raw.fget if isinstance(raw, property) else raw
+        before = (
+            raw.__func__
+            if isinstance(raw, classmethod | staticmethod)
+            else raw.fget
+            if isinstance(raw, property)
+            else raw
+        )
         made = make(before)
         kind = type(raw) if isinstance(raw, classmethod | staticmethod | property) else None
         self._before.append((where, name, raw))
@@ -326,10 +321,8 @@ def _backup_looks_once(patch: Patches) -> None:
     def make(_: Any) -> Any:
         def copy(source: Path, draft: Path) -> None:
             current = layout.read_current(source / "CURRENT")
-            try:
+            with suppress(FileNotFoundError):
                 backup._copy_named(source, draft, current)
-            except FileNotFoundError:
-                pass
             layout.write_current(draft, layout.read_current(source / "CURRENT"))
 
         return copy

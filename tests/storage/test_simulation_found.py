@@ -4,10 +4,10 @@ import errno
 import os
 
 import pytest
+from touches import filled
 
 from store import DamageError, Store, repair_store
 from store.framing import MARK
-from touches import filled
 
 
 def test_packing_passes_over_what_a_failing_disk_does_not_let_go_of(tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from faults import simulation_model as model
+from faults.disks import Event
 from faults.shim import Shim
 from faults.simulation_disk import Disks, Held, abandon
 from faults.simulation_model import Rows
@@ -151,37 +152,47 @@ class World:
         self.say(f"  {machine.name}: {what}" + (f" [{kind} {about}]" if kind else "") + f" -> {result!r:.110}")
         self.counts[f"fate: {kind or 'none'}"] += 1
         if kind in ("cut", "kill"):
-            count = int(about * (len(done) + 1))
-            renames = [i for i, one in enumerate(done) if one.kind == "R"]
-            if renames and rng.random() < 0.5:  # where most depends on the order
-                count = max(0, min(len(done), rng.choice(renames) + rng.randint(-2, 3)))
-            self.disks.go(done[:count])
             machine.candidates = [before, *machine.candidates[1:]] + ([after] if after != before else [])
-            self.crash(machine, rng, kind)
+            self._strike(machine, rng, done, kind, about)
             return None
         self.disks.go(done)
         if isinstance(result, StoreError):
             self.counts["refused by a full disk"] += kind == "full"
             if kind != "full" and not (late and what.startswith(("close", "reembed"))):
                 raise Wrong(f"{what} said {result!r}")
-            if after != before:
-                machine.candidates = [*machine.candidates, after]
-            if machine.learner is not None and not machine.learner._ledger._closed:
-                self.look(machine, machine.learner, f"after {what} failed")
-                if machine.rows != before and not what.startswith(("compact", "backup")):
-                    raise Wrong(f"{what} said {result!r}, and was done")
+            self._refused(machine, what, after, result)
             return None
         if either is not None and result == either[1]:
-            (after, foretold), self.counts["damaged on the way: the same"] = (
-                either,
-                1 + self.counts["damaged on the way: the same"],
-            )
+            after, foretold = either
+            self.counts["damaged on the way: the same"] += 1
         if result != foretold:
             raise Wrong(f"{what} gave {result!r}, expected {foretold!r}")
         if after != before:
             machine.sure = min(len(before.rows), len(after.rows))
             machine.candidates = [after]
         return result
+
+    def _strike(self, machine: Machine, rng: random.Random, done: list[Event], kind: str, about: float) -> None:
+        """Cut what was done short, rather where its order matters most; now and then once more after opening."""
+        count = int(about * (len(done) + 1))
+        order = [i for i, one in enumerate(done) if one.kind in "RSF" and not one.path.count("/checkpoints/")]
+        if order and rng.random() < 0.5:
+            count = max(0, min(len(done), rng.choice(order) + rng.randint(0, 2)))
+        self.disks.go(done[:count])
+        self.crash(machine, rng, kind)
+        if kind == "kill" and rng.random() < 0.4 and self.opened(machine, rng) is not None:
+            self.counts["cut after a kill"] += 1
+            self.crash(machine, rng, "cut")
+
+    def _refused(self, machine: Machine, what: str, after: Rows, error: StoreError) -> None:
+        """What failed was not done, but may come back with a crash."""
+        before = machine.rows
+        if after != before:
+            machine.candidates = [*machine.candidates, after]
+        if machine.learner is not None and not machine.learner._ledger._closed:
+            self.look(machine, machine.learner, f"after {what} failed")
+            if machine.rows != before and not what.startswith(("compact", "backup")):
+                raise Wrong(f"{what} said {error!r}, and was done")
 
     def look(
         self, machine: Machine, learner: Any, where: str, *, settle: bool = False, but: Sequence[str] = ()

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from faults.simulation_bucket import Carrying
-from faults.simulation_disk import flip
+from faults.simulation_disk import abandon, flip
 from faults.simulation_model import Rows
+from faults.simulation_touches import MATERIALS, stream
 from faults.simulation_world import Machine, Wrong
 from store import StoreError, repair_store
 
@@ -116,10 +117,23 @@ class System(Carrying):
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
         # A row of another kind may be left out, too, such as one that took another back.
         if unlisted or base > whole.base:
-            self.counts["rot: repaired, with less"] += 1
-            self._replace(machine)
+            self._with_less(machine, rows)
             return
         machine.candidates, machine.sure = [rows], min(repair.kept, len(rows.rows))
+
+    def _with_less(self, machine: Machine, rows: Rows) -> None:
+        """A memory of which a repair left less knows still what it learned, and learns on."""
+        self.counts["rot: repaired, with less"] += 1
+        learner = self._open(machine, machine.path, [rows])
+        try:
+            for candidate in (rows, rows.plus(("observe", MATERIALS[0], 0))):
+                if candidate is not rows:
+                    learner.observe(MATERIALS[0], stream(0), again=True)
+                machine.candidates = [candidate]
+                self.look(machine, learner, "repaired with less", but=("listed", *KEPT))
+        finally:
+            abandon(learner)
+        self._replace(machine)  # nothing of this was written down
 
     def _replace(self, machine: Machine) -> None:
         """A new disk, and nothing on it."""

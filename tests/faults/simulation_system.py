@@ -13,6 +13,7 @@ from faults.simulation_model import Rows
 from faults.simulation_touches import MATERIALS, stream
 from faults.simulation_world import Machine, Wrong
 from store import StoreError, repair_store
+from store.layout import read_current
 
 KEPT = ("kept", "pool", "exemplars")
 
@@ -31,6 +32,7 @@ class System(Carrying):
         files = [one for one in files if one.name not in ("lock", "holder.json")]
         if not files:
             return
+        newest = read_current(machine.path / "CURRENT").newest
         first = [one for one in files if one.parent == machine.path]
         hurt = rng.choice(first if rng.random() < 0.6 else files)
         flip(hurt, rng)
@@ -75,9 +77,10 @@ class System(Carrying):
                 self.counts["rot: refused when it was read"] += 1
                 self.say(f"    reading what was opened: {error!r:.150}")
                 self.drop(machine)
-        self._repair(machine, whole, hurt)
+        self._repair(machine, whole, hurt, 0 if newest is None else newest.upto)
 
-    def _repair(self, machine: Machine, whole: Rows, hurt: Path) -> None:
+    def _repair(self, machine: Machine, whole: Rows, hurt: Path, contained: int) -> None:
+        """contained: the last row that the newest checkpoint contained."""
         refused = None
         self.disks.begin()
         try:
@@ -99,14 +102,15 @@ class System(Carrying):
         if repair.kept < whole.base:  # the base is lost: with it all that it stood for
             self._replace(machine)
             return
-        if hurt.name == "CURRENT" and repair.kept < len(whole.rows):
-            raise Wrong(f"a repair of CURRENT kept {repair.kept} of {len(whole.rows)} rows")
+        if repair.kept < len(whole.rows) and (not hurt.name.startswith("log-") or repair.kept < contained):
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows")
         try:
             learner = self._open(machine, machine.path, [rows], "read")
         except StoreError as error:
             raise Wrong(f"repaired after {hurt.name}, and not opened: {error!r}") from error
         base = learner._ledger.store.compacted
         listed = {each.sequence for each in learner.observations()}
+        heads = sum(1 for _ in learner._ledger.store.heads())
         learner.close()
         if base < rows.base:
             raise Wrong(f"a repair of {hurt.name} left the base at {base}, which was {rows.base}")
@@ -116,7 +120,7 @@ class System(Carrying):
         if len(unlisted) > 1:
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
         # A row of another kind may be left out, too, such as one that took another back.
-        if unlisted or base > whole.base:
+        if unlisted or base > whole.base or heads < len(rows.rows):
             self._with_less(machine, rows)
             return
         machine.candidates, machine.sure = [rows], min(repair.kept, len(rows.rows))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,8 @@ class System(Carrying):
         if base < rows.base:
             raise Wrong(f"a repair of {hurt.name} left the base at {base}, which was {rows.base}")
         if base > rows.base:
-            rows = rows.based(base)
+            # What a later row took back of those counts again: a warning tells of it at each opening.
+            rows = replace(rows, base=base, stands=rows.cut(base).based(base).stands)
         unlisted = {sequence for sequence, _ in rows.listed if sequence <= base and sequence not in listed}
         if len(unlisted) > 1:
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")

@@ -56,7 +56,7 @@ WEIGHTS = {
     "rot": 2.5,
     "quiet": 3,
 }
-QUICK_SEEDS = 24
+QUICK_SEEDS = 12
 QUICK_PLANTS = ("the log is not synced", "CURRENT is not synced", "a retraction is lost in a merge")
 Event = tuple[str, int]
 

@@ -352,7 +352,8 @@ class Survey:
         there = [log_path(self.folder, number) for number in log_numbers(self.folder)]
         newest = self.sound[0].upto if self.sound else 0
         found = [FoundLog(self.files, path, None, self.progress) for path in there or aside[-1:]]
-        best = max(found, key=lambda log: (log.compacted <= newest, log.last), default=None)
+        # Of two that tell as much the newer: the other may be what a compaction replaced.
+        best = max(reversed(found), key=lambda log: (log.compacted <= newest, log.last), default=None)
         for log in found:
             if log is not best:
                 log.close()

@@ -1,4 +1,4 @@
-"""Machines' disks in a simulation: all that is written goes through disks.py, and comes back as a power cut leaves it."""
+"""Machines' disks in a simulation: what is written goes through disks.py, and is left as a power cut leaves it."""
 
 from __future__ import annotations
 

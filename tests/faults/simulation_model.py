@@ -1,8 +1,8 @@
 """The dumb model of a simulated memory: the rows that were acknowledged, and what they must come to.
 
 A row is ("observe", material, touch), ("retract", sequences, material or ""), ("describe", material, constituents),
-("merge", pairs), what a compacted memory brought, or ("member", material, touch), a touch that it had. `fold` of them is
-a multiset of (material, touch), and what a memory without a path keeps of that is what must be seen.
+("merge", pairs), what a compacted memory brought, or ("member", material, touch), a touch that it had. All in all they
+are a multiset of (material, touch), and what a memory without a path keeps of that is what must be seen.
 """
 
 from __future__ import annotations

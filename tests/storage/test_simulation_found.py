@@ -56,3 +56,16 @@ def test_a_bit_of_a_repaired_log_does_not_take_its_rows_away_unnoticed(tmp_path)
     log.write_bytes(data)
     with pytest.raises(DamageError, match="proves that it was durable"):
         Store.open(path)
+
+
+def test_of_a_log_and_the_one_that_compaction_replaced_a_repair_takes_the_newer(tmp_path):
+    path = tmp_path / "store"
+    with Store.open(path, identity={}) as store:
+        store.append("row", "a", b"")
+        before = (path / "log-00000001").read_bytes()
+        store.compact({}, upto=1)
+    (path / "log-00000001").write_bytes(before)  # a power cut brought it back
+    (path / "CURRENT").unlink()
+    repair_store(path)
+    with Store.open(path) as store:
+        assert store.compacted == 1

@@ -6,7 +6,7 @@ import logging
 import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 from store.archive import Files
 from store.encoding import decode_payload
@@ -44,7 +44,7 @@ class _OpenLog:
 
     def __init__(self, files: Files, current: Current, *, write: bool) -> None:
         self._files, self.current, self.path = files, current, log_path(files.folder, current.log)
-        self.rows, self.first = Rows(), 0
+        self.rows, self.first, self._told = Rows(), 0, 0
         named = current.newest
         self.log = self._reader(None if named is None else named.place, write=write)
         try:
@@ -126,6 +126,12 @@ class _OpenLog:
             pass
         earlier.extend(self.rows)
         self.rows, self.read_all = earlier, True
+
+    def tell_damage(self) -> None:
+        """Log a warning, once, for all that is damaged among the rows that are known."""
+        for damage in () if self._told == len(self.rows.damage) else self.rows.damage.values():
+            logger.warning("%s; what was there is not found by its key", damage[0])
+        self._told = len(self.rows.damage)
 
     def drop_index(self) -> bool:
         """Read the log itself where an index was used, which may be wrong; whether one was."""
@@ -392,12 +398,16 @@ class Journal:
             raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
 
     def with_key(self, key: bytes) -> Iterator[Head]:
-        """Yield the rows of a key, but for damaged ones."""
+        """Yield the rows of a key, but for damaged ones, which a logged warning names."""
         with self._looking("looking for a key") as at:
             at.find(0)
+            at.tell_damage()
             for index in at.rows.with_key(key):
-                with suppress(DamageError):
+                try:
                     head = self._head(at, index)
+                except DamageError as damage:
+                    logger.warning("%s", damage)
+                else:
                     if head.key == key:
                         yield head
 

@@ -8,7 +8,7 @@ Of a memory that was closed, and of one left as after a crash. Each flip, on a c
    are retracted, and all must be right, or refused with a StoreError.
 
 Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Damage
-in the very last batch of the log looks as a power cut does (LOG.md): where the memory is then as it was before that,
+in the very last batch of the log looks as a power cut does (FORMAT.md): where the memory is then as it was before that,
 without a word, that is counted apart. An f* in a damaged checkpoint is gone, with the warning, where the base is taken;
 and with a damaged base, with a warning, exemplars are those that are left.
 """
@@ -33,7 +33,7 @@ import scroll_tactile.memory.ledger
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, Other, State, after, expected, opened, perform, seen, warm
 from faults.plans import prepare
-from store import StoreError
+from store import DamageError, StoreError
 
 try:
     from store import check_store
@@ -222,6 +222,14 @@ class Flipping:
                     state = then
             with warnings_told(lambda text: None), opened(path) as learner:
                 self._require(where, "opened at last", learner, state, right=True)
+        except DamageError as error:
+            # A touch that takes the place of one that was taken back may be one whose row is damaged.
+            try:
+                with warnings_told(lambda text: None), opened(path) as learner:
+                    learner.digest()
+            except Exception as still:
+                self.failures.append(f"{where}: could be opened, and no more after a retraction: {still!r}")
+            return f"{later}, later {type(error).__name__}"
         except Exception as error:
             self.failures.append(
                 f"{where}: could be opened, and no more after one of its observations was retracted: {error!r}"

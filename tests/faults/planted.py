@@ -182,7 +182,7 @@ def _commit_frame_first(patch: Patches) -> None:
                 raise
             self._last, self.place, self._settled = last, self._next, True
 
-        return lambda self, *, empty=False: whole(self, empty=True) if empty else _reported(self.path, commit, self)
+        return lambda self: _reported(self.path, commit, self)
 
     patch(log_writer.LogWriter, "commit", make)
 

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -69,3 +70,8 @@ def test_the_store_knows_nothing_of_touch():
     code = "import sys, store; print(*[n for n in sys.modules if n.split('.')[0] in ('scroll_tactile', 'torch')])"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert said.stdout.split() == []
+
+
+def test_the_newest_change_that_is_told_is_of_this_version():
+    text = (Path(scroll_tactile.__file__).parent / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (\S+)$", text, re.MULTILINE)[0] == scroll_tactile.__version__

@@ -156,7 +156,7 @@ def _repair(survey: Survey) -> Repair:
     path = log_path(folder, number)
     create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
     current = _current(path, number, plan)
-    aside = _move_aside(survey)
+    aside = _move_aside(survey, path)
     write_current(folder, current)
     remove_unnamed(folder, current)
     return Repair(plan.kept, _lost(survey, plan), aside)
@@ -201,8 +201,16 @@ def _current(path: Path, number: int, plan: _Plan) -> Current:
     return Current(number, identity, *named)
 
 
-def _move_aside(survey: Survey) -> Path | None:
-    """Rename what is damaged; return the log's new name, or the one that it had already, None where it is gone."""
+def _move_aside(survey: Survey, new: Path) -> Path | None:
+    """Rename what is damaged; return the log's new name, or the one that it had already, None where it is gone.
+
+    new: the log that takes its place. Without `CURRENT` nobody knows which of others was the damaged one.
+    """
+    others = log_numbers(survey.folder) if survey.current is None else []
+    for other in (log_path(survey.folder, number) for number in others):
+        if other not in (new, survey.log.path):
+            other.rename(_free_name(other))
+            sync_folder(survey.folder)
     for found in survey.checkpoints:
         if not found.sound and found.folder.exists():
             found.folder.rename(_free_name(found.folder))

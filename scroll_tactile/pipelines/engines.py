@@ -100,7 +100,7 @@ class Processes(Engine):
         pool.shutdown(wait=False)
 
     def _new(self) -> ProcessPoolExecutor:
-        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
+        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_begin, initargs=(dict(os.environ),))
         self._all.add(pool)
         return pool
 
@@ -116,8 +116,13 @@ class Processes(Engine):
             pool.shutdown(wait=kind is None, cancel_futures=True)
 
 
-def _end_with_parent() -> None:
-    """A worker whose parent was killed ends, too, and leaves arithmetic to one thread: there are others beside it."""
+def _begin(environment: dict[str, str]) -> None:
+    """Make a worker: of the environment that its parent has now, for a fork server keeps the one that it began with.
+
+    One whose parent was killed ends, too, and it leaves arithmetic to one thread: there are others beside it.
+    """
+    os.environ.clear()
+    os.environ.update(environment)
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)

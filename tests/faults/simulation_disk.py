@@ -24,7 +24,6 @@ from faults.disks import STYLES, Disk, Event, Folder, _apply, _rebuild, events
 from faults.shim import Shim
 from store.checkpoint_files import Draft
 from store.content import ArrayContent
-from store.encoding import flat_bytes
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
 EVERY = 4  # rows that are put into an index
@@ -162,7 +161,7 @@ def write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], 
         for place in places:
             file = (path / name).joinpath("c", *map(str, place))
             file.parent.mkdir(parents=True, exist_ok=True)
-            data = np.ascontiguousarray(flat_bytes(array)).tobytes()
+            data = np.ascontiguousarray(content.to_plain(array)).tobytes()
             file.write_bytes(data if level is None else zstd.compress(data, level))
     return _Group(path)
 

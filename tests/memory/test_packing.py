@@ -13,6 +13,7 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import MismatchError, ObservationError
 from scroll_tactile.memory.gate import MemoryStore, check_memory
 from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, VersionError, archive, check_store
+from store.framing import FRAME_BYTES
 
 HALVES = OBSERVED[:6], OBSERVED[6:]
 
@@ -199,7 +200,9 @@ class TestDamage:
         inside = listed._ranges
         described = [name for name in inside if name.count("/") == 3 and name.endswith("/zarr.json")]  # not read whole
         spare = described if pack else [name for name in inside if name.startswith("checkpoints")]
-        needed = [held for name, held in inside.items() if name not in spare]
+        # The frame that ends a log proves what is before it, and nothing proves that.
+        shorter = {name: FRAME_BYTES for name in inside if name.startswith("log-")}
+        needed = [(begin, size - shorter.get(name, 0)) for name, (begin, size) in inside.items() if name not in spare]
         within = [begin + int(draw.integers(size)) for begin, size in needed for _ in range(2 if pack else 20)]
         outside = [*range(30), *range(len(whole) - 60, len(whole)), *(begin - 30 for begin, _ in inside.values())]
         places = [*within, *outside, *draw.integers(0, len(whole), size=40).tolist()]

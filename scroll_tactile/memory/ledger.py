@@ -48,6 +48,7 @@ logger = logging.getLogger(__name__)
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
 SNAPSHOT_EVERY = 128  # rows between generations: opening embeds so many again in half a second
+LOOKS = 5  # of a reader at a memory that is written to meanwhile, before it is read anew
 MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a generation has all
 
 
@@ -442,14 +443,19 @@ class Ledger:
             memory, store = self.memory, self.store
             if store is None or store.mode == "write":
                 return False
-            if (store.newest, store.last) == (memory.generation, memory.sequence):
+            if (store.newest, store.last, store.compacted) == (memory.generation, memory.sequence, memory.base):
                 return False
             try:
-                if store.compacted == memory.base and store.last - memory.sequence <= SNAPSHOT_EVERY:
+                # A checkpoint that came between the reads may be of rows behind these, and hold an f* that was made
+                # before them.
+                for _ in range(LOOKS):
+                    if store.compacted != memory.base or store.last - memory.sequence > SNAPSHOT_EVERY:
+                        break
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
-                    return True
+                    if store.newest == memory.generation and store.compacted == memory.base:
+                        return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
             self._memory, self._whole = self._load(), True

@@ -35,6 +35,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
 
 _LOOKED = 2000  # messages are looked at to say what a bag holds
+_DEEPEST = 32  # lists of metadata.yaml within each other, of which recorders write six
 _LONGEST, _LISTS = 1 << 24, 1 << 16  # bytes of metadata.yaml; and of the part that lists files: two thousand of them
 
 _PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
@@ -225,6 +226,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         return there, False
     try:
         from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
+        from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
     except ImportError as error:
         raise missing("rosbags", "ros", "a ROS recording", cause=error) from error
     text = read_text(path, listed, _LONGEST)
@@ -233,8 +235,13 @@ def _files(path: Path) -> tuple[list[Path], bool]:
     lists = "".join(parts) if len(parts) == 2 else text
     if len(lists) > _LISTS:
         raise RecordingError(f"{listed} lists its files in {len(lists)} letters; expected at most {_LISTS}")
-    if any(isinstance(event, AliasEvent) for event in YAML(typ="safe").parse(lists)):
-        raise RecordingError(f"{listed} has aliases, which no recorder writes, and which can stand for any length")
+    depth = 0
+    for event in YAML(typ="safe").parse(lists):
+        if isinstance(event, AliasEvent):
+            raise RecordingError(f"{listed} has aliases, which no recorder writes, and which can stand for any length")
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        if depth > _DEEPEST:  # each level makes all that follows slower
+            raise RecordingError(f"{listed} has more than {_DEEPEST} lists within each other")
     about = YAML(typ="safe").load(lists)
     about = about if len(parts) == 2 else about["rosbag2_bagfile_information"]
     names = [str(name) for name in about["relative_file_paths"]]

@@ -177,6 +177,9 @@ BAGS: dict[str, Attack] = {
     "R7 db3: a view": db3(view),
     "R7 db3: generated": db3(generated),
     "R7 yaml: aliases": yaml(ALIASES),
+    "R7 yaml: lists within lists": yaml(
+        f"rosbag2_bagfile_information:\n  relative_file_paths:\n  - a.mcap\n  x: {'[' * 20_000}\n"
+    ),
     "R7 yaml: a FIFO": yaml_fifo,
     "R7 yaml: a name that climbs": yaml(
         "rosbag2_bagfile_information:\n  compression_mode: ''\n  relative_file_paths:\n    - ..\n"

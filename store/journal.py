@@ -130,7 +130,9 @@ class _OpenLog:
     def tell_damage(self) -> None:
         """Log a warning, once, for all that is damaged among the rows that are known."""
         for damage in () if self._told == len(self.rows.damage) else self.rows.damage.values():
-            logger.warning("%s; what was there is not found by its key", damage[0])
+            logger.warning(
+                "%s; what was there is passed over where rows of one kind, name or key are asked for", damage[0]
+            )
         self._told = len(self.rows.damage)
 
     def drop_index(self) -> bool:
@@ -350,16 +352,19 @@ class Journal:
                 index = at.find(after)
                 found = at.rows.sequences[index] if index < len(at.rows) else last + 1
                 try:
-                    if not chosen:
+                    if chosen:
+                        at.tell_damage()
+                    else:
                         self._require_no_gap(at, after, min(found - 1, last), index)
                     if found > last:
                         return
                     head = self._record(at, index) if arrays else self._head(at, index)
-                except DamageError:
+                except DamageError as damage:
                     if at.drop_index():
                         continue
                     if not chosen:
                         raise
+                    logger.warning("%s", damage)
             after = found
             if head is not None and kind in (None, head.kind) and label in (None, head.label):
                 yield head

@@ -215,15 +215,18 @@ class Readout:
         for material, rows, sign in changes:
             if sign > 0:
                 come.setdefault(material, []).append(rows - self.origin)
-        with one_thread():
-            self._hold_before(changes)
-            self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
-            for material, rows, sign in changes:
-                if sign < 0:
-                    place = self.places.get(material)
-                    if place is None or self.counts[place] <= len(rows):
-                        return False
-                    self._follow({material: rows - self.origin}, -1)
+        try:
+            with one_thread():
+                self._hold_before(changes)
+                self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
+                for material, rows, sign in changes:
+                    if sign < 0:
+                        place = self.places.get(material)
+                        if place is None or self.counts[place] <= len(rows):
+                            return False
+                        self._follow({material: rows - self.origin}, -1)
+        except np.linalg.LinAlgError:  # nearly all that it was solved from went
+            return False
         return self.system.sound
 
     def copy(self) -> Readout:

@@ -14,7 +14,7 @@ from uuid import uuid4
 from store.exceptions import DamageError, NotAStoreError, reported
 from store.files import is_file, open_regular, read_regular, remove_tree, sync_folder
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
-from store.log import LogFile
+from store.log import LogFile, LogReader, Place
 
 __all__ = ["ARCHIVE_BYTES", "Archive", "Files", "files_of", "is_archive", "write_archive"]
 
@@ -49,6 +49,15 @@ class Files:
     def open_log(self, path: Path) -> LogFile:
         """Open a log to read. Raises DamageError, OSError."""
         return LogFile(path, write=False)
+
+    def read_log(self, path: Path, *, place: Place | None = None, identity: bytes | None = None) -> LogReader:
+        """Open a log as `LogReader` does, whatever holds it; it is closed again where that fails."""
+        file = self.open_log(path)
+        try:
+            return LogReader(path, place=place, identity=identity, file=file)
+        except BaseException:
+            file.close()
+            raise
 
     def sizes(self, folder: Path) -> Iterator[int]:
         """Yield the bytes of each file below a folder."""

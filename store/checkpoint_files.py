@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from store.encoding import array_digest
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import remove_tree, sync_folder, sync_tree
 from store.layout import PARTIAL, checkpoint_path
-from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json
+from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
 
 if TYPE_CHECKING:
     import zarr
@@ -74,7 +72,7 @@ def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[
                 remove_tree(partial)
                 group = _write_zarr(partial, draft, described, None)
             known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
-            digest = _own_digest(known)
+            digest = json_digest(known)
             group.update_attributes(known | {"sha256": digest})
             try:
                 _read_attributes(partial / "zarr.json", Files(folder))
@@ -102,10 +100,6 @@ def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSO
         }
         for name, content in described.items()
     }
-
-
-def _own_digest(known: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
 def _write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], level: int | None) -> zarr.Group:
@@ -207,7 +201,7 @@ def _read_description(path: Path, files: Files) -> dict[str, Any]:
     try:
         known = _read_attributes(header, files)
         stored = known.pop("sha256", None)
-        sound = _own_digest(known) == stored
+        sound = json_digest(known) == stored
     except Exception as error:
         raise _unreadable(error, f"a checkpoint in {header}", header) from error
     # Before the version, which a flipped bit can make a newer one.

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any, BinaryIO
 
 from store.exceptions import DamageError, NotAStoreError
 
@@ -26,6 +26,7 @@ __all__ = [
     "is_file",
     "is_real_folder",
     "is_there",
+    "new_file",
     "open_regular",
     "read_regular",
     "remove_tree",
@@ -102,6 +103,13 @@ def remove_tree(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+
+
+def new_file(path: Path, mode: str = "wb") -> IO[Any]:
+    """Return a new file at `path`, open; what a writer that died left there is removed. Raises OSError."""
+    remove_tree(path)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY
+    return os.fdopen(os.open(path, flags, 0o666), mode, encoding=None if "b" in mode else "utf-8")
 
 
 def is_there(path: Path) -> bool:

@@ -66,14 +66,14 @@ class _OpenLog:
     def _reader(self, place: Place | None, *, write: bool) -> LogReader:
         """Return the log from a place on; where that is not in it a reader begins at the beginning."""
         try:
-            return LogReader(self.path, place=place, file=self._files.open_log(self.path))
+            return self._files.read_log(self.path, place=place)
         except DamageError as damage:
             if place is None:
                 raise
             if write:
                 raise DamageError(f"{damage}: repair the store (repair_store)", path=self.path) from damage
             logger.warning("%s; reading all of it", damage)
-            return LogReader(self.path, file=self._files.open_log(self.path))
+            return self._files.read_log(self.path)
 
     def _read_identity(self) -> dict[str, JSON]:
         try:
@@ -119,9 +119,9 @@ class _OpenLog:
             self._read_before()
         return bisect_right(self.rows.sequences, after)
 
-    def _read_before(self, *, indexed: bool = True) -> None:
+    def _read_before(self) -> None:
         until = self.places[0][1].offset
-        earlier = self.index.read(until) if indexed and not self._files.is_packed else Rows()
+        earlier = Rows() if self._files.is_packed else self.index.read(until)
         for _ in earlier.take(self.log.beginning_at(self.index.end), until):
             pass
         earlier.extend(self.rows)

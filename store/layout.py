@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -12,11 +11,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import CAREFULLY, is_real_folder, read_regular, remove_tree, sync_folder, sync_open
+from store.files import is_real_folder, new_file, read_regular, remove_tree, sync_folder, sync_open
 from store.framing import IDENTITY_BYTES
 from store.lock import HOLDER_FILE, LOCK_FILE
 from store.log import LogReader, Place
-from store.records import LARGEST_NUMBER, from_json
+from store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
     "CHECKPOINTS",
@@ -112,14 +111,14 @@ class Current:
             "newest": None if self.newest is None else self.newest.to_json(),
             "base": None if self.base is None else self.base.to_json(),
         }
-        return (json.dumps(known | {"sha256": _digest(known)}) + "\n").encode("ascii")
+        return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
 
     @classmethod
     def from_bytes(cls, data: bytes, path: Path) -> Self:
         """Return what `to_bytes` wrote. Raises VersionError for a newer format, DamageError for anything else."""
         try:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
-            if known.pop("sha256", None) != _digest(known):
+            if known.pop("sha256", None) != json_digest(known):
                 raise ValueError("its sha256 differs")
             if _count(known["format"]) > FORMAT_VERSION:
                 raise VersionError(
@@ -145,10 +144,6 @@ def _not_as_written(path: Path, error: Exception) -> DamageError:
         "checkpoints by themselves",
         path=path,
     )
-
-
-def _digest(known: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
 def _count(value: Any) -> int:
@@ -178,10 +173,8 @@ def write_current(folder: Path, current: Current) -> None:
     Everything that it names has to be durable.
     """
     draft = folder / (CURRENT_FILE + NEW)
-    remove_tree(draft)  # a writer that died may have left one
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY, 0o666)
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with new_file(draft) as file:
             file.write(current.to_bytes())
             file.flush()
             sync_open(file.fileno())

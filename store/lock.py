@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from store.exceptions import DamageError, LockedError, StoreError, reported
-from store.files import CAREFULLY, read_regular, remove_tree
+from store.files import CAREFULLY, new_file, read_regular
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -92,9 +92,7 @@ class WriterLock:
         since = datetime.now(UTC).isoformat(timespec="seconds")
         text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since})
         draft = self._folder / f"{HOLDER_FILE}.new"
-        remove_tree(draft)  # a writer that died may have left one
-        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY, 0o666)
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        with new_file(draft, "w") as file:
             file.write(text + "\n")
         draft.replace(self._folder / HOLDER_FILE)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from shutil import disk_usage
 
 from store.exceptions import FULL, RecordError, StoreClosedError, StoreError, reported
-from store.files import CAREFULLY, remove_tree, sync_file, sync_folder, sync_open
+from store.files import new_file, remove_tree, sync_file, sync_folder, sync_open
 from store.framing import (
     COMMIT,
     FRAME_BYTES,
@@ -218,9 +218,7 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
     draft = path.with_name(f"{path.name}.new")
     with reported(path, "making a log"):
         try:
-            remove_tree(draft)  # a writer that died may have left one
-            descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL | CAREFULLY, 0o666)
-            with os.fdopen(descriptor, "wb") as file:
+            with new_file(draft) as file:
                 file.write(pack_frame(os.urandom(IDENTITY_BYTES), 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
             with LogWriter(draft) as log:
                 count = 0

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -24,6 +24,7 @@ __all__ = [
     "check_text",
     "check_time",
     "from_json",
+    "json_digest",
     "payload_digest",
     "to_json",
 ]
@@ -171,6 +172,11 @@ def _plain(where: str, value: JSON) -> JSON:
             raise RecordError(f"{where} is {value!r}, which JSON cannot hold; use None or a string")
         return float(value)
     raise RecordError(f"{where} is a {type(value).__name__}, not JSON: convert it, or keep it as an array")
+
+
+def json_digest(known: Mapping[str, Any]) -> str:
+    """Return the sha256 of a JSON object, in hexadecimal: of its compact text in ASCII, keys sorted at every depth."""
+    return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
 def payload_digest(payload: bytes) -> bytes:

@@ -15,6 +15,7 @@ from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
 from store.layout import (
     DAMAGED,
+    LOG,
     Current,
     log_numbers,
     log_path,
@@ -165,7 +166,7 @@ def _repair(survey: Survey) -> Repair:
 def _put_aside(folder: Path) -> Iterator[int]:
     """Yield the numbers of logs that earlier repairs put aside."""
     for entry in folder.iterdir():
-        stem, dot, _ = entry.name.removeprefix(log_path(folder, 0).name.rstrip("0")).partition(DAMAGED)
+        stem, dot, _ = entry.name.removeprefix(LOG).partition(DAMAGED)
         if dot and stem.isascii() and stem.isdigit():
             yield int(stem)
 

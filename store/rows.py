@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import struct
 from array import array
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from store.exceptions import DamageError
-from store.files import CAREFULLY, read_regular, remove_tree
+from store.files import new_file, read_regular, remove_tree
 from store.framing import Frame
 from store.layout import DERIVED, NEW
 from store.log import LogReader, Place
@@ -194,9 +193,7 @@ class Index:
         self._folder.mkdir(exist_ok=True)
         path = self._path(begin)
         draft = path.with_name(path.name + NEW)
-        remove_tree(draft)
-        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY, 0o666)
-        with os.fdopen(descriptor, "wb") as file:
+        with new_file(draft) as file:
             file.write(data + payload_digest(data))
         draft.replace(path)
         self._segments, self.end = [*kept, _Segment(path, begin, end, count)], end

@@ -5,8 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -21,6 +20,7 @@ from store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
     DAMAGED,
+    LOG,
     NEW,
     PARTIAL,
     Current,
@@ -54,11 +54,6 @@ class Fault(enum.Enum):
     NO_ARRAYS = ("has lost its arrays", "have lost their arrays")
     DAMAGED_ARRAYS = ("has arrays that fail their checksum", "have arrays that fail their checksums")
     FOREIGN_ARRAYS = ("has arrays that were never written so", "have arrays that were never written so")
-
-    @property
-    def takes_head(self) -> bool:
-        """Whether not even the row without its arrays is left."""
-        return self in (Fault.MISSING, Fault.DAMAGED)
 
     def describe(self, first: int, last: int) -> str:
         """Return in words that rows `first` to `last` have this fault."""
@@ -153,7 +148,6 @@ class FoundLog:
         self, files: Files, path: Path, identity: bytes | None, progress: Progress, durable: Place | None = None
     ) -> None:
         self.path, self.damage = path, list[str]()
-        self._open = partial(files.open_log, path)
         self.identity: dict[str, JSON] | None = None
         self.rows: list[tuple[int, Fault | None]] = []
         self.torn, self.without_arrays = set[int](), set[int]()
@@ -161,8 +155,8 @@ class FoundLog:
         self._offsets: dict[int, tuple[int, int]] = {}
         self._reader: LogReader | None = None
         try:
-            known = find_identity(self._open()) if identity is None else identity
-            self._reader = LogReader(path, identity=known, file=self._open())
+            known = find_identity(files.open_log(path)) if identity is None else identity
+            self._reader = files.read_log(path, identity=known)
             self._reader.durable = durable
         except FileNotFoundError:
             self.damage.append(f"{path} is gone")
@@ -343,7 +337,7 @@ class Survey:
         """
         named, aside = log_path(self.folder, 1), list[Path]()
         if self.current is None:
-            aside = sorted(self.folder.glob(f"{log_path(self.folder, 0).name[:4]}*{DAMAGED}*"))
+            aside = sorted(self.folder.glob(f"{LOG}*{DAMAGED}*"))
         else:
             named = _or_aside(log_path(self.folder, self.current.log))
             if self.files.is_packed or named.exists():
@@ -366,9 +360,7 @@ class Survey:
         for i, found in enumerate(self.checkpoints):
             if found.sound and found.identity != self.identity:
                 wrong = DamageError(f"{found.folder} is a checkpoint of another store", path=found.folder)
-                self.checkpoints[i] = FoundCheckpoint(
-                    found.number, found.folder, found.named, found.is_base, [wrong], None
-                )
+                self.checkpoints[i] = replace(found, damage=[wrong], identity=None)
 
     def _find_faults(self) -> None:
         upto = max((found.upto for found in self.checkpoints), default=0)

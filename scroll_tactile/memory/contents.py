@@ -74,9 +74,8 @@ class StoredContents:
 
     def _standing(self, key: bytes) -> list[Head]:
         memory = self._memory()
-        gone = memory.retracted | memory.excluded
         found = (head for head in self._store.with_key(key) if head.kind in (OBSERVE, MEMBER))
-        return [head for head in found if head.sequence <= memory.sequence and head.sequence not in gone]
+        return [head for head in found if head.sequence <= memory.sequence and not memory.is_gone(head.sequence)]
 
     def names(self, key: bytes) -> list[str]:
         """As `Contents.names`."""

@@ -121,9 +121,8 @@ class Ledger:
         memory, store = self.memory, self.store
         if store is None or self._closed:
             return None if self._contents is None else self._contents.copy()
-        gone = memory.retracted | memory.excluded
         heads = itertools.takewhile(lambda head: head.sequence <= memory.sequence, _sound(store))
-        stand = (head for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence not in gone)
+        stand = (head for head in heads if head.kind in (OBSERVE, MEMBER) and not memory.is_gone(head.sequence))
         return Contents((head.label, head.key, head.sequence) for head in stand)
 
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:

@@ -329,6 +329,10 @@ class Memory:
         """
         return retracted_by(head for head in retractions if head.sequence <= upto) | self.retracted | self.excluded
 
+    def is_gone(self, sequence: int) -> bool:
+        """Whether this observation was retracted, as far as the memory itself knows."""
+        return sequence in self.retracted or sequence in self.excluded
+
     def require_base(self, store: Store) -> None:
         """Raise CompactedError where the store was compacted since this memory was read."""
         if store.compacted != self.base:

@@ -308,16 +308,15 @@ class Snapshot:
 
     def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Rows of each material, shape (C,)."""
-        found = self._statistics.counts(scale, names)  # first: what changes meanwhile is kept by then
-        for i, name in enumerate(names):
-            if name in self._kept:
-                found[i] = self._kept[name][scale][0]
-        return found
+        return self._as_kept(self._statistics.counts(scale, names), scale, names, 0)
 
     def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Sums of codes of each material, shape (C, d)."""
-        found = self._statistics.sums(scale, names)  # first: what changes meanwhile is kept by then
+        return self._as_kept(self._statistics.sums(scale, names), scale, names, 1)
+
+    def _as_kept(self, found: IntArray, scale: Scale, names: Sequence[str], which: int) -> IntArray:
+        """What was found of each material, or what was kept of it: what changed since then is kept by now."""
         for i, name in enumerate(names):
             if name in self._kept:
-                found[i] = self._kept[name][scale][1]
+                found[i] = self._kept[name][scale][which]
         return found

@@ -95,7 +95,9 @@ class Checkpoints:
             current = self._journal.current()
             named = self._write(draft, self._journal.place(draft.upto))
             if current.newest is None or named.upto >= current.newest.upto:
-                self._commit(replace(current, newest=named))
+                # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
+                # be on the disk all the same, and count after a crash.
+                self._journal.commit(replace(current, newest=named, last=self._journal.last()))
             self.remove_unnamed()
             self._journal.keep_index()
             return named.number
@@ -110,17 +112,6 @@ class Checkpoints:
         if number >= 10**MOST_DIGITS:
             raise DamageError(f"{self._folder} has a log or a checkpoint of number {number - 1}", path=self._folder)
         return number
-
-    def _commit(self, current: Current) -> None:
-        # When this fails all folders stay, for the next commit or open to remove: what could not be synced may be on
-        # the disk all the same, and count after a crash.
-        with reported(self._folder, "committing"):
-            try:
-                write_current(self._folder, current)
-            except BaseException:
-                self._journal.unsettle()
-                raise
-        self._journal.committed(current)
 
     def compact(self, draft: Draft, newest: Draft | None) -> None:
         """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
@@ -140,7 +131,7 @@ class Checkpoints:
                     remove_tree(path)
                     raise
                 with reported(self._folder, "committing"):
-                    write_current(self._folder, Current(number, identity, newest=named[-1], base=named[0]))
+                    write_current(self._folder, Current(number, identity, named[-1], named[0], self._journal.last()))
             self.remove_unnamed()
 
     def commit_later(self, draft: Draft) -> None:

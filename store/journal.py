@@ -7,12 +7,13 @@ import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from store.archive import Files
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
-from store.layout import CURRENT_FILE, Current, log_path
+from store.layout import CURRENT_FILE, Current, log_path, write_current
 from store.log import LogReader, Place
 from store.log_writer import LogWriter
 from store.records import JSON, Head, Record, from_json
@@ -57,6 +58,7 @@ class _OpenLog:
             self.read_all = self.first == 0
             self.places = [(self.first, self.log.place)]
             self.catch_up()
+            self._note_lost_end()
             if write:
                 self._begin_writing()
         except BaseException:
@@ -96,6 +98,12 @@ class _OpenLog:
         for behind in self.rows.take(self.log):
             self.note_place(behind)
 
+    def _note_lost_end(self) -> None:
+        """Take rows that `CURRENT` knows of, and that are no longer there, as damage behind the last one."""
+        if max(self.last_row, self.current.compacted) < self.current.last:
+            what = f"{self.path} ends with row {self.last_row}, and had row {self.current.last}: its end is damaged or "
+            self.rows.damage.setdefault(len(self.rows), []).append(DamageError(f"{what}was cut off", path=self.path))
+
     def note_place(self, place: Place) -> None:
         """Note the place behind all rows that are known."""
         self.places.append((self.last_row, place))
@@ -109,9 +117,9 @@ class _OpenLog:
 
     @property
     def last(self) -> int:
-        """The last row, or the last that a checkpoint contains, if later."""
-        # A checkpoint counts only when rows were lost: then their numbers must not be given out again.
-        return max([self.last_row, *(named.upto for named in self.current.checkpoints)])
+        """The last row, or the last that a checkpoint contains or `CURRENT` names, if later."""
+        # These count only when rows were lost: then their numbers must not be given out again.
+        return max([self.last_row, self.current.last, *(named.upto for named in self.current.checkpoints)])
 
     def find(self, after: int) -> int:
         """Return the index of the first row behind `after`, once all rows from there on are known."""
@@ -148,6 +156,7 @@ class _OpenLog:
         for _ in self.rows.take(self.log.beginning_at(self.log.beginning), end):
             pass
         self.rows.extend(staged)
+        self._note_lost_end()
         return True
 
     def keep_index(self) -> None:
@@ -178,7 +187,7 @@ class Journal:
 
     def __init__(self, files: Files, *, write: bool) -> None:
         self._files, self.folder, self._write = files, files.folder, write
-        self._guard = threading.RLock()
+        self._guard, self._naming = threading.RLock(), threading.Lock()
         self._batch = self._failed = False
         self._unsettled = False
         with reported(self.folder, "opening the journal"):
@@ -220,11 +229,6 @@ class Journal:
             at.log.close()
         self._unsettled = False
 
-    def unsettle(self) -> None:
-        """Take note that `CURRENT` may be another than before, or only in the system's memory."""
-        with self._guard:
-            self._unsettled = True
-
     @contextmanager
     def _looking(self, doing: str) -> Iterator[_OpenLog]:
         """The log in use, of a reader after it has read what was committed since."""
@@ -257,10 +261,30 @@ class Journal:
         with self._looking("looking for checkpoints") as at:
             return at.current
 
-    def committed(self, current: Current) -> None:
-        """Take note of what was just written as `CURRENT`, with the same log."""
+    def commit(self, current: Current) -> None:
+        """Write `CURRENT`, with the same log."""
+        with reported(self.folder, "committing"):
+            try:
+                with self._naming:
+                    write_current(self.folder, current)
+            except BaseException:
+                # It may be another than before, or only in the system's memory.
+                with self._guard:
+                    self._unsettled = True
+                raise
         with self._using("committing") as at:
             at.current = current
+
+    def _note_last(self, at: _OpenLog) -> None:
+        """Have `CURRENT` say which row is the last, so that a log that is cut off later is not taken for whole."""
+        try:
+            with self._naming:
+                if replace(self._files.current(), last=0) == replace(at.current, last=0):
+                    current = replace(at.current, last=at.last)
+                    write_current(self.folder, current)
+                    at.current = current
+        except (OSError, StoreError) as error:  # nothing is lost but this knowledge
+            logger.warning("%s could not say that row %d is the last: %s", self.folder / CURRENT_FILE, at.last, error)
 
     def last(self) -> int:
         """Return the sequence of the last row, or the last that a checkpoint contains, if later; or 0."""
@@ -288,6 +312,7 @@ class Journal:
                 raise
             finally:
                 self._batch = False
+            self._note_first(at)
 
     def refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -322,7 +347,14 @@ class Journal:
                 self._failed = True
                 self._undo(at, writer)
                 raise
+            if not self._batch:
+                self._note_first(at)
             return sequence
+
+    def _note_first(self, at: _OpenLog) -> None:
+        """Have `CURRENT` say that the log has rows, as soon as that is so: without any it would look like a new one."""
+        if not at.current.last and at.last_row:
+            self._note_last(at)
 
     @staticmethod
     def _undo(at: _OpenLog, writer: LogWriter) -> None:
@@ -475,8 +507,10 @@ class Journal:
             return at.log.size
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
+        """Close the file, of which `CURRENT` says where it ends; a second call does nothing."""
         with self._guard, reported(self.folder, "closing the journal"):
             at, self._open = self._open, None
             if at is not None:
+                if self._write and at.current.last < at.last_row:
+                    self._note_last(at)
                 at.log.close()

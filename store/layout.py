@@ -85,12 +85,14 @@ class Current:
 
     log: the number of the log, and log_identity what all frames of it carry. newest: the checkpoint to begin with.
     base: the one that stands for the rows that gave up their arrays; it may be the same. None where there is none.
+    last: a row that the log has had; one that ends before it was cut off. 0 where nothing is known.
     """
 
     log: int
     log_identity: bytes
     newest: NamedCheckpoint | None = None
     base: NamedCheckpoint | None = None
+    last: int = 0
 
     @property
     def checkpoints(self) -> list[NamedCheckpoint]:
@@ -110,6 +112,7 @@ class Current:
             "log": [self.log, self.log_identity.hex()],
             "newest": None if self.newest is None else self.newest.to_json(),
             "base": None if self.base is None else self.base.to_json(),
+            "last": self.last,
         }
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
 
@@ -126,8 +129,9 @@ class Current:
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
             number, identity = known["log"]
-            named = [None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES]
-            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), *named)
+            newest, base = (None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES)
+            last = _count(known.get("last", 0))
+            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, base, last)
             if current.base is not None and (current.newest is None or current.newest.upto < current.base.upto):
                 raise ValueError("its base is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:

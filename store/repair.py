@@ -195,11 +195,11 @@ def _current(path: Path, number: int, plan: _Plan) -> Current:
     """Return what `CURRENT` is to say, after the new log was read back. Raises DamageError."""
     found = [plan.start, plan.standing]
     identity, places = read_back(path, [0 if each is None else each.upto for each in found])
-    named = [
+    newest, base = [
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)
     ]
-    return Current(number, identity, *named)
+    return Current(number, identity, newest, base, plan.kept)
 
 
 def _move_aside(survey: Survey, new: Path) -> Path | None:

@@ -363,7 +363,7 @@ class Survey:
                 self.checkpoints[i] = replace(found, damage=[wrong], identity=None)
 
     def _find_faults(self) -> None:
-        upto = max((found.upto for found in self.checkpoints), default=0)
+        known = 0 if self.current is None else self.current.last
         self.faults: list[tuple[int, int, Fault]] = []
         before = 0
         for sequence, fault in self.log.rows:
@@ -373,7 +373,7 @@ class Survey:
             elif sequence > self.compacted and sequence in self.log.without_arrays:
                 self._note(sequence, sequence, Fault.NO_ARRAYS)
             before = sequence
-        self.last = max(before, upto)
+        self.last = max([before, known, *(found.upto for found in self.checkpoints)])
         if before in self.log.torn:
             self.last = max(self.last, before + 1)
         self._note_gap(before, self.last)

@@ -144,8 +144,8 @@ def test_a_log_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, m
                     real(source, draft, current)
                 commit(writer.compact, 20)
                 if len(times) == 2:
-                    return
-            real(source, draft, current)
+                    return None
+            return real(source, draft, current)
 
         monkeypatch.setattr(store.backup, "_copy_named", and_then)
         writer.backup(tmp_path / "copy")

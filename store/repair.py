@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ from store.layout import (
 from store.lock import WriterLock
 from store.log_writer import create_log
 from store.records import to_json
-from store.row_encoding import ROW, decode_head, head_without_arrays
+from store.row_encoding import ROW, head_without_arrays
 from store.survey import Fault, FoundCheckpoint, Progress, Survey, require_store
 
 __all__ = ["Repair", "repair_store"]
@@ -125,7 +126,7 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
     if plan.fresh:
         lost.append(
             f"rows 1 to {plan.base} give up their arrays, {which} stands for them: none of them can be retracted any "
-            "more"
+            f"more{_counts_again(survey, plan)}"
         )
     if plan.kept < survey.last:
         behind = survey.faulty(newest + 1, survey.last)
@@ -143,6 +144,17 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
     return lost
 
 
+def _counts_again(survey: Survey, plan: _Plan) -> str:
+    """Return in words which rows, behind a base that is new, can have taken back one that it contains."""
+    behind = [sequence for sequence, _ in survey.log.rows if plan.base < sequence <= plan.kept]
+    if not behind:
+        return ""
+    kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
+    which = f"row {behind[0]}" if len(behind) == 1 else f"rows {behind[0]} to {behind[-1]}"
+    named = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    return f"; what {which} ({named}) took back of them counts again"
+
+
 def _repair(survey: Survey) -> Repair:
     if survey.identity is None:
         raise DamageError(
@@ -151,6 +163,7 @@ def _repair(survey: Survey) -> Repair:
             path=survey.log.path,
         )
     folder, plan = survey.folder, _Plan.of(survey)
+    lost = _lost(survey, plan)
     number = 1 + max([*log_numbers(folder, unfinished=True), *_put_aside(folder), 0])
     if log_path(folder, number) == survey.log.path:
         number += 1  # that of one which is gone
@@ -160,7 +173,7 @@ def _repair(survey: Survey) -> Repair:
     aside = _move_aside(survey, path)
     write_current(folder, current)
     remove_unnamed(folder, current)
-    return Repair(plan.kept, _lost(survey, plan), aside)
+    return Repair(plan.kept, lost, aside)
 
 
 def _put_aside(folder: Path) -> Iterator[int]:
@@ -186,9 +199,8 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
                     sequence=sequence,
                 ) from error
         elif fault is not Fault.DAMAGED:
-            data = survey.log.head_data(sequence)
-            with suppress(ValueError):
-                yield ROW, head_without_arrays(decode_head(data, survey.log.row_size(sequence)))
+            with suppress(DamageError):
+                yield ROW, head_without_arrays(survey.log.head(sequence))
 
 
 def _current(path: Path, number: int, plan: _Plan) -> Current:

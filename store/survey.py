@@ -33,7 +33,7 @@ from store.layout import (
     strangers,
 )
 from store.log import LogReader, Place, find_identity
-from store.records import JSON, from_json
+from store.records import JSON, Head, from_json
 from store.row_encoding import ROW, decode_head, decode_row, row_sequence
 from store.rows import Rows, head_bytes
 
@@ -257,14 +257,15 @@ class FoundLog:
         assert self._reader is not None
         return self._reader.read(*self._offsets[sequence])[1]
 
-    def head_data(self, sequence: int) -> bytes:
-        """Return the bytes of a row's head, not verified."""
+    def head(self, sequence: int) -> Head:
+        """Return the head of a row. Raises DamageError where that does not verify."""
         assert self._reader is not None
-        return head_bytes(self._reader, *self._offsets[sequence])
-
-    def row_size(self, sequence: int) -> int:
-        """Return the bytes of a row."""
-        return self._offsets[sequence][1]
+        offset, size = self._offsets[sequence]
+        try:
+            return decode_head(head_bytes(self._reader, offset, size), size)
+        except ValueError as error:
+            what = f"the head of row {sequence} is not as it was written ({error})"
+            raise DamageError(f"{what} in {self.path}", path=self.path, sequence=sequence) from error
 
     def close(self) -> None:
         """Close the file."""

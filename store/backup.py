@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
-from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
+from store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
 from store.layout import (
     CURRENT_FILE,
     PARTIAL,
@@ -40,16 +40,10 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
     with reported(destination, "backing up a store"):
         destination.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(mkdtemp(prefix=f"{destination.name}.", suffix=PARTIAL, dir=destination.parent))
-        try:
+        with replacing(destination, draft):
             shutil.copymode(source, draft)
             _copy(source, draft)
             _verify(source, draft, progress)
-            sync_tree(draft)
-            draft.rename(destination)
-            sync_folder(destination.parent)
-        except BaseException:
-            remove_tree(draft)
-            raise
 
 
 def _copy(source: Path, draft: Path) -> None:

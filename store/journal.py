@@ -128,12 +128,19 @@ class _OpenLog:
         return bisect_right(self.rows.sequences, after)
 
     def _read_before(self) -> None:
-        until = self.places[0][1].offset
-        earlier = Rows() if self._files.is_packed else self.index.read(until)
-        for _ in earlier.take(self.log.beginning_at(self.index.end), until):
-            pass
+        earlier = self._rows_until(self.places[0][1].offset, indexed=not self._files.is_packed)
         earlier.extend(self.rows)
         self.rows, self.read_all = earlier, True
+
+    def _rows_until(self, until: int, *, indexed: bool) -> Rows:
+        """Return all rows before an offset, by the index as far as it goes and is of this log, if it may be used."""
+        self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
+        rows = self.index.read(until) if indexed else Rows()
+        if not self.log.has_place(self.index.end):
+            return self._rows_until(until, indexed=False)
+        for _ in rows.take(self.log.beginning_at(self.index.end), until):
+            pass
+        return rows
 
     def tell_damage(self) -> None:
         """Log a warning, once, for all that is damaged among the rows that are known."""
@@ -151,10 +158,7 @@ class _OpenLog:
         for row in zip(self.rows.sequences, self.rows.offsets, self.rows.sizes, self.rows.keys, strict=True):
             if row[1] >= end:
                 staged.append(*row)
-        self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
-        self.rows, self.first, self.read_all = Rows(), 0, True
-        for _ in self.rows.take(self.log.beginning_at(self.log.beginning), end):
-            pass
+        self.rows, self.first, self.read_all = self._rows_until(end, indexed=False), 0, True
         self.rows.extend(staged)
         self._note_lost_end()
         return True
@@ -439,14 +443,14 @@ class Journal:
         with self._looking("looking for a key") as at:
             at.find(0)
             at.tell_damage()
-            for index in at.rows.with_key(key):
-                try:
-                    head = self._head(at, index)
-                except DamageError as damage:
-                    logger.warning("%s", damage)
-                else:
+            sequences = [at.rows.sequences[index] for index in at.rows.with_key(key)]
+        for sequence in sequences:
+            try:
+                for head in self.rows(sequence - 1, sequence, arrays=False):
                     if head.key == key:
                         yield head
+            except DamageError as damage:
+                logger.warning("%s", damage)
 
     def keep_index(self) -> None:
         """Write what is known of the rows beside the log, so that nobody has to read it for that."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import is_real_folder, new_file, read_regular, remove_tree, sync_folder, sync_open
+from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
 from store.framing import IDENTITY_BYTES
 from store.lock import HOLDER_FILE, LOCK_FILE
 from store.log import LogReader, Place
@@ -177,16 +177,8 @@ def write_current(folder: Path, current: Current) -> None:
     Everything that it names has to be durable.
     """
     draft = folder / (CURRENT_FILE + NEW)
-    try:
-        with new_file(draft) as file:
-            file.write(current.to_bytes())
-            file.flush()
-            sync_open(file.fileno())
-        draft.replace(folder / CURRENT_FILE)
-    except BaseException:
-        remove_tree(draft)
-        raise
-    sync_folder(folder)
+    with replacing(folder / CURRENT_FILE, draft), new_file(draft) as file:
+        file.write(current.to_bytes())
 
 
 def log_path(folder: Path, number: int) -> Path:

@@ -114,13 +114,6 @@ class LogFile:
             )
         return found.st_size if self._end is None else self._end
 
-    def is_at(self, path: Path) -> bool:
-        """Return whether `path` still names this file."""
-        try:
-            return os.path.samestat(path.lstat(), os.fstat(self.descriptor))
-        except FileNotFoundError:
-            return False
-
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         with self._guard:
@@ -398,12 +391,6 @@ class LogReader:
         """The bytes of the file."""
         with reported(self.path, "measuring the log"):
             return self._file.size()
-
-    @property
-    def moved(self) -> bool:
-        """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
-        with reported(self.path, "looking for the log"):
-            return not self._file.is_at(self.path)
 
     @property
     def beginning(self) -> Place:

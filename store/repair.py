@@ -164,7 +164,7 @@ def _repair(survey: Survey) -> Repair:
         )
     folder, plan = survey.folder, _Plan.of(survey)
     lost = _lost(survey, plan)
-    number = 1 + max([*log_numbers(folder, unfinished=True), *_put_aside(folder), 0])
+    number = 1 + max([*log_numbers(folder, unfinished=True), *_numbers_aside(folder), 0])
     if log_path(folder, number) == survey.log.path:
         number += 1  # that of one which is gone
     path = log_path(folder, number)
@@ -176,7 +176,7 @@ def _repair(survey: Survey) -> Repair:
     return Repair(plan.kept, lost, aside)
 
 
-def _put_aside(folder: Path) -> Iterator[int]:
+def _numbers_aside(folder: Path) -> Iterator[int]:
     """Yield the numbers of logs that earlier repairs put aside."""
     for entry in folder.iterdir():
         stem, dot, _ = entry.name.removeprefix(LOG).partition(DAMAGED)
@@ -222,25 +222,22 @@ def _move_aside(survey: Survey, new: Path) -> Path | None:
     others = log_numbers(survey.folder) if survey.current is None else []
     for other in (log_path(survey.folder, number) for number in others):
         if other not in (new, survey.log.path):
-            other.rename(_free_name(other))
-            sync_folder(survey.folder)
+            _put_aside(other)
     for found in survey.checkpoints:
         if not found.sound and found.folder.exists():
-            found.folder.rename(_free_name(found.folder))
-            sync_folder(found.folder.parent)
+            _put_aside(found.folder)
     path = survey.log.path
     if not path.exists() or DAMAGED in path.name:
         return path if path.exists() else None
-    aside = _free_name(path)
-    path.rename(aside)
-    sync_folder(path.parent)
-    return aside
+    return _put_aside(path)
 
 
-def _free_name(path: Path) -> Path:
-    """Return the path with "damaged" behind its name, and a number where something is there already."""
+def _put_aside(path: Path) -> Path:
+    """Rename to, and return, the path with "damaged" behind its name, and a number where something is there already."""
     aside, count = path.with_name(path.name + DAMAGED), 1
     while os.path.lexists(aside):
         count += 1
         aside = path.with_name(f"{path.name}{DAMAGED}-{count}")
+    path.rename(aside)
+    sync_folder(path.parent)
     return aside

@@ -277,7 +277,8 @@ class Survey:
     """All that is found of a store, and whether it verifies.
 
     `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays a base
-    stands for, whether that base is sound or not. `last` is the last sequence of which there is any sign; `faults` are
+    stands for, whether that base is sound or not. `sound` are the checkpoints that recovery can resume from, the newest
+    first. `last` is the last sequence of which there is any sign; `faults` are
     the rows that do not verify, as (first, last, fault), ascending. A writer may be at work meanwhile. Raises
     VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
     against it.
@@ -295,6 +296,7 @@ class Survey:
         except DamageError as error:
             self.damage.append(Problem(error.path, str(error), "spare"))
         self.checkpoints = list(self._found())
+        self._sort_sound()
         self.log = self._found_log()
         self.identity = self.log.identity
         if self.identity is None and self.sound:
@@ -362,6 +364,7 @@ class Survey:
             if found.sound and found.identity != self.identity:
                 wrong = DamageError(f"{found.folder} is a checkpoint of another store", path=found.folder)
                 self.checkpoints[i] = replace(found, damage=[wrong], identity=None)
+        self._sort_sound()
 
     def _find_faults(self) -> None:
         known = 0 if self.current is None else self.current.last
@@ -398,11 +401,9 @@ class Survey:
             if max(begin, first) <= min(end, last)
         ]
 
-    @property
-    def sound(self) -> list[FoundCheckpoint]:
-        """The checkpoints that recovery can resume from, the newest first."""
+    def _sort_sound(self) -> None:
         found = [found for found in self.checkpoints if found.sound]
-        return sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
+        self.sound = sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
 
     @property
     def base(self) -> FoundCheckpoint | None:

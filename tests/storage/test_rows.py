@@ -79,6 +79,18 @@ def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, column):
         assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
 
 
+@pytest.mark.parametrize("field", [5, 6, 7])
+def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, field):
+    keys = made(tmp_path / "s")
+    file = files(tmp_path / "s")[-1]
+    data = file.read_bytes()[:-16]
+    head = list(HEADER.unpack_from(data))
+    head[field] = bytes(16) if field == 7 else head[field] - 1
+    data = HEADER.pack(*head) + data[HEADER.size :]
+    file.write_bytes(data + payload_digest(data))
+    require_all(tmp_path / "s", keys)
+
+
 def test_files_of_another_log_are_not_believed(tmp_path):
     made(tmp_path / "other", rows=60, seed=1)
     keys = made(tmp_path / "s")

@@ -15,7 +15,8 @@ from uuid import uuid4
 from store.exceptions import DamageError, NotAStoreError, reported
 from store.files import is_file, open_regular, read_regular, replacing
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
-from store.log import LogFile, LogReader, Place
+from store.log import LogReader, Place
+from store.log_file import LogFile
 
 __all__ = ["ARCHIVE_BYTES", "Archive", "Files", "files_of", "is_archive", "write_archive"]
 

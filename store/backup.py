@@ -11,6 +11,7 @@ from tempfile import mkdtemp
 
 from store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
 from store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
+from store.found_log import Progress
 from store.layout import (
     CURRENT_FILE,
     PARTIAL,
@@ -22,7 +23,7 @@ from store.layout import (
 )
 from store.log import LogReader
 from store.row_encoding import HEAD_BYTES, ROW, row_sequence
-from store.survey import Progress, check_store
+from store.survey import check_store
 
 __all__ = ["back_up"]
 

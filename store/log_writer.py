@@ -24,7 +24,8 @@ from store.framing import (
     pack_frame,
     read_frame,
 )
-from store.log import PART, LogReader, Place
+from store.log import LogReader, Place
+from store.log_file import PART
 
 __all__ = ["LogWriter", "create_log"]
 

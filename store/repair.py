@@ -14,6 +14,7 @@ from store.archive import Files
 from store.checkpoints import read_back
 from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
+from store.found_log import Fault, Progress
 from store.layout import (
     DAMAGED,
     LOG,
@@ -29,7 +30,7 @@ from store.lock import WriterLock
 from store.log_writer import create_log
 from store.records import to_json
 from store.row_encoding import ROW, head_without_arrays
-from store.survey import Fault, FoundCheckpoint, Progress, Survey, require_store
+from store.survey import FoundCheckpoint, Survey, require_store
 
 __all__ = ["Repair", "repair_store"]
 

@@ -28,13 +28,13 @@ from store.exceptions import (
     reported,
 )
 from store.files import is_file, store_folder, sync_folder
+from store.found_log import Progress
 from store.journal import Journal
 from store.layout import CHECKPOINTS, Current, holds_store, log_path, require_unshared, write_current
 from store.lock import WriterLock
 from store.log import LogReader
 from store.log_writer import create_log
 from store.records import JSON, Checkpoint, Head, Record, check_key, check_text, check_time, from_json, to_json
-from store.survey import Progress
 
 __all__ = ["Store"]
 

@@ -12,7 +12,8 @@ import store.log
 import store.log_writer
 from store import DamageError, RecordError, StoreClosedError, StoreError, VersionError
 from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
-from store.log import PART, LogReader, Place
+from store.log import LogReader, Place
+from store.log_file import PART
 from store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
 from store.records import payload_digest
 

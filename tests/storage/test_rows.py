@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-import store.journal
+import store.open_log
 import store.rows
 from store import Store
 from store.records import payload_digest
@@ -17,7 +17,7 @@ from store.rows import HEADER
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(store.rows, "EVERY", 8)
-    monkeypatch.setattr(store.journal, "EVERY", 8)
+    monkeypatch.setattr(store.open_log, "EVERY", 8)
 
 
 def made(path, rows=100, seed=0):

@@ -35,7 +35,7 @@ __all__ = [
     "read_current",
     "remove_unnamed",
     "require_unshared",
-    "strangers",
+    "unsafe_entries",
     "write_current",
 ]
 
@@ -45,7 +45,7 @@ LOG = "log-"
 CHECKPOINTS = "checkpoints"
 DERIVED = "derived"  # what follows from the rest, and can be deleted
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
-EARLIER_FILE = "journal.sqlite"  # of releases 0.x
+LEGACY_FILE = "journal.sqlite"  # of releases 0.x
 
 LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
 MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
@@ -225,7 +225,7 @@ def holds_store(folder: Path) -> bool:
             return False
         if not folder.is_dir():
             raise NotAStoreError(f"{folder} is a file; a store is a folder")
-        for error in strangers(folder):
+        for error in unsafe_entries(folder):
             raise error
         try:
             read_current(folder / CURRENT_FILE)
@@ -238,7 +238,7 @@ def holds_store(folder: Path) -> bool:
 
 
 def _refuse_foreign(folder: Path) -> None:
-    if (folder / EARLIER_FILE).exists():
+    if (folder / LEGACY_FILE).exists():
         raise VersionError(
             f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
             "recordings, or keep that release to read it"
@@ -275,7 +275,7 @@ def _may_be_ours(name: str) -> bool:
     return name.startswith((LOG, CURRENT_FILE, HOLDER_FILE)) or name in (LOCK_FILE, CHECKPOINTS, DERIVED)
 
 
-def strangers(folder: Path) -> Iterator[DamageError]:
+def unsafe_entries(folder: Path) -> Iterator[DamageError]:
     """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
 
     A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never

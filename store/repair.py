@@ -23,7 +23,7 @@ from store.layout import (
     log_path,
     remove_unnamed,
     require_unshared,
-    strangers,
+    unsafe_entries,
     write_current,
 )
 from store.lock import WriterLock
@@ -71,7 +71,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     folder = store_folder(path)
     require_store(folder)
     with reported(folder, "looking at the store"):
-        for error in strangers(folder):
+        for error in unsafe_entries(folder):
             raise error
     require_unshared(folder)
     lock = WriterLock(folder)
@@ -92,7 +92,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
 class _Plan:
     """Rows 1 to `kept` stay, those up to `base` without arrays.
 
-    `start` is the checkpoint to begin with, `standing` the one that stands for the rows up to `base`; `fresh` tells
+    `start` is the checkpoint to begin with, `stand_in` the one that stands for the rows up to `base`; `fresh` tells
     whether that is another than before.
     """
 
@@ -100,7 +100,7 @@ class _Plan:
     base: int
     fresh: bool
     start: FoundCheckpoint | None
-    standing: FoundCheckpoint | None
+    stand_in: FoundCheckpoint | None
 
     @classmethod
     def of(cls, survey: Survey) -> _Plan:
@@ -206,7 +206,7 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 
 def _current(path: Path, number: int, plan: _Plan) -> Current:
     """Return what `CURRENT` is to say, after the new log was read back. Raises DamageError."""
-    found = [plan.start, plan.standing]
+    found = [plan.start, plan.stand_in]
     identity, places = read_back(path, [0 if each is None else each.upto for each in found])
     newest, base = [
         None if each is None or each.named is None else replace(each.named, place=place)

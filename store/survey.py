@@ -29,7 +29,7 @@ from store.layout import (
     log_numbers,
     log_path,
     numbers,
-    strangers,
+    unsafe_entries,
 )
 from store.log import Place
 from store.records import JSON
@@ -69,7 +69,7 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
         files = files_of(folder)
         if not files.is_packed:
             require_store(folder)
-            if strange := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
+            if strange := [Problem(error.path, str(error), "lost") for error in unsafe_entries(folder)]:
                 return strange
         with closing(files):
             for _ in range(ATTEMPTS):

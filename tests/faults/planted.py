@@ -461,11 +461,11 @@ def _all(heads: Any) -> Any:
 
 
 def _retraction_lost_in_a_merge(patch: Patches) -> None:
-    patch(merge, "standing", lambda _: _all)
+    patch(merge, "active_rows", lambda _: _all)
 
 
 def _retraction_lost_in_packing(patch: Patches) -> None:
-    patch(packing, "standing", lambda _: _all)
+    patch(packing, "active_rows", lambda _: _all)
 
 
 def _shared_twice(patch: Patches) -> None:

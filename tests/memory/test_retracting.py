@@ -405,7 +405,7 @@ def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
     assert newest != base
     spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
-        assert learner.memory.generation == base
+        assert learner.memory.checkpoint == base
         require_same(learner, expected)
         learner.retract(later)
         require_same(learner, expected[:-1])
@@ -443,7 +443,7 @@ def test_a_base_of_a_base_still_knows_what_both_left_out(path, caplog):
     if newest != base:
         spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
-        assert learner.memory.generation == base
+        assert learner.memory.checkpoint == base
         require_same(learner, without(0))
     assert "still counts" not in caplog.text
 

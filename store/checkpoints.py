@@ -121,9 +121,9 @@ class Checkpoints:
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
                 try:
-                    create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
+                    identity = create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
                     drafts = [draft] if newest is None else [draft, newest]
-                    identity, places = read_back(path, [each.upto for each in drafts])
+                    places = read_back(path, [each.upto for each in drafts])
                     named = [self._write(each, place) for each, place in zip(drafts, places, strict=True)]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
                         raise damage
@@ -185,8 +185,8 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def read_back(path: Path, uptos: Sequence[int]) -> tuple[bytes, list[Place]]:
-    """Read a log that was just written; return its identity, and for each of these rows a place.
+def read_back(path: Path, uptos: Sequence[int]) -> list[Place]:
+    """Read a log that was just written; return for each of these rows a place.
 
     All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.
     """
@@ -199,4 +199,4 @@ def read_back(path: Path, uptos: Sequence[int]) -> tuple[bytes, list[Place]]:
             raise DamageError(
                 f"{path} does not read back as it was just written: its disk cannot be trusted", path=path
             )
-        return log.identity, found
+        return found

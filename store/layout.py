@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
+from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing, sync_folder
 from store.framing import IDENTITY_BYTES
-from store.lock import HOLDER_FILE, LOCK_FILE
+from store.lock import HOLDER_FILE, LOCK_FILE, WriterLock
 from store.log import LogReader, Place
+from store.log_writer import create_log
 from store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "checkpoint_path",
     "holds_store",
     "is_number",
+    "lock_to_write",
     "log_numbers",
     "log_path",
     "numbers",
@@ -235,6 +237,31 @@ def holds_store(folder: Path) -> bool:
         _refuse_foreign(folder)
         # Another process may have made the store since.
         return os.path.lexists(folder / CURRENT_FILE)
+
+
+def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
+    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
+
+    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
+    """
+    with reported(folder, "making the folder"):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(folder.parent)
+    require_unshared(folder)
+    lock = WriterLock(folder)
+    try:
+        # Asked again, under the lock: another writer may have made the store, and left, since.
+        if not holds_store(folder):
+            if identity is None:
+                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
+            with reported(folder, "making the store"):
+                write_current(folder, Current(1, create_log(log_path(folder, 1), identity.encode())))
+                sync_folder(folder.parent)
+    except BaseException:
+        lock.release()
+        raise
+    return lock
 
 
 def _refuse_foreign(folder: Path) -> None:

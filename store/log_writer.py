@@ -208,8 +208,8 @@ class LogWriter(LogReader):
         super().close()
 
 
-def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = ()) -> None:
-    """Put a new log, with these kinds and payloads, at `path`, whole and durable or not at all.
+def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = ()) -> bytes:
+    """Put a new log, with these kinds and payloads, at `path`, whole and durable or not at all; return its identity.
 
     header: of the caller, for good. A log that is there is replaced; readers keep it open as it was. Raises
     StoreFullError, ReadOnlyError or another StoreError.
@@ -217,9 +217,10 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
     if len(header) > LARGEST_PAYLOAD:
         raise RecordError(f"a log's first frame of {len(header)} bytes cannot be kept")
     draft = path.with_name(f"{path.name}.new")
+    identity = os.urandom(IDENTITY_BYTES)
     with reported(path, "making a log"), replacing(path, draft):
         with new_file(draft) as file:
-            file.write(pack_frame(os.urandom(IDENTITY_BYTES), 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
+            file.write(pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
         with LogWriter(draft) as log:
             count = 0
             for count, (kind, payload) in enumerate(frames, 1):
@@ -229,3 +230,4 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
             log.commit()
             if count:
                 log.seal()  # all of them were durable, and may be all that the log ever holds
+    return identity

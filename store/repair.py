@@ -19,6 +19,7 @@ from store.layout import (
     DAMAGED,
     LOG,
     Current,
+    NamedCheckpoint,
     log_numbers,
     log_path,
     remove_unnamed,
@@ -169,8 +170,8 @@ def _repair(survey: Survey) -> Repair:
     if log_path(folder, number) == survey.log.path:
         number += 1  # that of one which is gone
     path = log_path(folder, number)
-    create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
-    current = _current(path, number, plan)
+    identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
+    current = Current(number, identity, *_checkpoints(path, plan), plan.kept)
     aside = _move_aside(survey, path)
     write_current(folder, current)
     remove_unnamed(folder, current)
@@ -204,15 +205,15 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
                 yield ROW, head_without_arrays(survey.log.head(sequence))
 
 
-def _current(path: Path, number: int, plan: _Plan) -> Current:
-    """Return what `CURRENT` is to say, after the new log was read back. Raises DamageError."""
+def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
+    """Return the newest checkpoint and the base, with places in the new log, which is read back. Raises DamageError."""
     found = [plan.start, plan.stand_in]
-    identity, places = read_back(path, [0 if each is None else each.upto for each in found])
-    newest, base = [
+    places = read_back(path, [0 if each is None else each.upto for each in found])
+    newest, base = (
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)
-    ]
-    return Current(number, identity, newest, base, plan.kept)
+    )
+    return newest, base
 
 
 def _move_aside(survey: Survey, new: Path) -> Path | None:

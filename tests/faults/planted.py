@@ -99,11 +99,11 @@ def _no_sync_of_the_log(patch: Patches) -> None:
 
 def _no_sync_of_a_new_log(patch: Patches) -> None:
     def make(create: Any) -> Any:
-        def created(*given: Any, **named: Any) -> None:
+        def created(*given: Any, **named: Any) -> Any:
             before = log_writer.sync_open, log_writer.replacing
             log_writer.sync_open, log_writer.replacing = nothing(None), unsynced(None)
             try:
-                create(*given, **named)
+                return create(*given, **named)
             finally:
                 log_writer.sync_open, log_writer.replacing = before
 

@@ -7,15 +7,13 @@ import zipfile
 
 import numpy as np
 import pytest
-from touches import OBSERVED, PAD, SETTINGS, contents, fed, filled, require_same, spoil, stream
+from touches import OBSERVED, SETTINGS, contents, fed, filled, require_same, spoil, stream
 
-from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.errors import MismatchError, ObservationError
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.gate import MemoryStore, check_memory
 from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, VersionError, archive, check_store
 from store.framing import FRAME_BYTES
-
-HALVES = OBSERVED[:6], OBSERVED[6:]
 
 
 def packed(folder, observed, name="p", described=(), pack=None, **settings):
@@ -29,19 +27,6 @@ def packed(folder, observed, name="p", described=(), pack=None, **settings):
 
 
 class TestMerging:
-    @pytest.mark.parametrize("rows", [True, False])
-    def test_what_was_packed_is_merged_to_the_same_bytes(self, tmp_path, rows):
-        file = packed(tmp_path, HALVES[1], pack={"rows": rows})
-        learner, _ = filled(tmp_path / "m", HALVES[0])
-        with learner:
-            done = learner.merge(file, shared="once")
-            assert (done.observations, done.shared) == (6, 0)
-            require_same(learner, OBSERVED)
-            states = [row.state for row in learner.observations()]
-            assert states == ["kept"] * 6 + ["kept" if rows else "compacted"] * 6
-        with TactileLearner.open(tmp_path / "m") as again:
-            require_same(again, OBSERVED)
-
     def test_rows_can_be_retracted_where_they_were_merged_and_after_a_checkpoint_was_lost(self, tmp_path):
         file = packed(tmp_path, OBSERVED)
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
@@ -51,23 +36,6 @@ class TestMerging:
         spoil(tmp_path / "m", 1)
         with TactileLearner.open(tmp_path / "m") as again:
             require_same(again, OBSERVED[1:])
-
-    def test_what_both_observed_counts_once_or_twice(self, tmp_path):
-        file = packed(tmp_path, OBSERVED[3:9])
-        for shared, expected in (("once", OBSERVED[:9]), ("twice", [*OBSERVED[:6], *OBSERVED[3:9]])):
-            learner, _ = filled(tmp_path / shared, OBSERVED[:6])
-            with learner:
-                done = learner.merge(file, shared=shared)
-                assert (done.observations, done.shared) == (3 if shared == "once" else 6, 3)
-                assert learner.digest() == fed(expected, again=True).digest()
-
-    def test_touches_without_rows_cannot_be_counted_once(self, tmp_path):
-        file = packed(tmp_path, OBSERVED[3:9], pack={"rows": False})
-        learner, _ = filled(tmp_path / "m", OBSERVED[:6])
-        with learner:
-            with pytest.raises(ObservationError, match="cannot be counted once"):
-                learner.merge(file, shared="once")
-            require_same(learner, OBSERVED[:6])
 
     def test_descriptions_sources_and_times_travel_and_what_was_retracted_stays(self, tmp_path):
         with TactileLearner.open(tmp_path / "robot", **SETTINGS) as robot:
@@ -101,34 +69,6 @@ class TestMerging:
                 learner.merge(file, shared="once")
             assert learner.materials == {}
 
-    def test_a_compacted_memory_is_packed_as_its_sums(self, tmp_path):
-        learner, _ = filled(tmp_path / "robot", HALVES[1])
-        with learner:
-            learner.compact(keep=2)
-            learner.pack(tmp_path / "p")
-        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-            learner.merge(tmp_path / "p", shared="once")
-            require_same(learner, HALVES[1])
-            assert [row.state for row in learner.observations()] == ["compacted"] * 6
-
-    @pytest.mark.parametrize(
-        "settings", [{"sensor": PAD.model_copy(update={"name": "q"})}, {"embedding": Kernels(seed=3)}]
-    )
-    def test_another_making_is_refused_by_name(self, tmp_path, settings):
-        file = packed(tmp_path, OBSERVED[:2], **settings)
-        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-            with pytest.raises(MismatchError, match=r"(sensor|embedding)s differ"):
-                learner.merge(file, shared="once")
-            assert learner.materials == {}
-
-    def test_a_memory_of_codes_alone_is_packed_with_them(self, tmp_path):
-        settings = {"exemplars": 0, "recall": 0}
-        file = packed(tmp_path, HALVES[1], **settings)
-        learner, _ = filled(tmp_path / "m", HALVES[0], **settings)
-        with learner:
-            learner.merge(file, shared="once")
-            assert contents(learner) == contents(fed(OBSERVED, **settings))
-
 
 class TestReading:
     @pytest.mark.parametrize("pack", [{}, {"rows": False}, {"readings": False}])
@@ -151,13 +91,6 @@ class TestReading:
         file = packed(tmp_path, OBSERVED[:2])
         with pytest.raises(NotAStoreError, match=r"opened with mode=\"read\", or merged"):
             TactileLearner.open(file)
-
-    def test_packing_what_was_packed_gives_the_same_memory(self, tmp_path):
-        file = packed(tmp_path, OBSERVED)
-        with TactileLearner.open(file, mode="read") as learner:
-            learner.pack(tmp_path / "again")
-        with TactileLearner.open(tmp_path / "again", mode="read") as learner:
-            require_same(learner, OBSERVED)
 
     def test_names_that_a_file_has_in_its_folder_lead_nowhere_else(self, tmp_path):
         file = packed(tmp_path, OBSERVED[:2])

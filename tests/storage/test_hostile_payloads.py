@@ -9,7 +9,7 @@ from forged import in_a_process, payload
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import zstd
-from store_builds import put_row, same_arrays
+from store_builds import put_row
 
 from store import DamageError, RecordError, Store, VersionError, check_store, encoding
 from store.encoding import decode_payload, encode_payload
@@ -117,11 +117,7 @@ ARRAYS = {
 }
 
 
-def test_a_payload_gives_back_its_arrays():
-    assert same_arrays(decode_payload(encode_payload(ARRAYS)), ARRAYS)
-
-
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=100)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_harmed_payload_is_refused_or_read_and_nothing_else(seed):
     rng, content = np.random.default_rng(seed), bytearray(encode_payload(ARRAYS))

@@ -34,11 +34,6 @@ class Gate:
         return self.write(parent, number, draft, identity)
 
 
-def test_only_the_current_one_is_kept(opened):
-    assert [opened.commit(ONE, upto=0) for _ in range(4)] == [1, 2, 3, 4]
-    assert folders(opened.path) == ["00000004"]
-
-
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
     gate = Gate(monkeypatch)
     opened.append("a", "b", b"")

@@ -208,7 +208,7 @@ def test_a_log_that_was_cut_off_gives_what_it_still_has(plain, first):
 LOGS = {
     # what is done to it; what is said of it; whether its rows still verify
     "gone": (lambda file: file.unlink(), "is gone", False),
-    "empty": (lambda file: file.write_bytes(b"", False), "does not begin as a log", False),
+    "empty": (lambda file: file.write_bytes(b""), "does not begin as a log", False),
     "a stub": (lambda file: file.write_bytes(file.read_bytes()[:80]), "does not begin as a log", False),
     "text": (lambda file: file.write_text("dear diary " * 900), "does not begin as a log", False),
     "zeros": (lambda file: file.write_bytes(bytes(500)), "does not begin as a log", False),

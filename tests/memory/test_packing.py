@@ -147,10 +147,6 @@ class TestDamage:
         within = [begin + int(draw.integers(size)) for begin, size in needed for _ in range(1 if pack else 8)]
         outside = [*range(0, 30, 3), *range(len(whole) - 60, len(whole), 4)]
         outside += [begin - 30 for begin, _ in inside.values()]
-            *range(0, 30, 3),
-            *range(len(whole) - 60, len(whole), 4),
-            *(begin - 30 for begin, _ in inside.values()),
-        ]
         places = [*within, *outside, *draw.integers(0, len(whole), size=15).tolist()]
         for place in places:
             flipped = bytearray(whole)

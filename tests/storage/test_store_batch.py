@@ -2,8 +2,6 @@
 
 import errno
 import os
-import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -81,36 +79,6 @@ def test_after_a_failed_append_none_is_there_whether_or_not_the_caller_goes_on(o
         opened.append("a", "large", b"", arrays={"x": noise})
     assert labels(opened) == ["before"]
     assert add(opened, "after") == [2]
-
-
-def test_other_threads_wait_and_their_rows_come_after(opened):
-    inside, done = threading.Event(), []
-
-    def other():
-        inside.wait(10)
-        done.append(("append", *add(opened, "theirs")))
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    with opened.batch():
-        add(opened, "one")
-        inside.set()
-        time.sleep(0.05)
-        assert done == []
-        add(opened, "two")
-    thread.join(10)
-    assert done == [("append", 4)]
-    assert labels(opened) == ["before", "one", "two", "theirs"]
-
-
-def test_a_reader_sees_nothing_of_it_until_it_ends(opened):
-    with Store.open(opened.path, mode="read") as reader:
-        with opened.batch():
-            add(opened, "one", "two")
-            assert reader.last == 1
-            assert labels(reader) == ["before"]
-            assert len(list(reader.heads())) == 1
-        assert labels(reader) == ["before", "one", "two"]
 
 
 ONE = {"x": np.arange(3)}

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from store_builds import as_after_a_crash, base, damage, flip_row, folders, log_of, rows
+from store_builds import as_after_a_crash, base, damage, flip_row, folders, log_of
 
 import store.checkpoints
 import store.layout
 from store import CompactedError, DamageError, RecordError, Store, StoreError, check_store
-from store.row_encoding import decode_row
 
 LAST = 12
 
@@ -62,10 +61,6 @@ def spoil(folder):
     chunk.write_bytes(chunk.read_bytes()[:-1])
 
 
-def payloads(path):
-    return [number for number, data in rows(path).items() if decode_row(data).payload is not None]
-
-
 def agrees(opened, compacted, last=LAST):
     assert (opened.last, opened.compacted) == (last, compacted)
     assert [head.label for head in opened.heads()] == [f"row {number}" for number in range(1, last + 1)]
@@ -80,21 +75,6 @@ def agrees(opened, compacted, last=LAST):
     else:
         assert found is None
     return True
-
-
-def test_rows_give_up_their_arrays_for_the_base_and_keep_their_heads(opened):
-    before = list(opened.heads())
-    compact(opened, 5, attributes={"made": "now"})
-    assert agrees(opened, 5)
-    assert list(opened.heads()) == before
-    assert payloads(opened.path) == list(range(6, LAST + 1))
-    assert opened.base().attributes == {"made": "now"}
-    assert opened.base().arrays["bulk"][100:102].tolist() == [5, 5]
-    assert opened.latest().upto == LAST
-    opened.close()
-    for mode in ("read", "write"):
-        with Store.open(opened.path, mode=mode) as again:
-            assert agrees(again, 5)
 
 
 def test_the_space_is_given_back_to_the_disk(opened):
@@ -140,15 +120,6 @@ def test_a_damaged_row_behind_the_base_is_named_and_nothing_is_given_up(opened):
     # Where the base stands for it, its arrays are given up anyway.
     compact(opened, 7)
     assert agrees(opened, 7)
-
-
-def test_a_lost_head_is_no_more_silently_left_out_than_a_row(opened):
-    opened.close()
-    flip_row(opened.path, 3)  # the checkpoint contains it: opening does not read it
-    with Store.open(opened.path) as again:
-        with pytest.raises(DamageError, match="repair the store"):
-            compact(again, 5)
-        assert (again.compacted, folders(again.path)) == (0, ["00000001"])
 
 
 @pytest.mark.parametrize("upto", [5, LAST])

@@ -31,7 +31,7 @@ from store import (
     check_store,
     repair_store,
 )
-from store.files import read_regular, same_folder
+from store.files import read_regular
 from store.lock import is_held
 
 LOG = "log-00000001"
@@ -99,15 +99,6 @@ def test_a_read_a_check_and_a_backup_leave_the_folder_as_it_is(left, tmp_path, u
     assert first == again
     if use != "check":
         assert len(first) >= LAST
-
-
-def test_beside_a_writer_no_file_is_new(tmp_path):
-    with Store.open(build(tmp_path / "s")) as writer:
-        add(writer, LAST + 1)
-        before = set(everything(writer.path))
-        assert read_all(writer.path)[-1] == f"row {LAST + 1}"
-        assert check_store(writer.path) == []
-        assert set(everything(writer.path)) == before
 
 
 # Links, pipes and other things that are no files.
@@ -315,14 +306,6 @@ def test_what_is_no_path_is_no_store(path):
     for call in (lambda: Store.open(path, identity={}), lambda: check_store(path), lambda: repair_store(path)):
         with pytest.raises(NotAStoreError):
             call()
-
-
-def test_one_folder_by_two_paths_is_the_same(tmp_path):
-    (tmp_path / "s").mkdir()
-    (tmp_path / "link").symlink_to("s")
-    assert same_folder(tmp_path / "s", tmp_path / "link")
-    assert same_folder(tmp_path / "none", tmp_path / "s" / ".." / "none")
-    assert not same_folder(tmp_path / "s", tmp_path)
 
 
 def test_numbers_at_the_end_of_all_numbers_are_damage_and_not_counted_on(tmp_path):

@@ -270,13 +270,6 @@ def test_damaged_logs_are_never_written_over(plain):
     assert agrees(plain, kept=17, latest=15)
 
 
-def test_progress_is_told(plain):
-    flip_row(plain, 18)
-    told = []
-    repair_store(plain, progress=lambda *step: told.append(step))
-    assert {"checkpoints", "rows written"} <= {what for what, _, _ in told}
-
-
 def test_while_a_writer_has_it_nothing_is_done(plain):
     with Store.open(plain):
         flip_row(plain, 18)

@@ -108,6 +108,12 @@ def test_a_payload_that_was_never_written_is_damage_at_its_row(plain, content):
     assert f"row {number}" in problem.what
 
 
+def test_arrays_in_a_newer_format_are_told_from_damage(plain):
+    put_row(plain, payload=payload([], version=2))
+    with Store.open(plain, mode="read") as opened, pytest.raises(VersionError, match=r"format 2; .* upgrade"):
+        list(opened.records())
+
+
 ARRAYS = {
     "levels": np.arange(4000, dtype=np.uint8).reshape(10, 400),
     "text": np.array(["wool", "silk ü"]),

@@ -239,6 +239,34 @@ def test_whatever_call_fails_all_that_was_acknowledged_is_there(made, tmp_path, 
     assert outcomes <= {(True, 5), (False, 0), (False, 5)}
 
 
+@pytest.mark.parametrize("name", ["replace", "fsync"])
+@pytest.mark.parametrize("after", [False, True])
+def test_whatever_call_of_a_commit_fails_the_store_goes_on(tmp_path, monkeypatch, name, after):
+    at = 0
+    while True:
+        at += 1
+        with Store.open(tmp_path / f"s{at}", identity={}) as opened:
+            add(opened, 1)
+            opened.commit(sums(0), upto=0)
+            with monkeypatch.context() as broken:
+                calls = failing(broken, name, at, OSError(errno.EIO, "the disk says no"), after=after)
+                try:
+                    opened.commit(sums(1), upto=1)
+                except StoreError as caught:
+                    assert "the disk says no" in str(caught)
+            if len(calls) < at:
+                break
+            assert opened.latest().upto in (0, 1)
+            # Both may be named on the disk until a sync has succeeded.
+            assert len(folders(opened.path)) >= 1
+            with Store.open(opened.path, mode="read") as reader:
+                assert reader.latest().upto == opened.latest().upto
+            add(opened, 2)
+            opened.commit(sums(2), upto=2)
+            assert len(folders(opened.path)) == 1
+        assert check_store(opened.path) == []
+
+
 def test_what_another_log_needs_is_durable_before_the_first_is_removed(opened, monkeypatch):
     """A power cut may undo whatever was not synced, in any order."""
     events = []

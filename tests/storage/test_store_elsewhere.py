@@ -31,7 +31,7 @@ from store import (
     check_store,
     repair_store,
 )
-from store.files import read_regular
+from store.files import read_regular, same_folder
 from store.lock import is_held
 
 LOG = "log-00000001"
@@ -306,6 +306,14 @@ def test_what_is_no_path_is_no_store(path):
     for call in (lambda: Store.open(path, identity={}), lambda: check_store(path), lambda: repair_store(path)):
         with pytest.raises(NotAStoreError):
             call()
+
+
+def test_one_folder_by_two_paths_is_the_same(tmp_path):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "link").symlink_to("s")
+    assert same_folder(tmp_path / "s", tmp_path / "link")
+    assert same_folder(tmp_path / "none", tmp_path / "s" / ".." / "none")
+    assert not same_folder(tmp_path / "s", tmp_path)
 
 
 def test_numbers_at_the_end_of_all_numbers_are_damage_and_not_counted_on(tmp_path):

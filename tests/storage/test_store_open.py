@@ -20,6 +20,7 @@ from store import (
     LockedError,
     NotAStoreError,
     ReadOnlyError,
+    RecordError,
     Store,
     StoreClosedError,
     StoreError,
@@ -175,6 +176,11 @@ def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_pa
     monkeypatch.setattr(store.layout, "read_current", not_yet)
     with Store.open(tmp_path / "s", mode="read") as opened:
         assert opened.last == 0
+
+
+def test_a_mode_is_read_or_write(tmp_path):
+    with pytest.raises(RecordError, match="append"):
+        Store.open(tmp_path, identity={}, mode="append")
 
 
 @pytest.mark.parametrize("died", ["os.replace", "store.store.write_current", "store.layout.sync_open"])

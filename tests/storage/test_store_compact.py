@@ -122,6 +122,15 @@ def test_a_damaged_row_behind_the_base_is_named_and_nothing_is_given_up(opened):
     assert agrees(opened, 7)
 
 
+def test_a_lost_head_is_no_more_silently_left_out_than_a_row(opened):
+    opened.close()
+    flip_row(opened.path, 3)  # the checkpoint contains it: opening does not read it
+    with Store.open(opened.path) as again:
+        with pytest.raises(DamageError, match="repair the store"):
+            compact(again, 5)
+        assert (again.compacted, folders(again.path)) == (0, ["00000001"])
+
+
 @pytest.mark.parametrize("upto", [5, LAST])
 def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, upto):
     """All its rows are one batch, which must not look as one that a power cut left."""

@@ -246,6 +246,26 @@ def test_only_a_regular_file_is_read_and_none_that_is_larger_than_it_may_be(tmp_
 
 # Rows that nobody wrote.
 
+FORGED = {
+    "nested JSON": {"attributes": '{"x":' + "[" * 100_000 + "]" * 100_000 + "}"},
+    "no JSON": {"attributes": "x"},
+    "a list": {"attributes": "[]"},
+    "a NUL in the label": {"label": "a\0b"},
+    "a NUL in the kind": {"kind": "a\0b"},
+    "a long key": {"key": bytes(65)},
+    "an endless time": {"time": float("inf")},
+}
+
+
+@pytest.mark.parametrize("what", FORGED)
+def test_a_forged_row_with_a_right_checksum_is_damage(tmp_path, what):
+    path = build(tmp_path / "s")
+    put_row(path, **FORGED[what])
+    with Store.open(path, mode="read") as reader, pytest.raises(DamageError) as caught:
+        list(reader.heads())
+    assert caught.value.sequence == LAST + 1
+    assert any(f"row {LAST + 1} fails" in problem.what for problem in check_store(path))
+
 
 # Locks and paths.
 

@@ -68,6 +68,34 @@ class TestOneContent:
 class TestChanges:
     """What is there is what was observed and not retracted, whatever was done in between."""
 
+    @pytest.mark.parametrize("again", ["retracted", "relabelled", "forgotten"])
+    def test_what_was_taken_back_and_compacted_is_learned_again(self, tmp_path, again):
+        learner, receipts = filled(tmp_path / "m", OBSERVED)
+        assert learner.names_of(stream((1, 60))) == ["b"]  # from here on what is there changes with the memory
+        gone = [1, 4, 7, 10] if again == "forgotten" else [1]
+        if again == "retracted":
+            learner.retract(receipts[1])
+        elif again == "forgotten":
+            learner.forget("b")
+        else:
+            learner.relabel(receipts[1], "z")
+        learner.compact(keep=2)
+        learner.observe("a", stream((50, 60)))
+        for mode in ("write", "read"):  # as it is now, and as `close` leaves it
+            assert [learner.names_of(stream(OBSERVED[i][1])) for i in gone] == (
+                [["z"]] if again == "relabelled" else [[]] * len(gone)
+            )
+            learner.compact()
+            learner.close()
+            learner = TactileLearner.open(tmp_path / "m", mode=mode)
+        learner.close()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            for times in range(2):
+                told = [learner.observe(*_given(OBSERVED[i])).repeated for i in gone]
+                assert told == [times == 1] * len(gone)
+            extra = [("z", (1, 60))] if again == "relabelled" else []
+            require_same(learner, [*OBSERVED, ("a", (50, 60)), *extra])
+
     def test_a_process_that_compacts_before_it_asks_is_told_what_is_there(self, tmp_path):
         filled(tmp_path / "m", OBSERVED)[0].close()
         with TactileLearner.open(tmp_path / "m") as learner:

@@ -3,7 +3,7 @@
 import csv
 
 import pytest
-from touches import OBSERVED, SETTINGS, fed, filled, require_same, spoil, stream
+from touches import OBSERVED, SETTINGS, filled, require_same, spoil, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
@@ -86,14 +86,6 @@ class TestMerge:
             require_same(ours, OBSERVED, SAID)
             assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
             require_same(ours, OBSERVED, other)
-
-
-def test_without_a_path_it_is_said_all_the_same():
-    learner = fed(OBSERVED, SAID)
-    sequence = learner.memory.sequence
-    learner.describe("c", {"silk": 1.0})
-    assert learner.memory.sequence == sequence == len(OBSERVED)
-    require_same(learner, OBSERVED, SAID | {"c": {"silk": 1.0}})
 
 
 def test_it_is_written_out_plain(path, tmp_path):

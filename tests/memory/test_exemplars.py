@@ -98,14 +98,6 @@ def test_scores_beyond_64_bits_are_still_compared_exactly():
     assert herd(rows, keys, np.full(width, -LARGEST), count + 1) == [*expected, count]
 
 
-def test_herding_stays_nearer_to_the_mean_than_chance():
-    rng = np.random.default_rng(0)
-    rows = rng.integers(-LARGEST, LARGEST, (60, 20))
-    mean = mean_code(rows.sum(axis=0), 60)
-    gap = np.linalg.norm(rows[herd(rows, keys_of(60), mean, 10)].mean(axis=0) - mean)
-    assert gap < 0.8 * min(np.linalg.norm(rng.permutation(rows)[:10].mean(axis=0) - mean) for _ in range(20))
-
-
 WRONG = {
     "floats": ((np.zeros((2, 3)), keys_of(2), np.zeros(3, int), 1), "float64"),
     "a mean of floats": ((np.zeros((2, 3), int), keys_of(2), np.zeros(3), 1), "float64"),
@@ -295,13 +287,6 @@ def test_the_buffer_is_herded_at_the_widest_scale_and_brief_touches_come_behind(
 
     assert [exemplar.key[0] for exemplar in rank(candidates, 6, means)["a"]] == [9, 1, 7, 8]
     assert asked == [("a", Scale("window", 20))]
-
-
-def test_no_candidates_make_no_buffer():
-    sample = ExemplarSample(3)
-    assert rank([], 3, lambda *_: np.zeros(3, np.int64)) == {}
-    assert len(ExemplarSample.from_arrays(*sample.to_arrays(), 3, 0)) == 0
-    assert exemplars_from_arrays(*exemplars_to_arrays([])) == []
 
 
 def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():

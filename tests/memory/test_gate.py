@@ -1,5 +1,6 @@
 """Folders from somebody else: rows, identities and checkpoints that verify, and are none of a memory's."""
 
+import itertools
 import json
 import math
 
@@ -16,7 +17,7 @@ from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.signals.stream import validate
-from store import DamageError, Store, StoreError
+from store import DamageError, StoreError
 
 TYPED = (ScrollTactileError, StoreError)
 OTHER = [("d", (9, 60)), ("e", (10, 60)), ("d", (11, 60))]
@@ -90,12 +91,6 @@ def readings_row(path, **changes):
     return put_row(path, key=touch.key, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
 
 
-def observed_in(path):
-    """The names and keys of what a memory observed."""
-    with Store.open(path, mode="read") as store:
-        return [(head.label, head.key) for head in store.heads(kind="observe")]
-
-
 def test_a_sound_memory_has_nothing_that_is_found(made):
     for name in ("whole", "coded", "compacted", "other"):
         assert check_memory(made / name) == []
@@ -136,179 +131,118 @@ ROWS = {
     "a long source": ("1 to 1000", {"attributes": {"columns": 60, "nbytes": 480, "source": "x" * 10**6}}),
     "no text for a source": ("as a string", {"attributes": {"columns": 60, "nbytes": 480, "source": ["x"]}}),
 }
-
-
-@pytest.mark.parametrize("name", ROWS)
-def test_a_row_that_is_no_observation_is_damage(path, others, name):
-    match, changes = ROWS[name]
-    row = {
-        "attributes": {"columns": 60, "nbytes": 480},
-        "payload": pack_readings(validate(stream((20, 60)), PAD).readings),
-    }
-    put_row(path, **row | changes)
-    require_refused(path, match, others=others)
-
-
-def test_a_row_under_the_key_of_another_touch_is_damage(made, path, others):
-    """What would be left out of a merge as "shared" though it was never there."""
-    label, key = observed_in(made / "other")[0]
-    readings = validate(stream((20, 60)), PAD).readings
-    put_row(path, key=key, label=label, attributes={"columns": 60, "nbytes": 480}, payload=pack_readings(readings))
-    require_refused(path, r"row 14 .* key: expected the content hash of its readings", others=others)
-
-
-@pytest.mark.parametrize("where", ["here", "there"])
-def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
-    """Row 1 lies under a generation: opening does not read it, but a touch is left out for its key."""
-    theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
-    theirs.close()
-    attributes, arrays = row_of(path, 1)
-    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=arrays)
-    assert any("content hash" in found for found in check_memory(path))
-    ours, theirs = (path, tmp_path / "theirs") if where == "here" else (tmp_path / "theirs", path)
-    with opened(ours) as learner:
-        before = learner.digest(), len(learner.observations())
-        with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
-            learner.merge(theirs, shared="once")
-        assert (learner.digest(), len(learner.observations())) == before
-
-
-def test_what_merge_leaves_out_passes_the_gate_too(path, others):
-    """A row that was retracted, one that both observed: opening refuses either."""
-    readings = validate(stream(OTHER[0][1]), PAD).readings
-    put_row(path, label="d", key=bytes(32), attributes={"columns": 60, "nbytes": 480}, payload=pack_readings(readings))
-    put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[14, 14]]})
-    require_refused(path, r"row 14 .* content hash", others=others)
-
-
-@pytest.mark.parametrize("kind", ["exec", "", "OBSERVE"])
-def test_a_row_of_a_kind_that_nobody_knows_is_of_a_newer_version(path, others, kind):
-    put_row(path, kind=kind, label="", key=b"")
-    require_refused(path, f"row 14 .* of kind {kind!r}", MismatchError, others=others)
-
-
-def test_a_generation_that_opening_refuses_is_not_merged(path, others):
-    attributes, arrays = checkpoint_of(path)
-    put_checkpoint(path, attributes | {"sample": ["nobody"] * len(attributes["sample"])}, arrays)
-    require_refused(path, "sample: expected materials that were observed", others=others)
-
-
-def test_an_exemplar_under_the_key_of_another_touch_is_damage(made, tmp_path, others):
-    path = copied(made / "compacted", tmp_path / "m")
-    attributes, arrays = checkpoint_of(path)
-    arrays["exemplar-keys"] = arrays["exemplar-keys"][::-1].copy()
-    put_checkpoint(path, attributes, arrays, base=True)
-    require_refused(path, "exemplar-keys: expected the content hashes of their readings", others=others)
-
-
-def test_a_row_of_nothing_is_damage(path):
-    put_row(path, attributes={"columns": 60})
-    require_refused(path, "codes or readings")
-
-
-def test_arrays_that_nobody_knows_are_of_a_newer_version(path):
-    readings_row(path, dreams=np.zeros(3))
-    require_refused(path, r"arrays \['dreams'\], which this version does not know", MismatchError)
-
-
+ROW = {"attributes": {"columns": 60, "nbytes": 480}, "payload": pack_readings(validate(stream((20, 60)), PAD).readings)}
+SEQUENCES = [None, [], "x", [3], [[1]], [[1, 10**12]], [[1, 14]], [[0, 1]], [[2, 1]], [[True, 1]], [[1.0, 1.0]]]
+SEQUENCES += [[[3, 4], [1, 2]], [[1, 2], [2, 3]]]
+CONSTITUENTS = ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}]
 ZEROS = {
     "readings-shape": np.array([60, 2]),
     "readings-zero": np.full(15, 255, np.uint8),
     "readings-rest": np.zeros(0, np.float32),
 }
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"readings-shape": np.array([2**40, 2])},
-        {"readings-shape": np.array([60, 2, 1])},
-        {"readings-shape": np.array([60.0, 2.0])},
-        {"readings-zero": np.full(14, 255, np.uint8)},
-        {"readings-zero": np.full(15, 255, np.int16)},
-        {"readings-rest": np.zeros(1, np.float32)},
-        {"readings-rest": None},
-    ],
-)
-def test_packed_readings_must_fit_together(path, changes):
-    readings_row(path, **ZEROS | changes)
-    require_refused(path, "readings")
-
-
+UNFIT = {
+    "a large shape": {"readings-shape": np.array([2**40, 2])},
+    "three axes": {"readings-shape": np.array([60, 2, 1])},
+    "a shape of floats": {"readings-shape": np.array([60.0, 2.0])},
+    "few zeros": {"readings-zero": np.full(14, 255, np.uint8)},
+    "zeros of int16": {"readings-zero": np.full(15, 255, np.int16)},
+    "more than zeros": {"readings-rest": np.zeros(1, np.float32)},
+    "no rest": {"readings-rest": None},
+}
 LARGE = 2**20 + 1
+CODES = {
+    "large": ("magnitude", lambda codes: codes + LARGE),
+    "least": ("magnitude", lambda codes: np.full_like(codes, np.iinfo(np.int32).min)),
+    "not a number": ("int32", lambda codes: codes.astype(np.float32) * np.nan),
+    "of int64": ("int32", lambda codes: codes.astype(np.int64)),
+    "of fewer features": ("int32", lambda codes: codes[:, :-1]),
+    "of fewer rows": ("rows", lambda codes: codes[:-1]),
+    "of more rows": ("rows", lambda codes: np.concatenate([codes, codes])),
+}
 
 
-@pytest.mark.parametrize(
-    ("match", "spoil"),
-    [
-        ("magnitude", lambda codes: codes + LARGE),
-        ("magnitude", lambda codes: np.full_like(codes, np.iinfo(np.int32).min)),
-        ("int32", lambda codes: codes.astype(np.float32) * np.nan),
-        ("int32", lambda codes: codes.astype(np.int64)),
-        ("int32", lambda codes: codes[:, :-1]),
-        ("rows", lambda codes: codes[:-1]),
-        ("rows", lambda codes: np.concatenate([codes, codes])),
-    ],
-)
-@pytest.mark.parametrize("scale", [15, 37, 1048576])
-def test_codes_must_be_those_of_the_touch(made, tmp_path, match, spoil, scale):
-    path = copied(made / "coded", tmp_path / "m")
-    attributes, arrays = row_of(path)
-    put_row(path, attributes=attributes, payload=arrays | {f"codes-{scale}": spoil(arrays[f"codes-{scale}"])})
-    embedding = STORED["embedding"]
-    require_refused(path, match, embedding=embedding)
+def row(**changes):
+    return lambda path: put_row(path, **ROW | changes)
 
 
-@pytest.mark.parametrize("changes", [{"codes-37": None}, {"codes-38": "codes-37"}])
-def test_scales_must_be_those_of_the_touch(made, tmp_path, changes):
-    path = copied(made / "coded", tmp_path / "m")
-    attributes, arrays = row_of(path)
-    changed = arrays | {name: None if of is None else arrays[of] for name, of in changes.items()}
-    put_row(path, attributes=attributes, payload={name: one for name, one in changed.items() if one is not None})
-    require_refused(path, "scales", embedding=STORED["embedding"])
+def retraction(sequences):
+    attributes = {} if sequences is None else {"sequences": sequences}
+    return lambda path: put_row(path, kind="retract", label="", key=b"", attributes=attributes)
 
 
-@pytest.mark.parametrize(
-    "sequences",
-    [
-        None,
-        [],
-        "x",
-        [3],
-        [[1]],
-        [[1, 10**12]],
-        [[1, 14]],
-        [[0, 1]],
-        [[2, 1]],
-        [[True, 1]],
-        [[1.0, 1.0]],
-        [[3, 4], [1, 2]],
-        [[1, 2], [2, 3]],
-    ],
-)
-def test_a_retraction_is_of_rows_before_it(path, others, sequences):
-    put_row(path, kind="retract", label="", key=b"", attributes={} if sequences is None else {"sequences": sequences})
-    require_refused(path, "sequences: expected", others=others)
+def description(constituents):
+    said = {"constituents": constituents}
+    return lambda path: put_row(path, kind="describe", label="a", key=b"", attributes=said)
 
 
-def test_a_description_cannot_be_retracted(path, others):
-    put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[13, 13]]})
-    require_refused(path, "retracts", others=others)
+def codes(name, of, change):
+    """The first row again, with other codes: one of its arrays is made of one that there is."""
+
+    def put(path):
+        attributes, arrays = row_of(path)
+        arrays[name] = change(arrays[of])
+        put_row(path, attributes=attributes, payload={name: one for name, one in arrays.items() if one is not None})
+
+    return put
 
 
-def test_an_observation_cannot_be_retracted_twice(path, others):
-    for _ in range(2):
-        put_row(path, kind="retract", label="", key=b"", attributes={"sequences": [[1, 1]]})
-    require_refused(path, "retracts", others=others)
+def packed_row(**changes):
+    return lambda path: readings_row(path, **changes)
 
 
-@pytest.mark.parametrize(
-    "constituents",
-    ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}],
-)
-def test_a_description_is_one_that_describe_keeps(path, others, constituents):
-    put_row(path, kind="describe", label="a", key=b"", attributes={"constituents": constituents})
-    require_refused(path, "constituents", others=others)
+def identity(field, value, part=None):
+    def change(path):
+        known = get_identity(path)
+        (known if part is None else known[part])[field] = value
+        set_identity(path, known)
+
+    return change
+
+
+def deep(depth):
+    def change(path):
+        known = get_identity(path)
+        known["embedding"]["configuration"]["parts"] = json.loads("[" * depth + "]" * depth)
+        set_identity(path, known)
+
+    return change
+
+
+def generation(change, *, base=False):
+    def put(path):
+        attributes, arrays = checkpoint_of(path)
+        change(attributes, arrays)
+        put_checkpoint(path, attributes, {name: one for name, one in arrays.items() if one is not None}, base=base)
+
+    return put
+
+
+def summed(name, spoil, **options):
+    return generation(lambda attributes, arrays: arrays.update({name: spoil(arrays[name])}), **options)
+
+
+def attributed(name, value):
+    return generation(lambda attributes, arrays: attributes.update({name: value}))
+
+
+def pairs(values_by_name):
+    return ((name, value) for name, values in values_by_name.items() for value in values)
+
+
+def one_after_another(*changes):
+    return lambda path: [change(path) for change in changes]
+
+
+def under_anothers_key(path):
+    """What would be left out of a merge as "shared" though it was never there."""
+    put_row(path, **ROW | {"key": validate(stream(OTHER[0][1]), PAD).key, "label": OTHER[0][0]})
+
+
+def of_another_key_and_retracted(path):
+    """What a merge leaves out passes the gate, too."""
+    readings = validate(stream(OTHER[0][1]), PAD).readings
+    put_row(path, **ROW | {"label": "d", "key": bytes(32), "payload": pack_readings(readings)})
+    retraction([[14, 14]])(path)
 
 
 IDENTITIES = {
@@ -321,60 +255,22 @@ IDENTITIES = {
     "views": [1, "true", None],
     "reading": [[1, "all"], ["x", "y"], [True], None],
 }
-
-
-@pytest.mark.parametrize(("field", "value"), [(field, value) for field in IDENTITIES for value in IDENTITIES[field]])
-def test_an_identity_that_is_none_is_damage(path, field, value):
-    set_identity(path, get_identity(path) | {field: value})
-    require_refused(path, f"identity of .*{field}")
-
-
-@pytest.mark.parametrize("field", ["dimension", "bound", "name", "fingerprint", "configuration"])
-@pytest.mark.parametrize("value", [0, -5, 10**9, 10**400, True, "", None, [], 1e308])
-def test_an_embedding_that_is_none_is_refused(path, field, value):
-    identity = get_identity(path)
-    identity["embedding"][field] = value
-    set_identity(path, identity)
-    if (field, value) in (("bound", 10**9), ("bound", 1e308), ("configuration", None)):
-        return  # it could be
-    require_refused(path, "identity", TYPED)
-
-
-@pytest.mark.parametrize("field", ["channels", "rate", "low", "high", "duration", "name", "layout"])
-@pytest.mark.parametrize("value", ["x", -1, True, 10**400, 1e308, [], None])
-def test_a_sensor_that_is_none_is_refused(path, field, value):
-    identity = get_identity(path)
-    identity["sensor"][field] = value
-    set_identity(path, identity)
-    if (field, value) in (("layout", None), ("name", "x"), ("low", -1)):
-        return
-    require_refused(path, "identity|range", TYPED)
-
-
-def test_depth_of_an_identity_ends(path):
-    identity = get_identity(path)
-    for depth in (17, 400):
-        identity["embedding"]["configuration"]["parts"] = json.loads("[" * depth + "]" * depth)
-        set_identity(path, identity)
-        require_refused(path, "identity")
-
-
-def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
-    for time in (-1e14, 1e300):
-        readings = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
-        put_row(
-            path,
-            key=readings.key,
-            attributes={"columns": 60, "nbytes": 480},
-            payload=pack_readings(readings.readings),
-            time=time,
-        )
-    with opened(path, mode="read") as learner:
-        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
-        export_plain(learner, tmp_path / "plain")
-    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
-
-
+EMBEDDINGS = {
+    "dimension": [0, 10**9, True, ""],
+    "bound": [-5, 10**400, True, None],
+    "name": [0, "", None],
+    "fingerprint": [-5, 1e308, []],
+    "configuration": [0, "", []],
+}
+SENSORS = {
+    "channels": ["x", -1, True, 10**400],
+    "rate": [-1, 10**400, None],
+    "low": ["x", 1e308, []],
+    "high": [-1, True, None],
+    "duration": ["x", 10**400, []],
+    "name": [-1, None, []],
+    "layout": ["x", -1, [1e308]],
+}
 SUMS = {
     "observations": [lambda a: a - 10, lambda a: a + 1, lambda a: a.astype(float), lambda a: a[:-1]],
     "lengths": [lambda a: -a, lambda a: np.concatenate([a, a]), lambda a: a[:, :1]],
@@ -395,18 +291,6 @@ SUMS = {
     "retracted": [lambda a: np.array([10**12]), lambda a: np.array([0]), lambda a: np.array([1.5])],
     "excluded": [lambda a: np.array([1, 1])],
 }
-
-
-@pytest.mark.parametrize(("field", "place"), [(field, i) for field, spoils in SUMS.items() for i in range(len(spoils))])
-def test_arrays_of_a_generation_must_be_those_of_touches(path, field, place):
-    attributes, arrays = checkpoint_of(path)
-    changed = SUMS[field][place](arrays.pop(field))
-    put_checkpoint(path, attributes, arrays | ({} if changed is None else {field: changed}))
-    require_refused(
-        path, "checkpoint 2 .*: (observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded)"
-    )
-
-
 ABOUT = {
     "dimension": [63, "x", None],
     "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20], [15.0, 37, 2**20, 2**20 + 1]],
@@ -419,15 +303,102 @@ ABOUT = {
     "tuned_upto": [None, -1, 10**9, "x"],
     "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
 }
+IN_GENERATIONS = "observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded"
+
+
+def forged_rows():
+    """What somebody put into the log of a whole memory: its name, what does it, what is said of it, and how."""
+    for name, (match, changes) in ROWS.items():
+        yield f"a row: {name}", row(**changes), match, DamageError
+    for kind in ("exec", "", "OBSERVE"):
+        yield f"a kind {kind!r}", row(kind=kind, label="", key=b""), f"row 14 .* of kind {kind!r}", MismatchError
+    for spans in SEQUENCES:
+        yield f"a retraction of {spans}", retraction(spans), "sequences: expected", DamageError
+    for said in CONSTITUENTS:
+        yield f"a description {said}", description(said), "constituents", DamageError
+    twice = one_after_another(retraction([[1, 1]]), retraction([[1, 1]]))
+    yield "a retracted description", retraction([[13, 13]]), "retracts", DamageError
+    yield "two retractions", twice, "retracts", DamageError
+    said = r"row 14 .* key: expected the content hash of its readings"
+    yield "another touch's key", under_anothers_key, said, DamageError
+    yield "another key, retracted", of_another_key_and_retracted, said, DamageError
+    nobodys = generation(lambda attributes, _: attributes.update(sample=["nobody"] * len(attributes["sample"])))
+    yield "a sample of nobody's", nobodys, "sample: expected materials that were observed", DamageError
+
+
+def forged_memories():
+    """What else somebody made of a memory: its name and which, what does it, what is said of it, and how."""
+    nothing = row(attributes={"columns": 60}, payload={})
+    yield "a row of nothing", "whole", nothing, "codes or readings", DamageError
+    later, said = packed_row(dreams=np.zeros(3)), r"arrays \['dreams'\], which this version does not know"
+    yield "arrays of a later version", "whole", later, said, MismatchError
+    for name, changes in UNFIT.items():
+        yield f"packed readings: {name}", "whole", packed_row(**ZEROS | changes), "readings", DamageError
+    for scale, (name, (match, spoil)) in itertools.product((15, 1048576), CODES.items()):
+        yield f"codes-{scale} {name}", "coded", codes(f"codes-{scale}", f"codes-{scale}", spoil), match, DamageError
+    yield "a scale less", "coded", codes("codes-37", "codes-37", lambda _: None), "scales", DamageError
+    yield "a scale more", "coded", codes("codes-38", "codes-37", np.copy), "scales", DamageError
+    others, said = summed("exemplar-keys", np.flipud, base=True), "exemplar-keys: expected the content hashes of their"
+    yield "exemplars under other keys", "compacted", others, said, DamageError
+    for field, value in pairs(IDENTITIES):
+        yield f"{field} {value}", "whole", identity(field, value), f"identity of .*{field}", DamageError
+    for part, fields in (("embedding", EMBEDDINGS), ("sensor", SENSORS)):
+        for field, value in pairs(fields):
+            yield f"{part}'s {field} {str(value)[:9]}", "whole", identity(field, value, part), "identity|range", TYPED
+    for depth in (17, 400):
+        yield f"an identity {depth} deep", "whole", deep(depth), "identity", DamageError
+    for i, (name, spoil) in enumerate(pairs(SUMS)):
+        yield f"{name} {i}", "whole", summed(name, spoil), f"checkpoint 2 .*: ({IN_GENERATIONS})", DamageError
+    for name, value in pairs(ABOUT):
+        said = f"checkpoint 2 .*({name}|tuned|exemplar)"
+        yield f"{name} {str(value)[:40]}", "whole", attributed(name, value), said, DamageError
+
+
+@pytest.mark.parametrize(("do", "match", "expected"), [pytest.param(*one, id=name) for name, *one in forged_rows()])
+def test_what_no_memory_writes_is_refused_by_whoever_reads_or_merges_it(path, others, do, match, expected):
+    do(path)
+    require_refused(path, match, expected, others)
 
 
 @pytest.mark.parametrize(
-    ("field", "place"), [(field, i) for field, values in ABOUT.items() for i in range(len(values))]
+    ("source", "do", "match", "expected"), [pytest.param(*one, id=name) for name, *one in forged_memories()]
 )
-def test_attributes_of_a_generation_must_be_those_of_touches(path, field, place):
-    attributes, arrays = checkpoint_of(path)
-    put_checkpoint(path, attributes | {field: ABOUT[field][place]}, arrays)
-    require_refused(path, f"checkpoint 2 .*({field}|tuned|exemplar)")
+def test_what_no_memory_holds_is_refused(made, tmp_path, source, do, match, expected):
+    path = copied(made / source, tmp_path / "m")
+    do(path)
+    require_refused(path, match, expected, **({"embedding": STORED["embedding"]} if source == "coded" else {}))
+
+
+@pytest.mark.parametrize("where", ["here", "there"])
+def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
+    """Row 1 lies under a generation: opening does not read it, but a touch is left out for its key."""
+    theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
+    theirs.close()
+    attributes, arrays = row_of(path, 1)
+    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=arrays)
+    assert any("content hash" in found for found in check_memory(path))
+    ours, theirs = (path, tmp_path / "theirs") if where == "here" else (tmp_path / "theirs", path)
+    with opened(ours) as learner:
+        before = learner.digest(), len(learner.observations())
+        with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
+            learner.merge(theirs, shared="once")
+        assert (learner.digest(), len(learner.observations())) == before
+
+
+def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
+    for time in (-1e14, 1e300):
+        readings = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
+        put_row(
+            path,
+            key=readings.key,
+            attributes={"columns": 60, "nbytes": 480},
+            payload=pack_readings(readings.readings),
+            time=time,
+        )
+    with opened(path, mode="read") as learner:
+        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
+        export_plain(learner, tmp_path / "plain")
+    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
 
 
 def hollow(attributes, arrays):

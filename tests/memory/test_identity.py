@@ -6,18 +6,16 @@ import json
 import pickle
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Augmented, Joined, Kernels, Maps, Sensor, TactileLearner, Vision
+from scroll_tactile import Joined, Kernels, Maps, Sensor, TactileLearner, Vision
 from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
-from scroll_tactile.prediction.current import CurrentModel
-from store import DamageError, Store
+from store import Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 EMBEDDINGS = {
@@ -133,27 +131,6 @@ def test_what_follows_from_readings_on_any_machine_is_known_without_making_it(em
     assert AbsentEmbedding(identity, None).capabilities.exact == capabilities_of(embedding).exact
 
 
-def test_exact_are_kernels_and_what_is_made_of_them():
-    assert [capabilities_of(embedding).exact for embedding in MADE] == [True, True, True] + [False] * 3
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"sensor": "x"},
-        {"embedding": {}},
-        {"grid": None},
-        {"embedding": {"name": "kernels", "dimension": "x", "bound": 1.0, "fingerprint": "00"}},
-        {"exemplars": "abc"},
-        {"augmentation": {"copies": -1}},
-    ],
-)
-def test_an_identity_that_is_none_is_damage(tmp_path, change):
-    prepare(tmp_path / "m", Kernels(), lambda identity: identity.update(change))
-    with pytest.raises(DamageError, match=r"identity of .* cannot be read"):
-        TactileLearner.open(tmp_path / "m")
-
-
 def test_another_number_of_exemplars_than_it_was_made_with_is_refused(tmp_path):
     filled(tmp_path / "m", exemplars=4).close()
     with pytest.raises(MismatchError, match=r"exemplars=4; it was opened with 7.*leave exemplars out"):
@@ -187,10 +164,6 @@ class TestSnapshots:
             with pytest.raises(InputError, match="keeps no journal"):
                 twin.retract(1)
 
-    def test_settings_travel(self):
-        learner = TactileLearner(sensor=PAD, embedding=Means(), readout="ridge", exemplars=7)
-        assert pickle.loads(pickle.dumps(learner)).settings == learner.settings
-
 
 def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
     filled(tmp_path / "new").close()
@@ -201,32 +174,6 @@ def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
     filled(tmp_path / "other", embedding=Kernels(dimension=64)).close()
     with TactileLearner.open(tmp_path / "new") as learner, pytest.raises(MismatchError, match="embeddings differ"):
         learner.merge(tmp_path / "other", shared="twice")
-
-
-def test_an_answer_is_of_one_state(monkeypatch):
-    """While another thread observes, every answer is one that the memory gave between two of its observations."""
-    monkeypatch.setattr(CurrentModel, "present", CurrentModel.settle)  # answers are then a function of the memory
-    learner = TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), augmentation=Augmented(copies=1))
-    for seed in range(4):
-        learner.observe("ab"[seed % 2], touch(seed))
-    states = {repr(learner.predict(touch(9)))}
-    twin, stop = copy.deepcopy(learner), threading.Event()
-    for seed in range(10, 16):
-        twin.observe("ab"[seed % 2], touch(seed))
-        states.add(repr(twin.predict(touch(9))))
-    answers: list[str] = []
-
-    def ask():
-        while not stop.is_set():
-            answers.append(repr(learner.predict(touch(9))))
-
-    thread = threading.Thread(target=ask)
-    thread.start()
-    for seed in range(10, 16):
-        learner.observe("ab"[seed % 2], touch(seed))
-    stop.set()
-    thread.join()
-    assert answers and set(answers) <= states
 
 
 def prepare(path, embedding, change):

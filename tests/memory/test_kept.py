@@ -1,13 +1,10 @@
 """Kept touches are a function of the set observed, whatever happened on the way, and of how many are kept."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from touches import OBSERVED, PAD, SETTINGS, Windowed, contents, fed, filled, kept_of, require_same, stream, without
+from touches import OBSERVED, PAD, Windowed, contents, fed, filled, kept_of, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
@@ -72,46 +69,6 @@ def test_a_touch_without_readings_is_not_kept():
     assert not kept.touches()
 
 
-@pytest.mark.parametrize("recall", [FEW, None])
-def test_they_are_the_same_after_every_change(tmp_path, recall):
-    chosen = {"recall": recall}
-    learner, receipts = filled(tmp_path / "m", **chosen)
-    other, _ = filled(tmp_path / "other", SPARE, **chosen)
-    other.close()
-    with learner, TactileLearner.open(tmp_path / "m", mode="read", **SETTINGS) as reader:
-        require_same(learner, OBSERVED, **chosen)
-        assert len(kept_of(learner)) == (FEW if recall else len(OBSERVED))
-        for i in (1, 5):
-            learner.retract(receipts[i])
-        require_same(learner, without(1, 5), **chosen)
-        assert reader.refresh()
-        require_same(reader, without(1, 5), **chosen)
-        learner.merge(tmp_path / "other", shared="once")
-        require_same(learner, [*without(1, 5), *SPARE], **chosen)
-        learner.forget("d")
-        learner.compact(keep=4)
-        require_same(learner, without(1, 5), **chosen)
-        assert reader.refresh()
-        require_same(reader, without(1, 5), **chosen)
-        learner.retract(receipts[11])
-        require_same(learner, without(1, 5, 11), **chosen)
-        assert reader.refresh()
-        assert kept_of(reader) == kept_of(learner)
-    with TactileLearner.open(tmp_path / "m") as again:
-        assert again.settings.recall == (FEW if recall else usual_kept(PAD))
-        require_same(again, without(1, 5, 11), **chosen)
-
-
-def test_a_compacted_memory_brings_its_own(tmp_path):
-    ours, _ = filled(tmp_path / "m", recall=FEW)
-    other, _ = filled(tmp_path / "other", SPARE, recall=FEW)
-    other.compact()
-    other.close()
-    with ours:
-        ours.merge(tmp_path / "other", shared="once")
-        require_same(ours, [*OBSERVED, *SPARE], exemplars=False, recall=FEW)
-
-
 @pytest.mark.parametrize("theirs", [0, 3, None])
 def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_path, theirs):
     ours, _ = filled(tmp_path / "m", recall=FEW)
@@ -137,26 +94,6 @@ def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
         ours.merge(tmp_path / "other", shared="once")
         assert kept_of(ours) is None
         assert ours.materials["d"] == len(SPARE)
-
-
-def test_a_process_that_dies_leaves_them_in_the_journal(tmp_path):
-    learner, _ = filled(tmp_path / "m", recall=FEW)
-    learner.observe("d", stream((50, 60)))
-    learner._ledger.store.close()  # as a kill leaves it: no generation
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as again:
-        require_same(again, [*OBSERVED, ("d", (50, 60))], recall=FEW)
-
-
-@pytest.mark.parametrize("made", [None, FEW, 0])
-@pytest.mark.parametrize("snapshot", [copy.deepcopy, lambda learner: pickle.loads(pickle.dumps(learner))])
-def test_a_snapshot_has_them(tmp_path, made, snapshot):
-    learner, _ = filled(tmp_path / "m", recall=made)
-    with learner:
-        taken = snapshot(learner)
-        assert contents(taken) == contents(learner)
-        learner.forget("a")
-        taken.observe("d", stream((50, 60)))
-        require_same(taken, [*OBSERVED, ("d", (50, 60))], recall=made)
 
 
 @pytest.mark.parametrize("made", [None, 0, FEW])
@@ -192,12 +129,3 @@ def test_none_are_kept_where_they_are_of_no_use():
 def test_it_is_a_whole_number(recall):
     with pytest.raises(InputError, match="recall"):
         TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), recall=recall)
-
-
-def test_it_stands_in_what_is_reembedded(tmp_path):
-    learner, receipts = filled(tmp_path / "m", recall=FEW)
-    with learner:
-        learner.retract(receipts[2])
-        learner.reembed(Kernels(seed=3, dimension=64))
-        assert learner.settings.recall == FEW
-        assert kept_of(learner) == kept_of(fed(without(2), recall=FEW))

@@ -8,12 +8,11 @@ from hypothesis.extra import numpy as arrays_of
 
 from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
-from scroll_tactile.memory.rows import OBSERVE, pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
+from scroll_tactile.memory.rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.windows import Scale, WindowPlan, extent
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.statistics.sample import stage_rows
-from store import Store
 from store.encoding import encode_payload
 
 DIMENSION, SCALES = 4, (6, 20)
@@ -108,39 +107,6 @@ def content(memory):
     return memory.statistics.digest(), pool, memory.sequence
 
 
-def append(store, seed):
-    material, key, columns, codes = touch(seed)
-    return store.append(OBSERVE, material, key, attributes={"columns": columns}, arrays=pack_codes(codes))
-
-
-@given(st.lists(st.integers(0, 30), unique=True), st.randoms(use_true_random=False))
-@settings(max_examples=30, deadline=None)
-def test_any_order_gives_the_same_memory(seeds, random):
-    shuffled = seeds.copy()
-    random.shuffle(shuffled)
-    assert content(filled(seeds)) == content(filled(shuffled))
-
-
-@pytest.mark.parametrize("upto", [None, 0, 1, 7, 12])
-def test_a_store_gives_back_the_memory_wherever_its_generation_ends(tmp_path, upto):
-    with Store.open(tmp_path / "s", identity={}) as store:
-        for seed in range(12):
-            append(store, seed)
-        if upto is not None:
-            arrays, attributes = filled(range(upto)).to_arrays()
-            store.commit(arrays, upto=upto, attributes=attributes)
-    with Store.open(tmp_path / "s") as store:
-        memory = Memory.load(store, DIMENSION, READING)
-        assert content(memory) == content(filled(range(12)))
-        # And it goes on from there, with arrays of its own.
-        for seed in range(12, 16):
-            record = append(store, seed)
-            memory.replay(store.record(record.sequence), store)
-        assert content(memory) == content(filled(range(16)))
-        store.commit(memory.to_arrays()[0], upto=16, attributes=memory.to_arrays()[1])
-        assert content(Memory.load(store, DIMENSION, READING)) == content(memory)
-
-
 def test_a_full_memory_refuses_and_stays_as_it_was():
     memory = filled(range(5))
     moment = memory.statistics.second(NARROW)
@@ -151,9 +117,3 @@ def test_a_full_memory_refuses_and_stays_as_it_was():
     assert content(memory) == before
     moment.rows = held
     assert content(memory) == content(filled(range(5)))
-
-
-def test_the_same_touch_twice_counts_twice_and_is_pooled_once():
-    memory = filled([1, 1])
-    assert memory.statistics.materials == {"b": 2}
-    assert len(memory.sample) == 1

@@ -1,6 +1,5 @@
 """A memory carried over to another embedding is what that one would have made of the same touches, or as it was."""
 
-import shutil
 import threading
 
 import numpy as np
@@ -13,7 +12,6 @@ from scroll_tactile import Kernels, Maps, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory import reembed
 from scroll_tactile.prediction.reembedding import reembed_memory
-from scroll_tactile.signals.copies import Augmented
 from store import DamageError, LockedError, Store, StoreFullError
 
 OTHER = {
@@ -68,61 +66,6 @@ def test_it_is_what_the_other_embedding_would_have_made(path, other):
         assert again.digest() == fed(without(4, 11), embedding=other).digest()
     with TactileLearner.open(old, **SETTINGS) as learner:
         require_carried(learner, SMALL)
-
-
-def arrays_of(learner):
-    """All that a checkpoint of this memory would hold, to the byte."""
-    arrays, attributes = learner.memory.to_arrays()
-    return {name: (array.dtype, array.shape, array.tobytes()) for name, array in arrays.items()}, attributes
-
-
-def with_second_names(learner):
-    """A touch under two names, one relabelled, one taken back, sources, a material that is described and never felt."""
-    receipts = [learner.observe(name, stream(touch), source=f"{name}.npy") for name, touch in OBSERVED[:6]]
-    learner.observe("z", stream(OBSERVED[0][1]))
-    learner.describe("a", {"wool": 1.0})
-    learner.describe("ü", {"soft": True})
-    learner.relabel(receipts[1], "c")
-    learner.retract(receipts[2])
-    learner.observe("b", stream((8, 25)))
-
-
-@pytest.mark.parametrize(
-    ("settings", "history"),
-    [
-        ({}, lambda learner: None),
-        ({"recall": 5}, with_second_names),
-        ({"recall": 0}, lambda learner: None),
-        ({"exemplars": 0, "recall": 3, "augmentation": Augmented(copies=1)}, lambda learner: None),
-    ],
-)
-def test_nothing_is_lost_it_is_the_memory_that_was_fed_afresh(path, tmp_path, settings, history):
-    made, other = SETTINGS | settings, OTHER["exact"]()
-    with (
-        TactileLearner.open(path, **made, readout="ridge") as learner,
-        TactileLearner.open(tmp_path / "afresh", **made | {"embedding": other}, readout="ridge") as afresh,
-    ):
-        for each in (learner, afresh):
-            for name, touch in OBSERVED[6:10]:
-                each.observe(name, stream(touch))
-            history(each)
-        learner.reembed(other)
-        assert arrays_of(learner) == arrays_of(afresh)
-        assert learner.settings == afresh.settings
-        places = [[(one.sequence, one.source, one.state) for one in each.observations()] for each in (learner, afresh)]
-        assert places[0] == places[1]
-        held = arrays_of(learner)
-    with TactileLearner.open(path, readout="ridge") as again:
-        assert (arrays_of(again), again.settings) == (held, afresh.settings)
-
-
-def test_replayed_it_is_the_same(path, other):
-    learner, _ = eventful(path)
-    with learner:
-        learner.reembed(other)
-    shutil.rmtree(path / "checkpoints")
-    with TactileLearner.open(path) as again:
-        require_carried(again, other)
 
 
 @pytest.mark.parametrize("stopped", [1, 2, 3])

@@ -81,20 +81,6 @@ def test_replayed_retracted_merged_and_compacted_it_is_what_observing_gives(made
         assert held(learner) == fresh(made, without(2, 5, 11))
 
 
-def test_a_merged_base_counts_as_what_it_observed(made, tmp_path):
-    with TactileLearner.open(tmp_path / "other", **made) as other:
-        observe(other, OBSERVED[6:])
-        other.compact(keep=2)
-    with TactileLearner.open(tmp_path / "m", **made) as learner:
-        receipts = observe(learner, OBSERVED[:6])
-        learner.merge(tmp_path / "other", shared="once")
-        learner.retract(receipts[0])
-        assert held(learner) == fresh(made, without(0))
-    shutil.rmtree(tmp_path / "m" / "checkpoints")
-    with TactileLearner.open(tmp_path / "m", **made) as learner:
-        assert held(learner) == fresh(made, without(0))
-
-
 def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
     with TactileLearner.open(tmp_path / "m", **made) as writer:
         receipts = observe(writer, OBSERVED[:4])
@@ -117,16 +103,6 @@ def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
             assert [(name, sign) for name, _, sign in reader._ledger.added] == [("a", -1)] * 4
             assert held(reader) == fresh(made, [pair for pair in without(1) if pair[0] != "a"])
             assert reader.descriptions == {}
-
-
-def test_a_reader_begins_anew_after_a_compaction(made, tmp_path):
-    with TactileLearner.open(tmp_path / "m", **made) as writer:
-        receipts = observe(writer, OBSERVED)
-        with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
-            writer.compact(keep=4)
-            writer.retract(receipts[-1])
-            assert reader.refresh()
-            assert held(reader) == fresh(made, without(11))
 
 
 def test_a_reader_stays_as_it_was_where_a_row_is_damaged(tmp_path):

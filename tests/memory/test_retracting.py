@@ -1,7 +1,5 @@
 """What was observed is retracted, brought together, made small and made durable in bulk: exactly."""
 
-import threading
-
 import pytest
 from forging import spoil_row
 from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_same, spoil, stream, without
@@ -34,14 +32,6 @@ def path(tmp_path):
 
 
 class TestRetract:
-    def test_of_a_stream_felt_twice_one_stays(self, path):
-        learner, receipts = filled(path, [*OBSERVED, OBSERVED[1]], again=True)
-        with learner:
-            learner.retract(receipts[1])
-            require_same(learner, OBSERVED)
-            learner.retract(receipts[-1])
-            require_same(learner, without(1))
-
     @pytest.mark.parametrize("wrong", [0, -1, 99, True, 1.5, None])
     def test_what_is_not_there_is_refused(self, path, wrong):
         learner, _ = filled(path)
@@ -134,23 +124,6 @@ def test_a_full_disk_keeps_memory_and_journal_alike(path, monkeypatch, change):
 
 
 class TestTuned:
-    def test_what_it_was_made_from_takes_it_along(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            learner.fine_tune(epochs=1)
-            made = learner.tuned_digest()
-            later = learner.observe("a", stream((9, 60)))
-            learner.retract(later)  # felt after it was made
-            assert learner.tuned_digest() == made
-            learner.retract(receipts[3])
-            assert learner.tuned_digest() is None
-        with TactileLearner.open(path, **SETTINGS) as again:
-            assert again.tuned_digest() is None
-            again.fine_tune(epochs=1)
-            whole = fed(without(3))
-            whole.fine_tune(epochs=1)
-            assert again.tuned_digest() == whole.tuned_digest()
-
     def test_retracted_while_it_is_being_made(self, path):
         learner, receipts = filled(path)
         with learner:
@@ -215,33 +188,8 @@ class TestBatch:
                     learner.observe("a", stream((9, 60)))
             require_same(learner, [*OBSERVED, ("a", (9, 60))])
 
-    def test_other_threads_wait_for_its_end(self, path):
-        with TactileLearner.open(path, **SETTINGS) as learner:
-            receipts = []
-            with learner.batch():
-                learner.observe("a", stream((0, 60)))
-                thread = threading.Thread(target=lambda: receipts.append(learner.observe("b", stream((1, 60)))))
-                thread.start()
-                thread.join(0.1)
-                assert receipts == []
-            thread.join()
-            assert receipts[0].durable
-
 
 class TestMerge:
-    def test_what_a_compacted_memory_brings_cannot_be_taken_apart(self, path, tmp_path):
-        ours, _ = filled(path, OBSERVED[:4])
-        theirs, _ = filled(tmp_path / "other", OBSERVED[4:])
-        with ours, theirs:
-            theirs.compact(keep=2)
-            ours.merge(tmp_path / "other", shared="once")
-            require_same(ours, OBSERVED)
-            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 2 of its 4"):
-                ours.forget("a")
-            with pytest.raises(ObservationError, match=r"6 streams that both .* cannot be counted once"):
-                ours.merge(theirs, shared="once")
-            require_same(ours, OBSERVED)
-
     @pytest.mark.parametrize(
         ("settings", "said"),
         [
@@ -325,38 +273,6 @@ class TestMerge:
 
 
 class TestCompact:
-    def test_what_was_learned_stays_and_can_no_longer_be_retracted(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            before = sum(learner._ledger.store.size().values())
-            done = learner.compact(keep=3)
-            assert (done.upto, done.bytes_before) == (9, before)
-            require_same(learner, OBSERVED)
-            with pytest.raises(ObservationError, match="rows 1 to 9 were compacted"):
-                learner.retract(receipts[8])
-            with pytest.raises(ObservationError, match="'a' cannot be forgotten: 3 of its 4"):
-                learner.forget("a")
-            learner.retract(receipts[9])
-            require_same(learner, without(9))
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, without(9))
-            again.compact()
-            require_same(again, without(9))
-
-    def test_what_was_retracted_before_is_gone_from_the_disk(self, path):
-        learner, receipts = filled(path)
-        with learner:
-            learner.retract(receipts[0])
-            learner.compact()
-            require_same(learner, without(0))
-        with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, without(0))
-            with pytest.raises(ObservationError):
-                again.retract(receipts[0])
-        with Store.open(path, mode="read") as store:
-            assert store.compacted == 13
-            assert [head.label for head in store.heads(kind="observe")] == [name for name, _ in OBSERVED]
-
     @pytest.mark.parametrize("keep", [-1, True, 1.5, None])
     def test_a_keep_that_is_no_number_is_refused(self, path, keep):
         learner, _ = filled(path)
@@ -468,27 +384,6 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
             learner.retract(receipts[0])
         learner.retract(receipts[-1])
         require_same(learner, without(11))
-
-
-def test_a_reader_chooses_again_among_what_it_has_read_and_not_what_came_since(path):
-    learner, receipts = filled(path)
-    with learner:
-        learner.retract(receipts[0])
-        reader = TactileLearner.open(path, mode="read", **SETTINGS)
-        with reader:
-            require_same(reader, without(0))
-            learner.observe("d", stream((9, 60)))
-            learner.retract(receipts[1])
-            memory = reader.memory
-            memory._stale = True  # as when the retraction is replayed while the writer goes on
-            memory.refill(reader._ledger.store)
-            require_same(reader, without(0))
-            learner.compact()
-            memory._stale = True
-            with pytest.raises(CompactedError):
-                memory.refill(reader._ledger.store)
-            reader.refresh()
-            require_same(reader, [*without(0, 1), ("d", (9, 60))])
 
 
 def test_with_a_damaged_base_nothing_is_retracted(path):

@@ -63,18 +63,6 @@ class TestSource:
 
 
 class TestRelabel:
-    def test_it_is_then_as_if_it_had_had_the_name_from_the_start(self, path):
-        learner, receipts = filled(path)
-        renamed = [*without(1), ("silk", OBSERVED[1][1])]
-        with learner:
-            assert learner.relabel(receipts[1], "silk") == 14
-            assert learner.observations()[-1].time == learner.observations()[1].time
-            require_same(learner, renamed)
-        with TactileLearner.open(path) as again:
-            require_same(again, renamed)
-            assert again.relabel(14, "b") == 16
-            require_same(again, OBSERVED)
-
     def test_it_keeps_the_source_and_follows_what_was_learned(self, path):
         with TactileLearner.open(path, **SETTINGS) as learner:
             for i, (material, touch) in enumerate(OBSERVED):
@@ -85,13 +73,6 @@ class TestRelabel:
             assert sources(learner)[-1] == (14, "a", "kept", "1.npy")
             assert dict(learner.predict(stream((7, 25))).ranking).keys() == {"a", "b", "c"}
             require_same(learner, [*without(1), ("a", OBSERVED[1][1])])
-
-    @pytest.mark.parametrize("settings", [{"exemplars": 0, "recall": 0}, {"exemplars": 0}], ids=["codes", "kept"])
-    def test_a_memory_that_keeps_no_exemplars(self, path, settings):
-        learner, receipts = filled(path, **settings)
-        with learner:
-            learner.relabel(receipts[1], "silk")
-            require_same(learner, [*without(1), ("silk", OBSERVED[1][1])], **settings)
 
     def test_what_cannot_be_relabelled_is_refused_and_nothing_changed(self, path):
         learner, _ = filled(path)

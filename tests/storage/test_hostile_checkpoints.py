@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from store_builds import flip, known_current, newest, put_current, put_row
 
-from store import DamageError, RecordError, Store, StoreError, VersionError, check_store
+from store import DamageError, RecordError, Store, VersionError, check_store
 from store import chunks as store_chunks
 from store import records as store_records
 from store.archive import Files
@@ -43,14 +43,6 @@ def kept(tmp_path_factory):
 @pytest.fixture
 def path(kept, tmp_path):
     return shutil.copytree(kept, tmp_path / "s")
-
-
-def same(found):
-    return found is not None and all(
-        (found.arrays[name].dtype, found.arrays[name].shape) == (array.dtype, array.shape)
-        and found.arrays[name].tobytes() == array.tobytes()
-        for name, array in ARRAYS.items()
-    )
 
 
 def require_damage(path):
@@ -107,8 +99,7 @@ def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(pat
     assert check_store(path) == []
 
 
-@pytest.mark.parametrize("shape", [[2**29], [2**29, 2], [2**37], [2**40, 2**20], [2**62]])
-@pytest.mark.parametrize("chunk", [[2**29], [1]])
+@pytest.mark.parametrize(("shape", "chunk"), [([2**29], [2**29]), ([2**37], [1]), ([2**40, 2**20], [2**29])])
 def test_a_shape_that_no_file_stands_for_takes_no_memory_and_no_time(path, shape, chunk):
     """The checkpoint claims another shape of its rows everywhere, and as many files as it would have."""
     header = newest(path) / "rows" / "zarr.json"
@@ -244,7 +235,7 @@ def test_more_attributes_than_are_read_are_not_written(opened, monkeypatch):
             opened.commit({}, upto=0, attributes=many)
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_harmed_checkpoint_is_damage_or_what_it_was(kept, tmp_path_factory, seed):
     rng = np.random.default_rng(seed)
@@ -264,13 +255,3 @@ def test_a_harmed_checkpoint_is_damage_or_what_it_was(kept, tmp_path_factory, se
     except (DamageError, VersionError):
         return
     assert all(found[name].tobytes() == ARRAYS[name].tobytes() for name in found)
-
-
-def test_memory_that_is_short_is_no_damage(path, monkeypatch):
-    def starve(*_):
-        raise MemoryError
-
-    monkeypatch.setattr(store_chunks, "decompress_zstd", starve)
-    with Store.open(path, mode="read") as opened, pytest.raises(StoreError) as refused:
-        opened.latest()
-    assert not isinstance(refused.value, DamageError)

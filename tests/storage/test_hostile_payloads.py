@@ -9,7 +9,7 @@ from forged import in_a_process, payload
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import zstd
-from store_builds import put_row, same_arrays
+from store_builds import put_row
 
 from store import DamageError, RecordError, Store, VersionError, check_store, encoding
 from store.encoding import decode_payload, encode_payload
@@ -108,6 +108,12 @@ def test_a_payload_that_was_never_written_is_damage_at_its_row(plain, content):
     assert f"row {number}" in problem.what
 
 
+def test_arrays_in_a_newer_format_are_told_from_damage(plain):
+    put_row(plain, payload=payload([], version=2))
+    with Store.open(plain, mode="read") as opened, pytest.raises(VersionError, match=r"format 2; .* upgrade"):
+        list(opened.records())
+
+
 ARRAYS = {
     "levels": np.arange(4000, dtype=np.uint8).reshape(10, 400),
     "text": np.array(["wool", "silk ü"]),
@@ -117,11 +123,7 @@ ARRAYS = {
 }
 
 
-def test_a_payload_gives_back_its_arrays():
-    assert same_arrays(decode_payload(encode_payload(ARRAYS)), ARRAYS)
-
-
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=100)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_harmed_payload_is_refused_or_read_and_nothing_else(seed):
     rng, content = np.random.default_rng(seed), bytearray(encode_payload(ARRAYS))

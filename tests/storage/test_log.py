@@ -6,11 +6,11 @@ import struct
 from pathlib import Path
 
 import pytest
-from logs import BATCHES, HEADER, KIND, append, build, ends, names, payload, read, rest
+from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest
 
 import store.log
 import store.log_writer
-from store import DamageError, RecordError, StoreClosedError, StoreError, VersionError
+from store import DamageError, RecordError, StoreClosedError
 from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
 from store.log import LogReader, Place
 from store.log_file import PART
@@ -45,13 +45,6 @@ def batches_and_damage(path):
         except DamageError as damage:
             return found, damage
     return found, None
-
-
-def test_what_was_committed_comes_back_in_its_batches(whole):
-    assert read(whole) == BATCHES
-    with LogReader(whole) as log:
-        assert log.header == HEADER
-        assert [frame.kind for batch in log.refresh() for frame in batch] == [KIND] * 8
 
 
 def test_a_commit_is_one_write_and_one_sync_of_data(tmp_path, monkeypatch):
@@ -210,27 +203,6 @@ def test_what_an_opening_finds_is_durable_before_anything_follows_it(copy, monke
         assert calls == [size - 4, size - 4]  # the cut, and what was there before
 
 
-def test_reading_goes_on_behind_damage_where_it_is_told_to(copy):
-    _, frames, _ = ends(copy)
-    for batch, index in ((0, 0), (1, 1), (3, 2)):
-        begin = [frame for frame in frames if frame[0] == batch][index][1]
-        data = bytearray(copy.read_bytes())
-        data[begin + 60] ^= 1
-        copy.write_bytes(data)
-    found, named = [], []
-    with LogReader(copy) as log:
-        while True:
-            try:
-                for batch in log.refresh():
-                    found += [log.read(frame.offset, frame.size)[1] for frame in batch]
-                break
-            except DamageError as damage:
-                named.append(damage.frame)
-                log.resume()
-    assert named == [1, 4, 10]
-    assert found == [payload(index) for index in (1, 3, 4, 5, 7)]
-
-
 @pytest.mark.parametrize(("frame", "lost"), [(0, 0), (2, 1), (7, 4), (8, 5), (9, 6)])
 @pytest.mark.parametrize("inserted", [False, True])
 def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
@@ -298,36 +270,6 @@ def test_a_torn_batch_whose_later_sectors_came_is_no_damage(copy):
         assert read(copy) == [*BATCHES, [b""]]
 
 
-def test_a_writer_refuses_a_damaged_log_and_leaves_it_as_it_is(copy):
-    data = bytearray(copy.read_bytes())
-    data[200] ^= 1
-    copy.write_bytes(data)
-    with pytest.raises(DamageError, match="proves that it was durable"):
-        LogWriter(copy)
-    assert copy.read_bytes() == data
-
-
-def test_a_reader_keeps_its_place_beside_a_writer(tmp_path):
-    path = build(tmp_path / "log", [])
-    with LogWriter(path) as writer, LogReader(path) as log:
-        for batch in BATCHES:
-            assert rest(log) == []
-            append(writer, batch)
-            assert rest(log) == [batch]
-        kept, before = log.place, path.stat()
-    with LogReader(path, place=kept) as log, LogWriter(path, place=kept) as writer:
-        append(writer, [b"later"])
-        assert rest(log) == [[b"later"]]
-    assert before.st_ino == path.stat().st_ino
-
-
-def test_a_reader_changes_nothing(copy):
-    copy.chmod(0o444)
-    before = (copy.read_bytes(), copy.stat().st_mtime_ns, names(copy.parent))
-    assert read(copy) == BATCHES
-    assert (copy.read_bytes(), copy.stat().st_mtime_ns, names(copy.parent)) == before
-
-
 def test_a_place_that_is_not_behind_a_commit_of_this_log_is_refused(copy, tmp_path):
     with LogReader(copy) as log:
         places = [log.place] + [log.place for _ in log.refresh()]
@@ -345,19 +287,6 @@ def test_a_place_that_is_not_behind_a_commit_of_this_log_is_refused(copy, tmp_pa
         LogReader(other, place=place)
     with pytest.raises(DamageError, match="holds no batch"):
         LogWriter(other, place=place)
-
-
-def test_a_reader_stays_with_the_log_that_was_replaced(copy):
-    with LogReader(copy) as log:
-        create_log(copy, b"new", [(KIND, b"1"), (KIND, b"2")])
-        assert rest(log) == BATCHES
-        assert rest(log) == []
-    with LogReader(copy) as log:
-        assert (log.header, rest(log)) == (b"new", [[b"1", b"2"]])
-    assert names(copy.parent) == ["log"]
-    copy.unlink()
-    with pytest.raises(StoreError):
-        LogReader(copy)
 
 
 def test_a_log_of_many_frames_replaces_another(tmp_path):
@@ -467,63 +396,3 @@ def test_a_second_header_and_a_commit_with_a_payload_hold_nothing(whole, tmp_pat
     path = tmp_path / "log"
     path.write_bytes(forged(whole, frame, (15, 14, COMMIT, 0, b"")))
     assert read(path) == BATCHES
-
-
-def test_marks_without_end_are_read_once(whole, tmp_path, monkeypatch):
-    path = tmp_path / "log"
-    with LogReader(whole) as log:
-        mark = whole.read_bytes()[:16]
-        assert mark.endswith(log.identity)
-    path.write_bytes(whole.read_bytes() + mark * 40_000)
-    calls = []
-    monkeypatch.setattr(store.log, "read_frame", lambda *given: calls.append(1))
-    with LogReader.__new__(LogReader) as log:
-        log.path, log._file = path, store.log.LogFile(path, write=False)
-        log._mark = mark
-        assert list(log._frames(0)) == []
-    assert 40_000 <= len(calls) <= 40_100
-
-
-def test_a_newer_version_is_named_and_a_flipped_one_is_damage(copy):
-    data = bytearray(copy.read_bytes())
-    data[6] = 2
-    copy.write_bytes(data)
-    with pytest.raises(DamageError, match="begin as a log"):
-        LogReader(copy)
-    data[72:88] = payload_digest(bytes(data[:72]))
-    copy.write_bytes(data)
-    with pytest.raises(VersionError, match="format 2"):
-        LogReader(copy)
-
-
-@pytest.mark.parametrize("content", [b"", b"x" * 500, bytes(500)])
-def test_what_is_no_log_is_named(tmp_path, content):
-    (tmp_path / "log").write_bytes(content)
-    for opening in (LogReader, LogWriter):
-        with pytest.raises(DamageError, match="begin as a log"):
-            opening(tmp_path / "log")
-    assert (tmp_path / "log").read_bytes() == content
-
-
-def test_links_pipes_and_folders_are_refused_and_nothing_is_touched_through_them(whole, tmp_path):
-    outside = Path(shutil.copy(whole, tmp_path / "outside"))
-    (tmp_path / "link").symlink_to(outside)
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "folder").mkdir()
-    for name in ("link", "pipe", "folder"):
-        for opening in (LogReader, LogWriter):
-            with pytest.raises(DamageError, match="no regular file"):
-                opening(tmp_path / name)
-    with pytest.raises(DamageError, match="no regular file"):
-        LogReader(Path("/dev/zero"))
-    # A draft that was planted leads nowhere either.
-    (tmp_path / "log.new").symlink_to(outside)
-    build(tmp_path / "log")
-    assert outside.read_bytes() == whole.read_bytes() and not (tmp_path / "log").is_symlink()
-
-
-def test_a_place_is_plain_numbers_and_bytes(whole):
-    with LogReader(whole) as log:
-        for _ in log.refresh():
-            pass
-        assert Place(*tuple(log.place)) == log.place

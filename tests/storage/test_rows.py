@@ -117,15 +117,3 @@ def test_there_are_few_files_however_many_rows(tmp_path):
     keys = made(tmp_path / "s", rows=600)
     assert len(files(tmp_path / "s")) <= 8
     require_all(tmp_path / "s", keys)
-
-
-def test_a_writer_that_opens_it_again_goes_on_with_its_files(tmp_path):
-    keys = made(tmp_path / "s")
-    for _ in range(6):
-        with Store.open(tmp_path / "s") as kept:
-            for _ in range(5):
-                head = kept.append("observe", "b", b"again")
-                keys[head.sequence] = b"again"
-            assert len(list(kept.with_key(b"again"))) == sum(key == b"again" for key in keys.values())
-            kept.commit({"sum": np.arange(4)}, upto=kept.last)
-    require_all(tmp_path / "s", keys)

@@ -3,8 +3,6 @@
 import os
 import shutil
 import subprocess
-import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -25,21 +23,6 @@ from store_builds import (
 
 import store.backup
 from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
-
-WRITER = """
-import sys
-import numpy as np
-from store import Store
-
-with Store.open(sys.argv[1], identity={}) as opened:
-    number = 0
-    while True:
-        number += 1
-        opened.append("a", f"row {number}", b"", arrays={"x": np.arange(number % 2000)})
-        print(number, flush=True)
-        if number % 3 == 0:
-            opened.commit({"sum": np.array(number), "bulk": np.arange(20_000) + number}, upto=number)
-"""
 
 
 def kept(folder):
@@ -226,41 +209,3 @@ def test_all_of_it_is_durable_before_it_appears(plain, tmp_path, monkeypatch):
     written = {str(path).replace(str(copy), draft) for path in (copy, *copy.rglob("*"))}
     assert set(events[:i]) >= written
     assert events[i + 1 :] == [str(tmp_path)]
-
-
-def test_copies_made_under_a_writer_in_another_process_are_states_that_it_acknowledged(tmp_path):
-    writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(tmp_path / "s")],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(Path(store.__file__).parents[1])},
-    )
-    acknowledged = [0]
-
-    def hear():
-        for line in writer.stdout:
-            acknowledged.append(int(line))
-
-    heard = threading.Thread(target=hear)
-    heard.start()
-    try:
-        while acknowledged[-1] < 4:
-            assert writer.poll() is None
-        for i in range(6):
-            before = acknowledged[-1]
-            with Store.open(tmp_path / "s", mode="read") as reader:
-                reader.backup(tmp_path / str(i))
-            assert damage(tmp_path / str(i)) == []
-            with Store.open(tmp_path / str(i), mode="read") as copy:
-                last, newest = copy.last, copy.latest()
-                # One more may be durable that was not yet told.
-                assert before <= last <= acknowledged[-1] + 1
-                assert [len(record.arrays["x"]) for record in copy.records()] == [n % 2000 for n in range(1, last + 1)]
-                assert newest.number == copy.newest
-                assert newest.upto == newest.arrays["sum"] <= last
-                assert last - newest.upto <= 3
-    finally:
-        writer.kill()
-        heard.join()
-        writer.stdout.close()
-        writer.wait()

@@ -2,14 +2,12 @@
 
 import errno
 import os
-import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
-from store import ReadOnlyError, RecordError, Store, StoreClosedError, StoreError, StoreFullError
+from store import ReadOnlyError, RecordError, Store, StoreError, StoreFullError
 
 
 @pytest.fixture
@@ -24,15 +22,6 @@ def labels(opened):
 
 def add(opened, *names):
     return [opened.append("a", name, b"", arrays={"x": np.arange(5)}).sequence for name in names]
-
-
-def test_a_batch_waits_for_the_disk_once(opened, monkeypatch):
-    calls, sync = [], os.fdatasync
-    monkeypatch.setattr(os, "fdatasync", lambda file: calls.append(1) or sync(file))
-    with opened.batch():
-        add(opened, *map(str, range(200)))
-    assert len(calls) == 1
-    assert len(labels(opened)) == 201
 
 
 class Mine(BaseException):
@@ -92,61 +81,6 @@ def test_after_a_failed_append_none_is_there_whether_or_not_the_caller_goes_on(o
     assert add(opened, "after") == [2]
 
 
-def test_a_commit_that_fails_takes_the_batch_back(opened):
-    with full_disk(), pytest.raises(StoreFullError), opened.batch():
-        add(opened, "one")
-    assert labels(opened) == ["before"]
-    assert add(opened, "after") == [2]
-
-
-def test_a_batch_that_cannot_be_retracted_at_once_hides_no_error_and_blocks_nothing(opened, monkeypatch, caplog):
-    def fail(*_):
-        raise OSError(errno.EIO, "the disk says no")
-
-    with monkeypatch.context() as broken:
-        broken.setattr(os, "fdatasync", fail)
-        broken.setattr(os, "ftruncate", fail)
-        with pytest.raises(StoreError, match="the disk says no"), opened.batch():
-            add(opened, "one")
-        assert "could not be taken back yet" in caplog.text
-        with pytest.raises(StoreError):
-            add(opened, "meanwhile")
-        assert labels(opened) == ["before"]
-    assert add(opened, "after") == [2]
-    with Store.open(opened.path, mode="read") as reader:
-        assert labels(reader) == ["before", "after"]
-
-
-def test_other_threads_wait_and_their_rows_come_after(opened):
-    inside, done = threading.Event(), []
-
-    def other():
-        inside.wait(10)
-        done.append(("append", *add(opened, "theirs")))
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    with opened.batch():
-        add(opened, "one")
-        inside.set()
-        time.sleep(0.05)
-        assert done == []
-        add(opened, "two")
-    thread.join(10)
-    assert done == [("append", 4)]
-    assert labels(opened) == ["before", "one", "two", "theirs"]
-
-
-def test_a_reader_sees_nothing_of_it_until_it_ends(opened):
-    with Store.open(opened.path, mode="read") as reader:
-        with opened.batch():
-            add(opened, "one", "two")
-            assert reader.last == 1
-            assert labels(reader) == ["before"]
-            assert len(list(reader.heads())) == 1
-        assert labels(reader) == ["before", "one", "two"]
-
-
 ONE = {"x": np.arange(3)}
 IMPOSSIBLE = {
     "commit": lambda opened: opened.commit(ONE, upto=1),
@@ -179,20 +113,6 @@ def test_a_batch_and_a_background_commit_do_not_wait_for_each_other_for_ever(ope
                 opened.flush()
     opened.flush()
     assert opened.last == 6
-
-
-def test_closing_from_another_thread_waits_for_the_batch(opened):
-    thread = threading.Thread(target=opened.close)
-    with opened.batch():
-        add(opened, "one")
-        thread.start()
-        time.sleep(0.05)
-        add(opened, "two")
-    thread.join(10)
-    with pytest.raises(StoreClosedError), opened.batch():
-        pass
-    with Store.open(opened.path) as again:
-        assert labels(again) == ["before", "one", "two"]
 
 
 def test_a_reader_has_no_batches(opened):

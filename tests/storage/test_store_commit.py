@@ -34,11 +34,6 @@ class Gate:
         return self.write(parent, number, draft, identity)
 
 
-def test_only_the_current_one_is_kept(opened):
-    assert [opened.commit(ONE, upto=0) for _ in range(4)] == [1, 2, 3, 4]
-    assert folders(opened.path) == ["00000004"]
-
-
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
     gate = Gate(monkeypatch)
     opened.append("a", "b", b"")
@@ -124,16 +119,6 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
         raise KeyError
 
 
-def test_a_failed_close_still_frees_the_store(tmp_path, monkeypatch):
-    opened = Store.open(tmp_path, identity={})
-    with monkeypatch.context() as broken:
-        broken.setattr(store.checkpoints, "write_checkpoint", fail)
-        opened.commit_later(ONE, upto=0)
-        with pytest.raises(StoreError, match="background commit failed"):
-            opened.close()
-    Store.open(tmp_path).close()
-
-
 def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
     opened.commit(ONE, upto=0)
     places = [(store.files, "sync_tree"), (store.checkpoint_files, "_write_zarr"), (store.files, "sync_folder")]
@@ -144,22 +129,6 @@ def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
                 opened.commit({"x": np.arange(3)}, upto=0)
         assert folders(opened.path) == ["00000001"]
         assert opened.latest().arrays["x"].tobytes() == ONE["x"].tobytes()
-
-
-def test_what_an_interrupted_commit_left_is_removed_by_the_next_writer(opened):
-    opened.commit(ONE, upto=0)
-    opened.close()
-    parent = opened.path / "checkpoints"
-    for name in ("00000002", "00000003.partial"):
-        (parent / name / "x").mkdir(parents=True)
-        (parent / name / "x" / "zarr.json").write_text("{}")
-    (parent / "notes").mkdir()
-    with Store.open(opened.path, mode="read") as reader:
-        assert reader.latest().number == 1
-    assert folders(opened.path) == ["00000001", "00000002", "00000003.partial", "notes"]
-    with Store.open(opened.path) as again:
-        assert folders(again.path) == ["00000001", "notes"]
-        assert again.commit(ONE, upto=0) == 2
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")

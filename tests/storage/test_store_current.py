@@ -9,10 +9,8 @@ from store_builds import (
     LAST,
     add,
     as_after_a_crash,
-    build,
     commit,
     contents,
-    cut_rows,
     damage,
     flip,
     folders,
@@ -27,7 +25,7 @@ from store_builds import (
     write_log,
 )
 
-from store import DamageError, NotAStoreError, Store, StoreError, VersionError, check_store, repair_store
+from store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
 from store.layout import log_path
 from store.log import LogReader
 from store.records import payload_digest
@@ -75,15 +73,6 @@ def test_what_is_lost_with_it_is_nothing(either, which, harm):
     with Store.open(either) as opened:
         add(opened, LAST + 1)
         commit(opened.compact, LAST + 1)
-
-
-@pytest.mark.parametrize("depth", [100, 900, 990, 1100, 5000, 20_000])
-def test_no_depth_of_it_is_an_error_of_another_kind(plain, depth):
-    for text in ("[" * depth + "]" * depth, '{"a":' * depth + "1" + "}" * depth):
-        (plain / "CURRENT").write_text(f'{{"x":{text},"sha256":"0"}}')
-        with pytest.raises(DamageError):
-            Store.open(plain)
-        assert damage(plain)
 
 
 def named(path, **changes):
@@ -214,28 +203,6 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
     assert damage(plain) == []
     with Store.open(plain) as opened:
         assert (opened.last, opened.latest()) == (LAST, None)
-
-
-def test_what_it_names_by_a_link_is_not_followed(plain, tmp_path):
-    for target in (log_of(plain), newest(plain), plain / "CURRENT"):
-        moved = target.rename(tmp_path / target.name)
-        target.symlink_to(moved)
-        for mode in ("read", "write"):
-            with pytest.raises(DamageError, match="symbolic link"):
-                Store.open(plain, mode=mode)
-        assert [problem.path for problem in check_store(plain)] == [target]
-        target.unlink()
-        moved.rename(target)
-    assert is_whole(plain, 0)
-
-
-def test_a_log_that_is_gone_is_named(plain):
-    log_of(plain).unlink()
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match=r"which .*CURRENT names, is not there: .* repair") as caught:
-            Store.open(plain, mode=mode)
-        assert caught.value.path == log_path(plain, 1)
-    assert repair_store(plain).kept == 15
 
 
 @pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
@@ -371,19 +338,3 @@ def test_a_log_of_holes_is_refused_at_once(plain):
         with pytest.raises(DamageError, match="are on the disk"):
             Store.open(plain, mode=mode)
     assert "are on the disk" in damage(plain)[0].what
-
-
-def test_rows_that_a_checkpoint_contains_and_the_log_has_lost_are_never_numbered_again(tmp_path):
-    path = build(tmp_path / "s")
-    cut_rows(path, 3)
-    with pytest.raises(StoreError):
-        Store.open(path)
-    assert repair_store(path).kept == 15
-    with Store.open(path) as opened:
-        assert add(opened, 16).sequence == 16
-    torn(path, frames(path)[16].offset)
-    with pytest.raises(DamageError, match="had row 16"):
-        Store.open(path)
-    assert repair_store(path).kept == 15
-    with Store.open(path) as opened:
-        assert opened.last == 15

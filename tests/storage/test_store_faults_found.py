@@ -46,13 +46,6 @@ def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(
             assert (again.last, again.compacted, before) == (3, 2, [])
 
 
-def test_a_log_that_is_not_there_is_damage(path):
-    log_of(path).unlink()
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match="is not there"):
-            Store.open(path, mode=mode)
-
-
 def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
     with Store.open(path, mode="read") as reader:
         os.truncate(log_of(path), 2**40)

@@ -3,16 +3,11 @@
 import os
 import random
 import shutil
-import threading
-import time
-from contextlib import suppress
-from pathlib import Path
 
-import numpy as np
 import pytest
 from store_builds import IDENTITY, LAST, damage, flip, frames, log_of, same_arrays, state, values
 
-from store import Store, StoreError, repair_store
+from store import Store, repair_store
 
 BATCH = 25
 
@@ -100,70 +95,3 @@ def test_whole_pages_of_rubbish_are_found_and_then_repaired(either, places):
     kept = repair_store(either).kept
     assert damage(either) == []
     assert is_a_state_there_has_been(content(either), whole, kept)
-
-
-def test_a_folder_copied_file_by_file_under_a_writer_gives_what_was_acknowledged_or_an_error(tmp_path, caplog):
-    rng, source, acknowledged, stop = random.Random(0), tmp_path / "s", [0], threading.Event()
-
-    def write():
-        with Store.open(source, identity=IDENTITY) as opened:
-            while not stop.is_set() and opened.last < 4000:
-                number = opened.last + 1
-                opened.append("a", f"row {number}", b"", arrays={"x": values(number % 7)})
-                acknowledged[0] = number
-                if number % 20 == 0:
-                    opened.commit({"sum": np.array(number), "bulk": np.full(3000, number)}, upto=number)
-                if number % 100 == 0:
-                    opened.compact({"sum": np.array(number - 9), "bulk": np.full(3000, number - 9)}, upto=number - 9)
-
-    writer = threading.Thread(target=write)
-    writer.start()
-    try:
-        outcomes = [end for number in range(12) for end in copied(source, tmp_path / str(number), rng, acknowledged)]
-    finally:
-        stop.set()
-        writer.join()
-    assert outcomes.count("right") > 5
-
-
-def copied(source, copy, rng, acknowledged):
-    """Copy the files in any order, while they change; what becomes of opening the copy, and of repairing it."""
-    while not acknowledged[0]:
-        time.sleep(0.001)
-    files = [Path(folder, name).relative_to(source) for folder, _, names in os.walk(source) for name in names]
-    rng.shuffle(files)
-    for file in files:
-        (copy / file).parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):
-            shutil.copyfile(source / file, copy / file)
-    yield opens_right(copy, acknowledged, "read")
-    yield opens_right(copy, acknowledged, "write")
-    try:
-        repair_store(copy)
-    except StoreError as error:
-        yield f"not repaired: {error}"
-    else:
-        assert damage(copy) == []
-        assert opens_right(copy, acknowledged, "write") == "right"
-    shutil.rmtree(copy)
-
-
-def opens_right(copy, acknowledged, mode):
-    try:
-        with Store.open(copy, mode=mode) as opened:
-            assert opened.identity == IDENTITY
-            found = opened.latest()
-            if found is not None:
-                assert found.arrays["sum"] == found.upto
-                assert found.arrays["bulk"].tolist() == [found.upto] * 3000
-            after = opened.compacted
-            for row in opened.records(after):
-                assert row.sequence == after + 1
-                assert row.label == f"row {row.sequence}"
-                assert row.arrays["x"].tobytes() == values(row.sequence % 7).tobytes()
-                after = row.sequence
-            # One more may have been on its way.
-            assert after == opened.last <= acknowledged[0] + 1
-    except StoreError as error:
-        return type(error).__name__
-    return "right"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from store_builds import flip_row, lose_rows
 
-from store import CompactedError, DamageError, Head, Record, RecordError, Store
+from store import DamageError, Head, Record, RecordError, Store
 
 
 @pytest.fixture
@@ -110,15 +110,3 @@ def test_damage_of_one_record_is_not_that_of_another(opened):
         assert [reader.record(sequence).sequence for sequence in (3, 6)] == [3, 6]
         assert sequences(reader.heads(5)) == [6, 7, 8, 9, 10]
         assert next(reader.heads(3)).sequence == 4  # its head verifies by itself
-
-
-def test_compacted_records_have_heads_only(opened):
-    before = list(opened.heads())
-    opened.commit({}, upto=10)
-    opened.compact({}, upto=6)
-    assert list(opened.heads()) == before
-    assert sequences(opened.heads(kind="take")) == [3, 6, 9]
-    for sequence in (1, 6):
-        with pytest.raises(CompactedError, match=f"row {sequence} .* rows 1 to 6 were"):
-            opened.record(sequence)
-    assert opened.record(7).arrays["x"].tolist() == list(range(7))

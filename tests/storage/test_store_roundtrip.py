@@ -112,25 +112,6 @@ def test_large_arrays_are_chunked_along_the_first_axis(kept):
     assert same(kept.latest().arrays, {"rows": rows.astype(np.int64)})
 
 
-def test_what_is_returned_is_the_callers_own(kept):
-    given = np.arange(5)
-    head = kept.append("a", "b", b"", arrays={"x": given})
-    given[:] = 0
-    kept.record(head.sequence).arrays["x"][:] += 1
-    (found,) = kept.records(head.sequence - 1)
-    assert found.arrays["x"].tolist() == [0, 1, 2, 3, 4]
-
-
-def test_few_distinct_values_come_out_small(tmp_path):
-    signs = np.random.default_rng(0).integers(-1, 2, 12_500)
-    with Store.open(tmp_path, identity={}) as opened:
-        empty = opened.size()["journal"]
-        for _ in range(20):
-            opened.append("a", "b", b"", arrays={"x": signs})
-    with Store.open(tmp_path) as opened:
-        assert opened.size()["journal"] - empty < 20 * signs.nbytes / 3
-
-
 REFUSED = {
     "label with NUL": {"label": "a\0b"},
     "lone surrogate": {"label": "a\ud800"},

@@ -84,7 +84,7 @@ class CheckpointChecks:
         observations = array(arrays, "observations", ("int64",), (count,))
         touches: list[int] = counts("observations", observations, 0, MOST_ROWS).tolist()
         lengths = array(arrays, "lengths", ("int64",), (None, 2))
-        counts("lengths", lengths[:, 0], 0, MOST_COLUMNS)
+        counts("lengths", lengths[:, 0], 1, MOST_COLUMNS)
         counts("lengths", lengths[:, 1], 1, MOST_ROWS)
         expect(len(np.unique(lengths[:, 0])) == len(lengths), "lengths", "different lengths", lengths[:, 0])
         total = int(lengths[:, 1].sum())

@@ -189,10 +189,11 @@ def abandon(learner: Any) -> None:
     held._closed = True
 
 
-def flip(path: Path, rng: random.Random) -> None:
-    """One bit of a file becomes another."""
+def flip(path: Path, rng: random.Random, *, last: int = 0) -> None:
+    """One bit of a file becomes another; last: among its last so many bytes before the zeros at its end."""
     data = bytearray(path.read_bytes())
-    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    end = len(data.rstrip(b"\0")) or len(data) if last else len(data)
+    data[rng.randrange(max(0, end - last) if last else 0, end)] ^= 1 << rng.randrange(8)
     path.write_bytes(data)
 
 

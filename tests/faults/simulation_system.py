@@ -17,6 +17,7 @@ from store import StoreError, repair_store
 from store.layout import read_current
 
 KEPT = ("kept", "pool", "exemplars")
+END = 600  # bytes of a log, which has its last row or two there
 
 
 class System(Carrying):
@@ -29,16 +30,13 @@ class System(Carrying):
         if rng.random() < 0.5:
             self._shut(machine)
         self.drop(machine)
-        files = [one for one in machine.path.rglob("*") if one.is_file() and one.stat().st_size]
-        files = [one for one in files if one.name not in ("lock", "holder.json")]
-        if not files:
-            return
         newest = read_current(machine.path / "CURRENT").newest
-        first = [one for one in files if one.parent == machine.path]
-        hurt = rng.choice(first if rng.random() < 0.6 else files)
-        flip(hurt, rng)
+        hurt, last = self._hurt(machine.path, rng)
+        flip(hurt, rng, last=last)
         self.disks.settle(machine.name)
-        self.say(f"  {machine.name}: a bit of {hurt.relative_to(machine.path)} is another")
+        self.say(
+            f"  {machine.name}: a bit of {hurt.relative_to(machine.path)} is another{', near its end' if last else ''}"
+        )
         whole = machine.rows
         allowed = [whole]
         if hurt.name.startswith("log-") and machine.sure < len(whole.rows):
@@ -79,6 +77,19 @@ class System(Carrying):
                 self.say(f"    reading what was opened: {error!r:.150}")
                 self.drop(machine)
         self._repair(machine, whole, hurt, 0 if newest is None else newest.upto)
+
+    @staticmethod
+    def _hurt(path: Path, rng: random.Random) -> tuple[Path, int]:
+        """A file of a memory, and how many of its last bytes are meant, 0 for all: all kinds of files are."""
+        files = [one for one in sorted(path.rglob("*")) if one.is_file() and one.stat().st_size]
+        files = [one for one in files if one.name not in ("lock", "holder.json")]
+        chunks = [one for one in files if "c" in one.relative_to(path).parts]
+        kind = rng.choice(("CURRENT", "log", "end of the log", "chunk", "any"))
+        if kind == "CURRENT":
+            return path / "CURRENT", 0
+        if "log" in kind:
+            return rng.choice([one for one in files if one.name.startswith("log-")]), END * (kind != "log")
+        return rng.choice(chunks if kind == "chunk" and chunks else files), 0
 
     def _repair(self, machine: Machine, whole: Rows, hurt: Path, contained: int) -> None:
         """contained: the last row that the newest checkpoint contained."""

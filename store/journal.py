@@ -121,7 +121,7 @@ class _OpenLog:
 
     def _read_before(self) -> None:
         until = self.places[0][1].offset
-        earlier = Rows() if self._files.is_packed else self.index.read(until)
+        earlier = Rows() if self._files.is_packed else self.index.read(self.log, until)
         for _ in earlier.take(self.log.beginning_at(self.index.end), until):
             pass
         earlier.extend(self.rows)

@@ -65,10 +65,13 @@ class World:
         for name in MACHINES:
             (self.root / name).mkdir(parents=True)
         self.net.mkdir()
+        self.trees = home / "trees"
+        self.trees.mkdir()
         self.disks = Disks(self.root, shim, log)
         self.machines = [Machine(name, self.root / name / "memory") for name in MACHINES]
         self.bucket: dict[str, list[tuple[bytes, Rows]]] = {}
         self.flying: list[tuple[int, str, tuple[bytes, Rows]]] = []
+        self.derived: list[dict[str, bytes]] = []
         self.step = 0
         self.counts = counts
         self.warned: list[str] = []

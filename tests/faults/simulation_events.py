@@ -201,7 +201,7 @@ class OneMemory(World):
     def _backup(self, machine: Machine, rng: random.Random) -> None:
         if self.opened(machine, rng) is None:
             return
-        rows, to = machine.rows, machine.path.with_name(f"copy-{self.step}")
+        rows, begins, to = machine.rows, list(machine.begins), machine.path.with_name(f"copy-{self.step}")
         # While it copies, the memory goes on.
         then, place = rows, rng.choice((-1, 0, 1, 5, 20))
         if place >= 0:
@@ -219,14 +219,14 @@ class OneMemory(World):
             return "done"
 
         done = self._do(machine, rng, f"backup {to.name}, going on at {place}", do, lambda _: (then, "done"))
-        machine.copies[to] = [rows, then], done == "done"
+        machine.copies[to] = [rows, then], done == "done", begins
 
     def _restore(self, machine: Machine, rng: random.Random) -> None:
         """A copy is whole; now and then it takes the memory's place, or is copied over it, file by file."""
         if not machine.copies:
             return
         path = rng.choice(sorted(machine.copies))
-        rows, acknowledged = machine.copies[path]
+        rows, acknowledged, begins = machine.copies[path]
         if not path.exists():
             if acknowledged:
                 raise Wrong(f"{path.name} of {machine.name} is gone")
@@ -240,7 +240,7 @@ class OneMemory(World):
                 shutil.rmtree(machine.path, ignore_errors=True)
             shutil.copytree(path, machine.path, dirs_exist_ok=True)
             self.disks.settle(machine.name)
-            machine.candidates, machine.sure = rows, 0
+            machine.candidates, machine.begins = rows, begins
             machine.made = True
             self.say(f"  {machine.name}: restored {path.name}{', over what was there' if over else ''}")
             self.counts[f"restored{' over what was there' if over else ''}"] += 1

@@ -36,8 +36,8 @@ class Rotting(Carrying):
         self.counts[f"rot: of {kind}"] += 1
         whole = machine.rows
         allowed = [whole]
-        if hurt.name.startswith("log-") and machine.sure < len(whole.rows):
-            allowed.append(whole.cut(max(machine.sure, whole.base)))
+        if hurt.name.startswith("log-") and machine.begins:
+            allowed.append(whole.cut(max(machine.begins[-1], whole.base)))
         machine.candidates = allowed
         self.warned.clear()
 
@@ -131,7 +131,7 @@ class Rotting(Carrying):
         if unlisted or base > whole.base or heads < len(rows.rows):
             self._with_less(machine, rows)
             return
-        machine.candidates, machine.sure = [rows], min(repair.kept, len(rows.rows))
+        machine.candidates, machine.begins = [rows], []
 
     def _with_less(self, machine: Machine, rows: Rows) -> None:
         """A memory of which a repair left less knows still what it learned, and learns on."""
@@ -153,7 +153,7 @@ class Rotting(Carrying):
         shutil.rmtree(self.root / machine.name)
         (self.root / machine.name).mkdir()
         self.disks.settle(machine.name)
-        machine.candidates, machine.copies, machine.made, machine.sure = [Rows()], {}, False, 0
+        machine.candidates, machine.copies, machine.made, machine.begins = [Rows()], {}, False, []
         self.counts["disks replaced"] += 1
 
     def _derived(self, machine: Machine, rng: random.Random) -> None:

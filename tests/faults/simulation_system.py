@@ -40,7 +40,7 @@ class System(Rotting):
             self._shut(machine)
             if problems := self._problems(machine.path):
                 raise Wrong(f"at the end {machine.name} has {problems}")
-            for path, (_, acknowledged) in machine.copies.items():
+            for path, (_, acknowledged, _) in machine.copies.items():
                 if acknowledged and not path.exists():
                     raise Wrong(f"{path.name} of {machine.name} is gone")
         self._merge_all(rng)

@@ -18,7 +18,18 @@ from typing import NamedTuple, Self
 from store.encoding import RATIO, SPARE
 from store.exceptions import DamageError, StoreClosedError, StoreError, VersionError, reported
 from store.files import open_regular
-from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
+from store.framing import (
+    COMMIT,
+    FRAME_BYTES,
+    HEADER,
+    LARGEST_PAYLOAD,
+    MARK,
+    NO_CHECKSUM,
+    VERSION,
+    Frame,
+    pack_frame,
+    read_frame,
+)
 from store.records import LARGEST_NUMBER, payload_digest
 
 __all__ = ["LogFile", "LogReader", "Place", "find_identity"]
@@ -330,6 +341,9 @@ class LogReader:
             if found == known:
                 return known
         if self.durable is not None and torn.offset < self.durable.offset:
+            commit = pack_frame(self.identity, torn.offset, torn.number, torn.batch, COMMIT, b"", torn.previous)[1]
+            if Place.behind(commit) == self.durable:
+                return commit  # as it was: all of its batch is there but for this frame
             with suppress(DamageError):
                 return self._commit_before(self.durable)
         proofs = (frame for frame in self._frames(torn.offset) if not torn.can_be_torn_before(frame))

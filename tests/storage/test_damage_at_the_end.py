@@ -48,3 +48,26 @@ def test_what_a_repair_leaves_is_read_to_its_end(compacted):
     assert repair_store(compacted).kept == 2
     with Store.open(compacted, mode="read") as store:
         assert [record.label for record in store.records(after=1)] == ["1"]
+
+
+@pytest.mark.parametrize("place", [20, 80])
+def test_rows_of_a_batch_whose_end_alone_is_damaged_are_kept(tmp_path, place):
+    """What CURRENT has of the place behind it tells what the last frame was."""
+    folder = tmp_path / "store"
+    with Store.open(folder, identity={"for": "a test"}) as store:
+        with store.batch():
+            for i in range(3):
+                store.append("row", f"{i}", b"key", arrays=ARRAYS)
+        store.commit(ARRAYS, upto=3)
+    log = folder / "log-00000001"
+    data = bytearray(log.read_bytes())
+    data[len(data) - 88 + place] ^= 1
+    log.write_bytes(data)
+    with pytest.raises(DamageError, match="repair"):
+        Store.open(folder)
+    assert {problem.kind for problem in check_store(folder)} == {"spare"}
+    repair = repair_store(folder)
+    assert (repair.kept, repair.lost) == (3, [])
+    with Store.open(folder) as store:
+        assert store.compacted == 0
+        assert [record.label for record in store.records()] == ["0", "1", "2"]

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from faults.planting import Patches, nothing
-from store import backup, checkpoint_files, chunks, journal, layout, log, rows
+from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, rows
 
 
 def _payload_not_looked_at(patch: Patches) -> None:
@@ -44,7 +44,14 @@ def _current_not_looked_at(patch: Patches) -> None:
 
         return found
 
+    # What a checkpoint says of itself is compared with what CURRENT says of it. That alone lets one bit in 3900 pass.
+    def make_verified(_: Any) -> Any:
+        return lambda self, named: checkpoint_files.CheckpointReader(
+            layout.checkpoint_path(self._folder, named.number), self._files
+        )
+
     patch(layout.Current, "from_bytes", make)
+    patch(checkpoints.Checkpoints, "_verified", make_verified)
 
 
 class _Same(str):

@@ -79,12 +79,17 @@ class Rotting(Carrying):
         files = [one for one in sorted(path.rglob("*")) if one.is_file() and one.stat().st_size]
         files = [one for one in files if one.name not in ("lock", "holder.json")]
         logs = [one for one in files if one.name.startswith("log-")]
-        chunks = [one for one in files if "c" in one.relative_to(path).parts]
-        kind = rng.choice(("CURRENT", "a number", "the log", "the end of the log", "a chunk", "any"))
-        if kind in ("CURRENT", "a number"):
-            hurt = path / "CURRENT"
-        else:
-            hurt = rng.choice((logs if "log" in kind else chunks if "chunk" in kind else files) or files)
+        of_kind = {
+            "CURRENT": [path / "CURRENT"],
+            "a number": [path / "CURRENT"],
+            "the log": logs,
+            "the end of the log": logs,
+            "a chunk": [one for one in files if "c" in one.relative_to(path).parts],
+            "a checkpoint's own words": sorted(path.glob("checkpoints/*/zarr.json")),
+            "any": files,
+        }
+        kind = rng.choice(list(of_kind))
+        hurt = rng.choice(of_kind[kind] or files)
         if kind == "a number":
             flip(hurt, rng, in_numbers, bits=4)  # most are digits still
         else:

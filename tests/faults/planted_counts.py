@@ -108,7 +108,7 @@ def _shared_twice(patch: Patches) -> None:
 
 def _packed_twice(patch: Patches) -> None:
     def make(sums: Any) -> Any:
-        return lambda source, memory, left_out: sums(source, memory, set())
+        return lambda source, newest, memory, left_out: sums(source, newest, memory, set())
 
     patch(merge, "sums_without", make)
 

@@ -7,7 +7,7 @@ import os
 import random
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -201,23 +201,26 @@ def abandon(learner: Any) -> None:
     held._closed = True
 
 
-def flip(path: Path, rng: random.Random, where: Callable[[bytes], Sequence[int]] | None = None, bits: int = 8) -> None:
+Where = Callable[[bytes, random.Random], range]
+
+
+def flip(path: Path, rng: random.Random, where: Where | None = None, bits: int = 8) -> None:
     """One bit of a file becomes another; where: the bytes that it may be in; bits: the lowest that it may be."""
     data = bytearray(path.read_bytes())
-    place = rng.randrange(len(data)) if where is None else rng.choice(where(bytes(data)))
+    place = rng.randrange(len(data)) if where is None else rng.choice(where(bytes(data), rng))
     data[place] ^= 1 << rng.randrange(bits)
     path.write_bytes(data)
 
 
-def near_the_end(data: bytes) -> range:
+def near_the_end(data: bytes, _: random.Random) -> range:
     """The last bytes before the zeros at the end, which in a log have its last row or two."""
     end = len(data.rstrip(b"\0")) or len(data)
     return range(max(0, end - LAST_BYTES), end)
 
 
-def in_numbers(data: bytes) -> list[int]:
-    """The digits of the numbers in JSON, and not those in text."""
-    return [place for found in NUMBER.finditer(data) for place in range(*found.span())]
+def in_a_number(data: bytes, rng: random.Random) -> range:
+    """The digits of a number in JSON, long ones as often as short ones, and not those in text."""
+    return range(*rng.choice([found.span() for found in NUMBER.finditer(data)]))
 
 
-__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "in_numbers", "near_the_end", "prepare"]
+__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "in_a_number", "near_the_end", "prepare"]

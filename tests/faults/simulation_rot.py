@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.simulation_bucket import Carrying
-from faults.simulation_disk import abandon, flip, in_numbers, near_the_end
+from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_model import Rows
 from faults.simulation_touches import MATERIALS, stream
 from faults.simulation_world import Machine, Wrong
@@ -91,7 +91,7 @@ class Rotting(Carrying):
         kind = rng.choice(list(of_kind))
         hurt = rng.choice(of_kind[kind] or files)
         if kind == "a number":
-            flip(hurt, rng, in_numbers, bits=4)  # most are digits still
+            flip(hurt, rng, in_a_number, bits=4)  # most are digits still
         else:
             flip(hurt, rng, near_the_end if "end" in kind else None)
         return hurt, kind

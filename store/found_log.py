@@ -115,7 +115,9 @@ class FoundLog:
         except ValueError:
             pass
         self.damage.append(str(damage))
-        self.torn.add(before)
+        is_commit = log.durable is not None and log.durable[:2] == (offset + FRAME_BYTES, (damage.frame or 0) + 1)
+        if not is_commit:  # which is no row
+            self.torn.add(before)
 
     def _note_row(self, log: LogReader, sequence: int, offset: int, size: int) -> None:
         if self.rows and sequence <= self.rows[-1][0]:

@@ -233,7 +233,7 @@ class Journal:
         arrays: as records, one in memory at a time. Raises DamageError at the first that is not as it was written,
         or that is missing itself where all are asked for; CompactedError where a base has the arrays' place.
         """
-        chosen = kind is not None or label is not None
+        chosen, begin = kind is not None or label is not None, after
         while after < last:
             head = None
             with self._using(f"reading rows behind {after}") as at:
@@ -245,7 +245,7 @@ class Journal:
                     else:
                         self._require_no_gap(at, after, min(found - 1, last), index)
                     if found > last:
-                        return
+                        break
                     head = self._record(at, index) if arrays else self._head(at, index)
                 except DamageError as damage:
                     if at.drop_index():
@@ -256,6 +256,16 @@ class Journal:
             after = found
             if head is not None and kind in (None, head.kind) and label in (None, head.label):
                 yield head
+        if not chosen:
+            self._require_no_damage_at_the_end(begin, last)
+
+    def _require_no_damage_at_the_end(self, after: int, last: int) -> None:
+        """Raise for rows behind `after` that are damaged and are the last: frames that go on behind them prove it."""
+        with self._using("reading the last rows") as at:
+            begin, end = self.place(after).offset, at.log.place.offset
+            for damage in at.rows.damage.get(len(at.rows), ()) if last >= at.last else ():
+                if damage.offset is not None and begin <= damage.offset < end:
+                    raise DamageError(f"{damage}: repair the store (repair_store)", path=at.path)
 
     def _require_no_gap(self, at: OpenLog, after: int, through: int, index: int) -> None:
         why = at.rows.damage.get(index)

@@ -13,7 +13,18 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from store.exceptions import DamageError, StoreError, VersionError, reported
-from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
+from store.framing import (
+    COMMIT,
+    FRAME_BYTES,
+    HEADER,
+    LARGEST_PAYLOAD,
+    MARK,
+    NO_CHECKSUM,
+    VERSION,
+    Frame,
+    pack_frame,
+    read_frame,
+)
 from store.log_file import PART, LogFile, Window
 from store.records import LARGEST_NUMBER, payload_digest
 
@@ -228,6 +239,9 @@ class LogReader:
             if found == known:
                 return known
         if self.durable is not None and torn.offset < self.durable.offset:
+            commit = pack_frame(self.identity, torn.offset, torn.number, torn.batch, COMMIT, b"", torn.previous)[1]
+            if Place.behind(commit) == self.durable:
+                return commit  # as it was: all of its batch is there but for this frame
             with suppress(DamageError):
                 return self._commit_before(self.durable)
         proofs = (frame for frame in self._frames(torn.offset) if not torn.can_be_torn_before(frame))

@@ -121,9 +121,7 @@ class OpenLog:
     def _rows_until(self, until: int, *, indexed: bool) -> Rows:
         """Return all rows before an offset, by the index as far as it goes and is of this log, if it may be used."""
         self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
-        rows = self.index.read(until) if indexed else Rows()
-        if not self.log.has_place(self.index.end):
-            return self._rows_until(until, indexed=False)
+        rows = self.index.read(self.log, until) if indexed else Rows()
         for _ in rows.take(self.log.beginning_at(self.index.end), until):
             pass
         return rows

@@ -145,8 +145,8 @@ class Index:
         """How many rows it has."""
         return sum(segment.count for segment in self._segments)
 
-    def read(self, until: int) -> Rows:
-        """Return the rows that the files have, none behind an offset."""
+    def read(self, log: LogReader, until: int) -> Rows:
+        """Return the rows that the files have, none behind an offset, nor what the log never had or has no more."""
         rows = Rows()
         while True:
             path = self._path(self.end)
@@ -158,6 +158,9 @@ class Index:
                     logger.info("%s is not used: %s", path, error)
                 return rows
             if segment.begin != self.end or segment.end.offset > until or segment.end.offset <= segment.begin.offset:
+                return rows
+            if not log.has_place(segment.end):  # a copy of the store was put over it, and another way taken
+                logger.info("%s is not used: the log has not come that way", path)
                 return rows
             rows.extend(found)
             self._segments.append(segment)

@@ -48,16 +48,18 @@ WEIGHTS = {
     "reader": 3,
     "refresh": 10,
     "leave": 2,
-    "backup": 1.5,
-    "restore": 1.5,
+    "backup": 2.5,
+    "restore": 4,
     "pack": 4,
     "collect": 5,
     "merge": 3,
-    "rot": 2.5,
+    "rot": 3.5,
+    "derived": 4,
     "quiet": 3,
 }
 QUICK_SEEDS = 12
 QUICK_PLANTS = ("the log is not synced", "CURRENT is not synced", "a retraction is lost in a merge")
+MISFITS = ("=> AttributeError", "=> NameError", "=> TypeError")  # of a bug that is put in where nothing is
 Event = tuple[str, int]
 
 
@@ -84,7 +86,7 @@ class Simulation:
             with warnings_told(world.warned.append):
                 for kind, seed in events:
                     world.play(kind, seed)
-                world.finish(random.Random(len(events)))
+                world.finish(random.Random(events[-1][1]))
         except Exception as error:
             self._shim.disarm()
             return f"{type(error).__name__}: {error}", world.told
@@ -209,6 +211,8 @@ def planted(simulation: Simulation, options: argparse.Namespace) -> int:
                 found[name] = {"seeds": None, "tried": options.seeds}
             else:
                 told = simulation.tell(failed, shorten=False).splitlines()[-1]
+                if told.startswith(MISFITS):
+                    sys.exit(f"{name} does not fit what it spoils any more: {told}")
                 if options.plant:
                     progress(simulation.tell(failed))
                 taken = failed + 1 - options.first

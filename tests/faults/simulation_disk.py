@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ from store.content import ArrayContent
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
 EVERY = 4  # rows that are put into an index
+LAST_BYTES = 600
+NUMBER = re.compile(rb"(?<=[ \[])\d+(?=[,\]}])")
 ARRAY = {"zarr_format": 3, "node_type": "array", "fill_value": 0, "storage_transformers": []}
 
 
@@ -52,6 +55,15 @@ class Disks(Disk):
         """Take in what was done."""
         for event in done:
             self.apply(event)
+
+    @contextmanager
+    def taken_in(self) -> Iterator[None]:
+        """In the block what is done is done, without any fate."""
+        self.begin()
+        try:
+            yield
+        finally:
+            self.go(self.end())
 
     def cut(self, name: str, rng: random.Random) -> str:
         """Pull the plug of a machine; how its disk was left."""
@@ -189,11 +201,26 @@ def abandon(learner: Any) -> None:
     held._closed = True
 
 
-def flip(path: Path, rng: random.Random) -> None:
-    """One bit of a file becomes another."""
+Where = Callable[[bytes, random.Random], range]
+
+
+def flip(path: Path, rng: random.Random, where: Where | None = None, bits: int = 8) -> None:
+    """One bit of a file becomes another; where: the bytes that it may be in; bits: the lowest that it may be."""
     data = bytearray(path.read_bytes())
-    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    place = rng.randrange(len(data)) if where is None else rng.choice(where(bytes(data), rng))
+    data[place] ^= 1 << rng.randrange(bits)
     path.write_bytes(data)
 
 
-__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "prepare"]
+def near_the_end(data: bytes, _: random.Random) -> range:
+    """The last bytes before the zeros at the end, which in a log have its last row or two."""
+    end = len(data.rstrip(b"\0")) or len(data)
+    return range(max(0, end - LAST_BYTES), end)
+
+
+def in_a_number(data: bytes, rng: random.Random) -> range:
+    """The digits of a number in JSON, long ones as often as short ones, and not those in text."""
+    return range(*rng.choice([found.span() for found in NUMBER.finditer(data)]))
+
+
+__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "in_a_number", "near_the_end", "prepare"]

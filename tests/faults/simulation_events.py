@@ -169,13 +169,11 @@ class OneMemory(World):
         machine.readers = []
         if not readers_only and machine.learner is not None:
             learner, machine.learner = machine.learner, None
-            self.disks.begin()
-            try:
-                learner.close()
-            except StoreError as error:  # of an earlier background commit
-                self.say(f"    closing said {error!r:.100}")
-            finally:
-                self.disks.go(self.disks.end())
+            with self.disks.taken_in():
+                try:
+                    learner.close()
+                except StoreError as error:  # of an earlier background commit
+                    self.say(f"    closing said {error!r:.100}")
 
     def _cut(self, machine: Machine, rng: random.Random) -> None:
         self.crash(machine, rng, "cut")
@@ -203,7 +201,7 @@ class OneMemory(World):
     def _backup(self, machine: Machine, rng: random.Random) -> None:
         if self.opened(machine, rng) is None:
             return
-        rows, to = machine.rows, machine.path.with_name(f"copy-{self.step}")
+        rows, begins, to = machine.rows, list(machine.begins), machine.path.with_name(f"copy-{self.step}")
         # While it copies, the memory goes on.
         then, place = rows, rng.choice((-1, 0, 1, 5, 20))
         if place >= 0:
@@ -213,6 +211,7 @@ class OneMemory(World):
         def do(learner: Any) -> str:
             def between() -> None:
                 learner.observe(material, stream(touch), again=True)
+                learner._ledger.require_writing()  # passes over the failure of an earlier generation
                 learner._ledger._snapshot()
 
             with interleaved(place, between):
@@ -220,14 +219,14 @@ class OneMemory(World):
             return "done"
 
         done = self._do(machine, rng, f"backup {to.name}, going on at {place}", do, lambda _: (then, "done"))
-        machine.copies[to] = [rows, then], done == "done"
+        machine.copies[to] = [rows, then], done == "done", begins
 
     def _restore(self, machine: Machine, rng: random.Random) -> None:
-        """A copy is whole; now and then it takes the memory's place."""
+        """A copy is whole; now and then it takes the memory's place, or is copied over it, file by file."""
         if not machine.copies:
             return
         path = rng.choice(sorted(machine.copies))
-        rows, acknowledged = machine.copies[path]
+        rows, acknowledged, begins = machine.copies[path]
         if not path.exists():
             if acknowledged:
                 raise Wrong(f"{path.name} of {machine.name} is gone")
@@ -236,15 +235,15 @@ class OneMemory(World):
             raise Wrong(f"{path.name} of {machine.name}: {problems}")
         if rng.random() < 0.5:
             self._shut(machine)
-            self.disks.begin()
-            shutil.rmtree(machine.path, ignore_errors=True)
-            shutil.copytree(path, machine.path)
-            self.disks.end()
+            over = rng.random() < 0.5
+            if not over:
+                shutil.rmtree(machine.path, ignore_errors=True)
+            shutil.copytree(path, machine.path, dirs_exist_ok=True)
             self.disks.settle(machine.name)
-            machine.candidates, machine.sure = rows, 0
+            machine.candidates, machine.begins = rows, begins
             machine.made = True
-            self.say(f"  {machine.name}: restored {path.name}")
-            self.counts["restored"] += 1
+            self.say(f"  {machine.name}: restored {path.name}{', over what was there' if over else ''}")
+            self.counts[f"restored{' over what was there' if over else ''}"] += 1
         else:
             learner = self._open(machine, path, rows, "read")
             self.look(Machine(path.name, path, rows), learner, "a backup")

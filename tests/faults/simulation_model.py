@@ -166,7 +166,7 @@ def packed(ours: Rows, rows: bool) -> Rows:
 
 
 def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> Then:
-    """As `Ledger.merge`, and `Ledger.merge_sources` where one_name."""
+    """As `Ledger.merge`, and `Ledger.merge_sources` where one_name: a touch that came twice there is counted once."""
     if ours.embedding != theirs.embedding:
         return ours, "MismatchError"
     have = {pair for _, pair in ours.listed}
@@ -174,11 +174,14 @@ def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> 
     for _, (material, touch) in ours.listed:
         names.setdefault(touch, []).append(material)
     both = {sequence for sequence, pair in theirs.listed if pair in have}
-    refused, came = set[int](), dict[Touch, str]()
+    refused, again, came = set[int](), set[int](), dict[Touch, str]()
     for sequence, (material, touch) in theirs.listed if one_name else ():
+        before = touch in came
         if material not in (names.get(touch) or [came.setdefault(touch, material)]):
             refused.add(sequence)
-    out = (both if once else set()) | refused
+        elif before and sequence > theirs.base and theirs.rows[sequence - 1][0] == "observe":
+            again.add(sequence)
+    out = (both if once else set()) | refused | again
     if any(sequence <= theirs.base or theirs.rows[sequence - 1][0] == "member" for sequence in out):
         return ours, "ObservationError"
     new = {name: said for name, said in theirs.said.items() if repr(ours.said.get(name)) != repr(said)}
@@ -194,7 +197,7 @@ def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> 
         elif row[0] != "merge":
             added.append(("member", *row[1:]))
     count = sum(row[0] in LISTED for _, row in coming)
-    return ours.plus(*added), [count, len(both), len(new), len(refused)]
+    return ours.plus(*added), [count, len(both) + len(again), len(new), len(refused)]
 
 
 def seen(learner: TactileLearner) -> dict[str, Any]:

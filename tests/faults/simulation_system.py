@@ -1,156 +1,22 @@
-"""Files at rest that change by a bit, and the end of a simulation: the last of its events."""
+"""The end of a simulation: all is sound, and all of it is merged into one."""
 
 from __future__ import annotations
 
 import random
-import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from faults.simulation_bucket import Carrying
-from faults.simulation_disk import abandon, flip
+from faults import simulation_model as model
 from faults.simulation_model import Rows
-from faults.simulation_touches import MATERIALS, stream
+from faults.simulation_rot import Rotting
+from faults.simulation_touches import EMBEDDINGS, SETTINGS
 from faults.simulation_world import Machine, Wrong
-from store import StoreError, repair_store
-from store.layout import read_current
-
-KEPT = ("kept", "pool", "exemplars")
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError
 
 
-class System(Carrying):
-    """All events."""
-
-    def _rot(self, machine: Machine, rng: random.Random) -> None:
-        """A bit of a file at rest is another: the memory is the same, or refused by name and repaired."""
-        if not machine.made or len(machine.candidates) > 1 or not machine.path.exists():
-            return
-        if rng.random() < 0.5:
-            self._shut(machine)
-        self.drop(machine)
-        files = [one for one in machine.path.rglob("*") if one.is_file() and one.stat().st_size]
-        files = [one for one in files if one.name not in ("lock", "holder.json")]
-        if not files:
-            return
-        newest = read_current(machine.path / "CURRENT").newest
-        first = [one for one in files if one.parent == machine.path]
-        hurt = rng.choice(first if rng.random() < 0.6 else files)
-        flip(hurt, rng)
-        self.disks.settle(machine.name)
-        self.say(f"  {machine.name}: a bit of {hurt.relative_to(machine.path)} is another")
-        whole = machine.rows
-        allowed = [whole]
-        if hurt.name.startswith("log-") and machine.sure < len(whole.rows):
-            allowed.append(whole.cut(max(machine.sure, whole.base)))
-        machine.candidates = allowed
-        self.warned.clear()
-
-        def look(learner: Any, where: str, *, settle: bool = False) -> None:
-            # Of a damaged base a warning tells that nothing can take the place of what is retracted.
-            named = any("no other touch can take the place" in text for text in self.warned)
-            self.look(machine, learner, f"{where} after a bit of {hurt.name} changed", settle=settle, but=KEPT * named)
-
-        try:
-            learner = self._open(machine, machine.path, allowed, "read")
-            look(learner, "read")
-            learner.close()
-        except StoreError as error:
-            self.counts["rot: refused to read"] += 1
-            self.say(f"    reading: {error!r:.150}")
-        try:
-            self.disks.begin()
-            machine.learner = self._open(machine, machine.path, allowed)
-        except StoreError as error:
-            self.counts["rot: refused"] += 1
-            self.say(f"    writing: {error!r:.150}")
-        finally:
-            self.disks.go(self.disks.end())
-        if machine.learner is not None:
-            try:
-                look(machine.learner, "opened", settle=True)
-                self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
-                if not self._problems(machine.path):
-                    return
-                self.counts["rot: named by a check alone"] += 1
-                self.drop(machine)
-            except StoreError as error:
-                self.counts["rot: refused when it was read"] += 1
-                self.say(f"    reading what was opened: {error!r:.150}")
-                self.drop(machine)
-        self._repair(machine, whole, hurt, 0 if newest is None else newest.upto)
-
-    def _repair(self, machine: Machine, whole: Rows, hurt: Path, contained: int) -> None:
-        """contained: the last row that the newest checkpoint contained."""
-        refused = None
-        self.disks.begin()
-        try:
-            repair = repair_store(machine.path)
-        except StoreError as error:
-            refused = error
-        finally:
-            self.disks.go(self.disks.end())
-        if refused is not None:
-            self.say(f"    repairing: {refused!r:.200}")
-            self.counts["rot: not repaired"] += 1
-            self._replace(machine)
-            return
-        self.say(f"    repaired: {repair!r:.300}")
-        self.counts["rot: repaired"] += 1
-        rows = whole.cut(repair.kept)
-        if not repair.lost and repair.kept < len(whole.rows):
-            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows, and tells of no loss")
-        if repair.kept < whole.base:  # the base is lost: with it all that it stood for
-            self._replace(machine)
-            return
-        if repair.kept < len(whole.rows) and (not hurt.name.startswith("log-") or repair.kept < contained):
-            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows")
-        try:
-            learner = self._open(machine, machine.path, [rows], "read")
-        except StoreError as error:
-            raise Wrong(f"repaired after {hurt.name}, and not opened: {error!r}") from error
-        base = learner._ledger.store.compacted
-        listed = {each.sequence for each in learner.observations()}
-        heads = sum(1 for _ in learner._ledger.store.heads())
-        learner.close()
-        if base < rows.base:
-            raise Wrong(f"a repair of {hurt.name} left the base at {base}, which was {rows.base}")
-        if base > rows.base:
-            # What a later row took back of those counts again: a warning tells of it at each opening.
-            rows = replace(rows, base=base, stands=rows.cut(base).based(base).stands)
-        unlisted = {sequence for sequence, _ in rows.listed if sequence <= base and sequence not in listed}
-        if len(unlisted) > 1:
-            raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
-        # A row of another kind may be left out, too, such as one that took another back.
-        if unlisted or base > whole.base or heads < len(rows.rows):
-            self._with_less(machine, rows)
-            return
-        machine.candidates, machine.sure = [rows], min(repair.kept, len(rows.rows))
-
-    def _with_less(self, machine: Machine, rows: Rows) -> None:
-        """A memory of which a repair left less knows still what it learned, and learns on."""
-        self.counts["rot: repaired, with less"] += 1
-        learner = self._open(machine, machine.path, [rows])
-        try:
-            for candidate in (rows, rows.plus(("observe", MATERIALS[0], 0))):
-                if candidate is not rows:
-                    learner.observe(MATERIALS[0], stream(0), again=True)
-                machine.candidates = [candidate]
-                self.look(machine, learner, "repaired with less", but=("listed", *KEPT))
-        finally:
-            abandon(learner)
-        self._replace(machine)  # nothing of this was written down
-
-    def _replace(self, machine: Machine) -> None:
-        """A new disk, and nothing on it."""
-        self.drop(machine)
-        shutil.rmtree(self.root / machine.name)
-        (self.root / machine.name).mkdir()
-        self.disks.settle(machine.name)
-        machine.candidates, machine.copies, machine.made, machine.sure = [Rows()], {}, False, 0
-        self.counts["disks replaced"] += 1
-
-    # The end.
+class System(Rotting):
+    """All events, and the end."""
 
     def quiet(self) -> None:
         """All that is open is as it must be."""
@@ -168,15 +34,65 @@ class System(Carrying):
             if not machine.made:
                 continue
             self.crash(machine, rng, "cut")
-            self.disks.begin()
-            try:
+            with self.disks.taken_in():
                 machine.learner = self._open(machine, machine.path, machine.candidates)
-            finally:
-                self.disks.go(self.disks.end())
             self.look(machine, machine.learner, "at the end", settle=True)
             self._shut(machine)
             if problems := self._problems(machine.path):
                 raise Wrong(f"at the end {machine.name} has {problems}")
-            for path, (_, acknowledged) in machine.copies.items():
+            for path, (_, acknowledged, _) in machine.copies.items():
                 if acknowledged and not path.exists():
                     raise Wrong(f"{path.name} of {machine.name} is gone")
+        self._merge_all(rng)
+
+    def _merge_all(self, rng: random.Random) -> None:
+        """All memories, and the packed ones in the bucket, become one: the branches of a tree, merged two by two."""
+        branches = [(machine.path, machine.rows) for machine in self.machines if machine.made]
+        for name, versions in sorted(self.bucket.items()):
+            data, rows = rng.choice(versions)
+            branches.append((self.net / f"{name}.zip", rows))
+            branches[-1][0].write_bytes(data)
+        if not branches:
+            return
+        embedding = rng.choice(branches)[1].embedding
+        branches = [branch for branch in branches if branch[1].embedding == embedding and not branch[1].unlisted]
+        rng.shuffle(branches)
+        touches = sorted(pair for _, rows in branches for pair in rows.pairs)
+        once = rng.random() < 0.5
+        while len(branches) > 1 or not branches[0][0].is_relative_to(self.trees):
+            two = [branches.pop(rng.randrange(len(branches))) for _ in range(min(2, len(branches)))]
+            branches.append(self._branch(two, rng, embedding, once=once))
+        if not once and touches != list(branches[0][1].pairs):
+            raise Wrong(f"all merged have {branches[0][1].pairs}, and each had {touches}")
+        self.counts[f"all merged, {'once' if once else 'twice'}"] += 1
+
+    def _branch(
+        self, parts: list[tuple[Path, Rows]], rng: random.Random, embedding: str, *, once: bool
+    ) -> tuple[Path, Rows]:
+        """Merge memories into a new one; it goes on as a folder, a compacted folder or a packed memory."""
+        path, rows = self.trees / f"{len(list(self.trees.iterdir()))}", Rows(embedding=embedding)
+        with TactileLearner.open(path, embedding=EMBEDDINGS[embedding], **SETTINGS) as learner:
+            for other, theirs in parts:
+                self.say(f"  {path.name} of all: {other.parent.name}/{other.name}")
+                then, foretold = model.merge(rows, theirs, once, "theirs", one_name=False)
+                try:
+                    merged = learner.merge(other, shared="once" if once else "twice", descriptions="theirs")
+                    found: Any = [merged.observations, merged.shared, merged.described, 0]
+                except InputError as error:
+                    found = type(error).__name__
+                if found != foretold:
+                    raise Wrong(f"merging {other.name} of all gave {found!r}, expected {foretold!r}")
+                if found == "ObservationError":  # it was compacted, and has what is there
+                    then, _ = model.merge(rows, theirs, False, "theirs", one_name=False)
+                    learner.merge(other, shared="twice", descriptions="theirs")
+                rows = then
+            if (drawn := rng.random()) < 0.3:
+                keep = rng.choice((0, 2))
+                rows, _ = model.compact(rows, keep)
+                learner.compact(keep=keep)
+            self.look(Machine("all", path, [rows]), learner, "all merged")
+            if drawn > 0.7 and rows.pairs:
+                packed = path.with_suffix(".zip")
+                learner.pack(packed)
+                return packed, model.packed(rows, True)
+        return path, rows

@@ -36,7 +36,8 @@ class Wrong(Exception):
 class Machine:
     """A machine. candidates: what its memory may hold, the first of them unless something went wrong.
 
-    sure: how many rows no flip can take away unnoticed. copies: its backups, and whether each was acknowledged.
+    begins: the counts of rows before batches, of which a flip can take the last away unnoticed; none of a log that
+    replaced another. copies: its backups, whether each was acknowledged, and their batches.
     """
 
     name: str
@@ -44,14 +45,22 @@ class Machine:
     candidates: list[Rows] = field(default_factory=lambda: [Rows()])
     learner: Any = None
     readers: list[Any] = field(default_factory=list)
-    sure: int = 0
-    copies: dict[Path, tuple[list[Rows], bool]] = field(default_factory=dict)
+    begins: list[int] = field(default_factory=list)
+    copies: dict[Path, tuple[list[Rows], bool, list[int]]] = field(default_factory=dict)
     made: bool = False
 
     @property
     def rows(self) -> Rows:
         """What it holds, where nothing is open."""
         return self.candidates[0]
+
+    def become(self, rows: Rows) -> None:
+        """It holds these rows, which are another batch, or the last one less, or all that there were in a new log."""
+        before, after = len(self.rows.rows), len(rows.rows)
+        self.begins = [begin for begin in self.begins if begin < min(before, after)] if before != after else []
+        if after > before:
+            self.begins.append(before)
+        self.candidates = [rows]
 
 
 Fate = tuple[str, Any]
@@ -65,10 +74,13 @@ class World:
         for name in MACHINES:
             (self.root / name).mkdir(parents=True)
         self.net.mkdir()
+        self.trees = home / "trees"
+        self.trees.mkdir()
         self.disks = Disks(self.root, shim, log)
         self.machines = [Machine(name, self.root / name / "memory") for name in MACHINES]
         self.bucket: dict[str, list[tuple[bytes, Rows]]] = {}
         self.flying: list[tuple[int, str, tuple[bytes, Rows]]] = []
+        self.derived: list[dict[str, bytes]] = []
         self.step = 0
         self.counts = counts
         self.warned: list[str] = []
@@ -168,8 +180,7 @@ class World:
         if result != foretold:
             raise Wrong(f"{what} gave {result!r}, expected {foretold!r}")
         if after != before:
-            machine.sure = min(len(before.rows), len(after.rows))
-            machine.candidates = [after]
+            machine.become(after)
         return result
 
     def _strike(self, machine: Machine, rng: random.Random, done: list[Event], kind: str, about: float) -> None:
@@ -206,6 +217,8 @@ class World:
             if not differ[-1]:
                 others = [] if settle else [other for other in machine.candidates if other is not rows]
                 if learner is machine.learner:
+                    if rows is not machine.rows:
+                        machine.become(rows)
                     machine.candidates = [rows, *others]
                 return
         about = [(name, str(found[name])[:300], str(EXPECTED(machine.rows)[name])[:300]) for name in differ[0][:2]]

@@ -7,7 +7,6 @@ import os
 import shutil
 import socket
 import stat
-import threading
 from pathlib import Path
 
 import pytest

@@ -1,0 +1,180 @@
+"""Files at rest: a bit of one is another, and what is derived is of another time."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from faults.simulation_bucket import Carrying
+from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
+from faults.simulation_model import Rows
+from faults.simulation_touches import MATERIALS, stream
+from faults.simulation_world import Machine, Wrong
+from store import StoreError, repair_store
+from store.layout import DERIVED, read_current
+
+KEPT = ("kept", "pool", "exemplars")
+
+
+class Rotting(Carrying):
+    """The events of files that nobody writes."""
+
+    def _rot(self, machine: Machine, rng: random.Random) -> None:
+        """A bit of a file at rest is another: the memory is the same, or refused by name and repaired."""
+        if not machine.made or len(machine.candidates) > 1 or not machine.path.exists():
+            return
+        if rng.random() < 0.5:
+            self._shut(machine)
+        self.drop(machine)
+        newest = read_current(machine.path / "CURRENT").newest
+        hurt, kind = self._hurt(machine.path, rng)
+        self.disks.settle(machine.name)
+        self.say(f"  {machine.name}: a bit of {hurt.relative_to(machine.path)} is another ({kind})")
+        self.counts[f"rot: of {kind}"] += 1
+        whole = machine.rows
+        allowed = [whole]
+        if hurt.name.startswith("log-") and machine.begins:
+            allowed.append(whole.cut(max(machine.begins[-1], whole.base)))
+        machine.candidates = allowed
+        self.warned.clear()
+
+        def look(learner: Any, where: str, *, settle: bool = False) -> None:
+            # Of a damaged base a warning tells that nothing can take the place of what is retracted.
+            named = any("no other touch can take the place" in text for text in self.warned)
+            self.look(machine, learner, f"{where} after a bit of {hurt.name} changed", settle=settle, but=KEPT * named)
+
+        try:
+            learner = self._open(machine, machine.path, allowed, "read")
+            look(learner, "read")
+            learner.close()
+        except StoreError as error:
+            self.counts["rot: refused to read"] += 1
+            self.say(f"    reading: {error!r:.150}")
+        try:
+            with self.disks.taken_in():
+                machine.learner = self._open(machine, machine.path, allowed)
+        except StoreError as error:
+            self.counts["rot: refused"] += 1
+            self.say(f"    writing: {error!r:.150}")
+        if machine.learner is not None:
+            try:
+                look(machine.learner, "opened", settle=True)
+                self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
+                if not self._problems(machine.path):
+                    return
+                self.counts["rot: named by a check alone"] += 1
+                self.drop(machine)
+            except StoreError as error:
+                self.counts["rot: refused when it was read"] += 1
+                self.say(f"    reading what was opened: {error!r:.150}")
+                self.drop(machine)
+        self._repair(machine, whole, hurt, 0 if newest is None else newest.upto)
+
+    @staticmethod
+    def _hurt(path: Path, rng: random.Random) -> tuple[Path, str]:
+        """Flip a bit in a file of a memory, and return which, and where it was meant to hit: all kinds are hit."""
+        files = [one for one in sorted(path.rglob("*")) if one.is_file() and one.stat().st_size]
+        files = [one for one in files if one.name not in ("lock", "holder.json")]
+        logs = [one for one in files if one.name.startswith("log-")]
+        of_kind = {
+            "CURRENT": [path / "CURRENT"],
+            "a number": [path / "CURRENT"],
+            "the log": logs,
+            "the end of the log": logs,
+            "a chunk": [one for one in files if "c" in one.relative_to(path).parts],
+            "a checkpoint's own words": sorted(path.glob("checkpoints/*/zarr.json")),
+            "any": files,
+        }
+        kind = rng.choice(list(of_kind))
+        hurt = rng.choice(of_kind[kind] or files)
+        if kind == "a number":
+            flip(hurt, rng, in_a_number, bits=4)  # most are digits still
+        else:
+            flip(hurt, rng, near_the_end if "end" in kind else None)
+        return hurt, kind
+
+    def _repair(self, machine: Machine, whole: Rows, hurt: Path, contained: int) -> None:
+        """contained: the last row that the newest checkpoint contained."""
+        try:
+            with self.disks.taken_in():
+                repair = repair_store(machine.path)
+        except StoreError as error:
+            self.say(f"    repairing: {error!r:.200}")
+            self.counts["rot: not repaired"] += 1
+            self._replace(machine)
+            return
+        self.say(f"    repaired: {repair!r:.300}")
+        self.counts["rot: repaired"] += 1
+        rows = whole.cut(repair.kept)
+        if not repair.lost and repair.kept < len(whole.rows):
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows, and tells of no loss")
+        if repair.kept < whole.base:  # the base is lost: with it all that it stood for
+            self._replace(machine)
+            return
+        if repair.kept < len(whole.rows) and (not hurt.name.startswith("log-") or repair.kept < contained):
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows")
+        try:
+            learner = self._open(machine, machine.path, [rows], "read")
+        except StoreError as error:
+            raise Wrong(f"repaired after {hurt.name}, and not opened: {error!r}") from error
+        base = learner._ledger.store.compacted
+        listed = {each.sequence for each in learner.observations()}
+        heads = sum(1 for _ in learner._ledger.store.heads())
+        learner.close()
+        if base < rows.base:
+            raise Wrong(f"a repair of {hurt.name} left the base at {base}, which was {rows.base}")
+        if base > rows.base:
+            # What a later row took back of those counts again: a warning tells of it at each opening.
+            rows = replace(rows, base=base, stands=rows.cut(base).based(base).stands)
+        unlisted = {sequence for sequence, _ in rows.listed if sequence <= base and sequence not in listed}
+        if len(unlisted) > 1:
+            raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
+        # A row of another kind may be left out, too, such as one that took another back.
+        if unlisted or base > whole.base or heads < len(rows.rows):
+            self._with_less(machine, rows)
+            return
+        machine.candidates, machine.begins = [rows], []
+
+    def _with_less(self, machine: Machine, rows: Rows) -> None:
+        """A memory of which a repair left less knows still what it learned, and learns on."""
+        self.counts["rot: repaired, with less"] += 1
+        learner = self._open(machine, machine.path, [rows])
+        try:
+            for candidate in (rows, rows.plus(("observe", MATERIALS[0], 0))):
+                if candidate is not rows:
+                    learner.observe(MATERIALS[0], stream(0), again=True)
+                machine.candidates = [candidate]
+                self.look(machine, learner, "repaired with less", but=("listed", *KEPT))
+        finally:
+            abandon(learner)
+        self._replace(machine)  # nothing of this was written down
+
+    def _replace(self, machine: Machine) -> None:
+        """A new disk, and nothing on it."""
+        self.drop(machine)
+        shutil.rmtree(self.root / machine.name)
+        (self.root / machine.name).mkdir()
+        self.disks.settle(machine.name)
+        machine.candidates, machine.copies, machine.made, machine.begins = [Rows()], {}, False, []
+        self.counts["disks replaced"] += 1
+
+    def _derived(self, machine: Machine, rng: random.Random) -> None:
+        """What follows from the rest is of another time, or of another memory: it is not believed."""
+        folder = machine.path / DERIVED
+        if not folder.exists():
+            return
+        self.derived.append({one.name: one.read_bytes() for one in folder.iterdir()})
+        if rng.random() < 0.5:
+            return
+        self._shut(machine)
+        self.drop(machine)
+        shutil.rmtree(folder)
+        folder.mkdir()
+        for name, data in rng.choice(self.derived[-6:]).items():
+            (folder / name).write_bytes(data)
+        self.disks.settle(machine.name)
+        self.say(f"  {machine.name}: derived files of another time")
+        self.counts["derived files of another time"] += 1

@@ -17,7 +17,7 @@ from numcodecs import zstd
 
 import store.checkpoint_files
 import store.checkpoints
-import store.journal
+import store.open_log
 import store.log_writer
 import store.rows
 from faults import shim as watch
@@ -181,7 +181,7 @@ def write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], 
 def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
     store.log_writer.AHEAD = AHEAD
-    store.rows.EVERY = store.journal.EVERY = EVERY
+    store.rows.EVERY = store.open_log.EVERY = EVERY
     store.checkpoint_files._write_zarr = write_zarr
     store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
     store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]

@@ -29,7 +29,7 @@ def compacted(tmp_path) -> Path:
 
 @pytest.mark.parametrize("after", [1, 2])
 def test_a_damaged_last_row_is_not_taken_for_the_end(compacted, after):
-    with Store.open(compacted, mode="read") as store, pytest.raises(DamageError, match="repair|row 3 is missing"):
+    with Store.open(compacted, mode="read") as store, pytest.raises(DamageError, match=r"repair|row 3 is missing"):
         list(store.records(after=after))
 
 
@@ -63,7 +63,7 @@ def test_rows_of_a_batch_whose_end_alone_is_damaged_are_kept(tmp_path, place):
     data = bytearray(log.read_bytes())
     data[len(data) - 88 + place] ^= 1
     log.write_bytes(data)
-    with pytest.raises(DamageError, match="repair|row 3 is missing"):
+    with pytest.raises(DamageError, match=r"repair|row 3 is missing"):
         Store.open(folder)
     assert {problem.kind for problem in check_store(folder)} == {"spare"}
     repair = repair_store(folder)

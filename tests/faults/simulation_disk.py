@@ -17,8 +17,8 @@ from numcodecs import zstd
 
 import store.checkpoint_files
 import store.checkpoints
-import store.open_log
 import store.log_writer
+import store.open_log
 import store.rows
 from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, Folder, _apply, _rebuild, events

@@ -20,8 +20,8 @@ from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.measurement import Measurement
-from scroll_tactile.prediction.model import Draft, Measures, Model
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.model import Draft, Model
 from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel", "FrozenModel"]
@@ -29,7 +29,6 @@ __all__ = ["CurrentModel", "FrozenModel"]
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
 FEW = 64  # touches: of a memory with no more the calibration is worth waiting for
-MEASURED = 1.5  # times as many touches as when beginnings were last measured: until then nobody waits for that
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
@@ -43,8 +42,8 @@ class FrozenModel:
 class CurrentModel:
     """The model of one memory. Whoever calls holds the ledger's lock."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._kind = settings.readout
+    def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
+        self._kind, self._extractor = settings.readout, extractor
         self._version = -1
         self._model: Model | None = None
         self._exact = False  # whether the model was fitted to the memory as it is, and not followed
@@ -76,7 +75,6 @@ class CurrentModel:
         self.take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
-        before = None if model is None else model.beginnings
         if model is not None and (behind is None or self._due(model, memory)):
             model = None
         if model is not None and behind:
@@ -87,10 +85,6 @@ class CurrentModel:
                 model = None
         # The last one is let go first, and its memory given back: each is some tens of MB.
         present = self._adopted(memory) if model is None else model
-        if before is not None and before is not present.beginnings and _serves(before, present, memory):
-            # Measuring takes seconds, and a call would wait for it.
-            present.beginnings = Measurement(before)
-            self._exact = False
         self._model, self._behind = present, []
         self.prepare(ledger)
         return present
@@ -107,7 +101,7 @@ class CurrentModel:
             with suppress(MemoryError, InputError, RuntimeError):
                 self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
                 self._since = []
-                self._coming = self._worker.submit(_fit, Draft.of(ledger.memory, self._kind), model.beginnings.measures)
+                self._coming = self._worker.submit(Draft.of(ledger.memory, self._kind).fit, self._extractor)
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
@@ -164,7 +158,7 @@ class CurrentModel:
         return self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit()
+        model = Draft.of(memory, self._kind).fit(self._extractor)
         self._exact = True
         return model
 
@@ -174,22 +168,6 @@ class CurrentModel:
         if self._composer is None or self._composer[:3] != state:
             self._composer = *state, Composer.of(model, ledger.memory)
         return self._composer[3]
-
-
-def _fit(draft: Draft, measures: Measures | None) -> Model:
-    """A model; where beginnings are asked for, with how it judges them."""
-    model = draft.fit()
-    if measures is not None:
-        model.early(measures)
-    return model
-
-
-def _serves(before: Measurement[Model], present: Model, memory: Memory) -> bool:
-    """Whether a model judges beginnings as one before it does, which was measured, or is being measured."""
-    if not before.asked_for or present.beginnings.asked_for:
-        return False
-    found = before.found
-    return found is None or MEASURED * found.touches >= memory.statistics.touches
 
 
 def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:

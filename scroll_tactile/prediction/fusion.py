@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
-from scroll_tactile.readouts.deviation import spaced
 from scroll_tactile.readouts.held_out import HeldOut
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
@@ -175,6 +174,7 @@ class _Said:
 
     reached: IntArray
     targets: IntArray
+    counts: FloatArray
     logs: FloatArray
     scores: FloatArray
     certainty: float
@@ -182,47 +182,58 @@ class _Said:
     surprise: FloatArray
 
 
-def fuse(recall: Recall | None, judged: Sequence[Judged], paced: Sequence[Judged], chosen: Sequence[bytes]) -> Fusion:
+def fuse(
+    recall: Recall | None,
+    judged: Sequence[Judged],
+    paced: Sequence[Judged],
+    chosen: Sequence[bytes],
+    counts: Mapping[bytes, float],
+) -> Fusion:
     """Fit the table to held-out touches.
 
     judged: what is said by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
-    ascending by columns. chosen: the keys of the touches that are compared with kept ones.
+    ascending by columns. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
+    as complete ones, and how many touches each stands for.
     """
-    names = judged[-1].held_out.names
-    moments, said = _rows(recall, judged, names, chosen, judged[-1])
-    return Fusion(
-        tuple(moments),
-        tuple(_rows(recall, paced, names, chosen, None)[0]),
-        recall,
-        _trajectories(moments[:-1], said[:-1], said[-1], len(names)),
-    )
+    names, even = judged[-1].held_out.names, dict.fromkeys(chosen, 1.0)
+    said = [_at(recall, one, names, even) for one in judged[:-1]]
+    said.append(_at(recall, judged[-1], names, counts))
+    others = [_at(recall, one, names, even) for one in paced]
+    moments = _rows(recall, judged, said, judged[-1])
+    of_paced = _rows(recall, paced, others, None)
+    return Fusion(tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names)))
 
 
 def _rows(
-    recall: Recall | None,
-    judged: Sequence[Judged],
-    names: Sequence[str],
-    chosen: Sequence[bytes],
-    complete: Judged | None,
-) -> tuple[list[Moment], list[_Said]]:
-    """Rows of the table, each drawn to its neighbours, and what they were fitted to."""
-    said = [_at(recall, one, names, chosen) for one in judged]
+    recall: Recall | None, judged: Sequence[Judged], said: Sequence[_Said], complete: Judged | None
+) -> list[Moment]:
+    """Rows of the table, each drawn to its neighbours."""
     rows = []
     for i, one in enumerate(judged):
         near = [other for other in said[max(0, i - 1) : i + 2] if len(other.targets) >= FEWEST]
         rows.append(_fitted(one, said[i], near, recall, complete=one is complete))
-    return rows, said
+    return rows
 
 
-def chosen_of(complete: HeldOut, recall: Recall | None) -> list[bytes]:
-    """The held-out touches that are seen at all moments: those that are kept, spread evenly over their keys."""
+def chosen_of(complete: HeldOut, recall: Recall | None) -> tuple[list[bytes], dict[bytes, float]]:
+    """The held-out touches that are seen at all moments: of those that are kept, evenly over their keys.
+
+    And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it
+    matters what is believed; each of the others stands for many.
+    """
     kept = set() if recall is None else recall.rows().keys()
-    keys = sorted(key for key in complete.keys if key in kept)
-    return [keys[i] for i in spaced(keys, MOST_HELD_OUT)]
+    ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
+    keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 2]
+    places = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int)
+    chosen = [keys[i] for i in places]
+    surer = [key for key in chosen if key not in set(unsure)]
+    each = (len(keys) - len(unsure)) / max(len(surer), 1)
+    return chosen, dict.fromkeys(unsure, 1.0) | dict.fromkeys(surer, each)
 
 
-def _at(recall: Recall | None, judged: Judged, names: Sequence[str], chosen: Sequence[bytes]) -> _Said:
-    """What is said of the chosen touches at one moment."""
+def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Mapping[bytes, float]) -> _Said:
+    """What is said at one moment of some touches, and how many each stands for."""
+    chosen = list(counts)
     held = judged.held_out
     among, own = {key: i for i, key in enumerate(held.keys)}, {name: i for i, name in enumerate(held.names)}
     places = [own[name] for name in names if name in own]
@@ -238,6 +249,7 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], chosen: Seq
     return _Said(
         np.array(at, dtype=np.intp),
         np.array([names.index(held.names[held.targets[i]]) for i in found], dtype=np.intp),
+        np.array([counts[chosen[number]] for number in at]),
         held.logs[np.ix_(found, places)] if found else np.zeros((0, len(names))),
         scores * (usual / certainty)[:, None],
         usual,
@@ -255,7 +267,7 @@ def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall |
     """A moment; near: what is said at the moments near it, this one among them, where that is enough."""
     held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
-    alone = _odd_share(own, len(held.names)) if len(own) else 0.0
+    alone = _odd_share(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
     familiar = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
     if recall is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
@@ -265,18 +277,19 @@ def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall |
             columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread, calibration.novelties
         )
     together = _joined(near)
-    prior = np.array([0.5, _worth(together) / 2])
+    prior = np.array([1.0, _worth(together) / 2])
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
     weights = _weights(said, shared, SHARED_TOUCHES)
-    by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, PRIOR_TOUCHES)
+    by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, PRIOR_TOUCHES, said.counts)
     match, lone = (match_of(float(value), said.certainty) for value in (weights[1], by_itself[0]))
-    surprise, spread = float(said.surprise.mean()), max(float(said.surprise.std()), LEAST_SPREAD)
+    surprise = float(np.average(said.surprise, weights=said.counts))
+    spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
     of_model = float(weights[0])
     moment = Moment(
         columns, stage, calibration, of_model, match, lone, 0.0, alone, familiar, surprise, spread, calibration.novelties
     )
     own = _chances(moment, said)[np.arange(len(said.targets)), said.targets]
-    return replace(moment, odd=_odd_share(own, said.logs.shape[1]))
+    return replace(moment, odd=_odd_share(own, said.logs.shape[1], said.counts))
 
 
 UNSEEN = 1 / 16_000  # β where nothing can be held out: after one touch of each, beginnings are lost to a larger one
@@ -291,14 +304,14 @@ def _worth(said: _Said) -> float:
 
 def _joined(said: Sequence[_Said]) -> _Said:
     """What is said at some moments as that at one; of one median certainty."""
-    parts = [np.concatenate([getattr(one, name) for one in said]) for name in ("targets", "logs", "scores")]
+    parts = [np.concatenate([getattr(one, name) for one in said]) for name in ("targets", "counts", "logs", "scores")]
     none = np.zeros(0)
-    return _Said(np.zeros(0, np.intp), parts[0], parts[1], parts[2], 1.0, none, none)
+    return _Said(np.zeros(0, np.intp), parts[0], parts[1], parts[2], parts[3], 1.0, none, none)
 
 
 def _weights(said: _Said, prior: FloatArray, touches: float) -> FloatArray:
     """g and β."""
-    return fit_weights(np.stack([said.logs, said.scores], axis=1), said.targets.tolist(), prior, touches)
+    return fit_weights(np.stack([said.logs, said.scores], axis=1), said.targets.tolist(), prior, touches, said.counts)
 
 
 def _chances(moment: Moment, said: _Said) -> FloatArray:
@@ -309,13 +322,14 @@ def _chances(moment: Moment, said: _Said) -> FloatArray:
     return np.asarray(chances / chances.sum(axis=1, keepdims=True))
 
 
-def _odd_share(own: FloatArray, materials: int) -> float:
+def _odd_share(own: FloatArray, materials: int, counts: FloatArray) -> float:
     """ε of least log loss, where touches have such probabilities for their own material without it (EM)."""
-    odd = ODD / (len(own) + 1)
+    total = float(counts.sum())
+    odd = ODD / (total + 1)
     for _ in range(STEPS):
         drawn = odd / materials
-        share = float((drawn / ((1 - odd) * own + drawn)).sum())
-        odd = (share + ODD) / (len(own) + 1)
+        share = float((counts * drawn / ((1 - odd) * own + drawn)).sum())
+        odd = (share + ODD) / (total + 1)
     return odd
 
 
@@ -329,12 +343,11 @@ def match_of(steepness: float, certainty: float) -> float:
     return 1 / (1 + max(1 / max(steepness, LEAST_STEEPNESS) - 1, 0.0) / max(certainty, LEAST_CERTAINTY))
 
 
-def _trajectories(moments: Sequence[Moment], said: Sequence[_Said], complete: _Said, materials: int) -> Trajectories:
-    count = 1 + max((int(one.reached.max()) for one in [*said, complete] if len(one.reached)), default=-1)
-    chances = np.full((count, len(moments), materials), np.nan)
-    novelty, targets = np.full((count, len(moments)), np.nan), np.zeros(count, np.intp)
-    targets[complete.reached] = complete.targets
+def _trajectories(moments: Sequence[Moment], said: Sequence[_Said], touches: int, materials: int) -> Trajectories:
+    chances = np.full((touches, len(moments), materials), np.nan)
+    novelty, targets = np.full((touches, len(moments)), np.nan), np.zeros(touches, np.intp)
     for i, (moment, one) in enumerate(zip(moments, said, strict=True)):
         chances[one.reached, i] = tempered(_chances(moment, one), moment.odd)
         novelty[one.reached, i], targets[one.reached] = one.novelty, one.targets
-    return Trajectories(chances, novelty, targets)
+    reached = np.isfinite(novelty).any(axis=1)
+    return Trajectories(chances[reached], novelty[reached], targets[reached])

@@ -153,34 +153,38 @@ class Draft:
         whole = held_out(last, both, self.sample, apart, complete)
         least = max(1, min(self.least, self.longest))
         columns = moments_of(milestones[: last + 1], least, 1, matched=recall is not None)
-        chosen = chosen_of(whole, recall)
+        chosen, counts = chosen_of(whole, recall)
         stages = [max(0, sum(length <= at for length in milestones[: last + 1]) - 1) for at in columns]
         rows = {} if recall is None else recall.rows()
         seen = self._beginnings(readouts, recall, chosen, columns, stages, extractor) if recall is not None else apart
+        # What came over a touch is looked for once, in all of it: that is most of what a comparison costs.
+        matches = {}
+        if recall is not None:
+            matches = {key: recall.recollect(recall.levels(rows[key]), left_out=rows[key]) for key in sorted({*chosen, *counts})}
         judged = []
         for i, (at, stage) in enumerate(zip(columns, stages, strict=True)):
             scales, number = self.stages[stage], stage if recall is None else i
             calibration = self._calibrated(number, scales, readouts, seen)
-            said, matches = held_out(number, scales, self.sample, seen, calibration), dict[bytes, Recollection]()
+            said, begun = held_out(number, scales, self.sample, seen, calibration), dict[bytes, Recollection]()
             for key in chosen if recall is not None else ():
                 if (levels := recall.levels(rows[key])).shape[1] >= at:
-                    matches[key] = recall.recollect(levels[:, :at], left_out=rows[key])
-            judged.append(Judged(at, stage, calibration, said, matches))
-        matches = {key: recall.recollect(recall.levels(rows[key]), left_out=rows[key]) for key in chosen} if recall is not None else {}
+                    begun[key] = recall.recollect(levels[:, :at], left_out=rows[key], noise=matches[key].noise)
+            judged.append(Judged(at, stage, calibration, said, begun))
         judged.append(Judged(least, last, complete, whole, matches))
         if recall is None or not chosen:
-            return whole, fuse(recall, judged, judged[-1:], chosen)
+            return whole, fuse(recall, judged, judged[-1:], chosen, counts)
         paced = [
-            self._paced(pace, readouts, recall, chosen[i % 2 :: 2], last, extractor) for i, pace in enumerate(PACES)
+            self._paced(pace, readouts, recall, {key: matches[key] for key in chosen[i :: len(PACES)]}, last, extractor)
+            for i, pace in enumerate(PACES)
         ]
-        return whole, fuse(recall, judged, paced, chosen)
+        return whole, fuse(recall, judged, paced, chosen, counts)
 
     def _paced(
         self,
         pace: float,
         readouts: Mapping[Scale, Readout],
         recall: Recall,
-        chosen: Sequence[bytes],
+        chosen: Mapping[bytes, Recollection],
         last: int,
         extractor: FeatureExtractor,
     ) -> Judged:
@@ -188,9 +192,9 @@ class Draft:
         places, rows = {key: place for place, (_, key, _) in enumerate(self.sample)}, recall.rows()
         asked: dict[Scale, dict[int, dict[int, FloatArray]]] = {scale: {} for scale in self.views}
         matches = {}
-        for key in chosen:
+        for key, match in chosen.items():
             levels = at_pace(recall.levels(rows[key]), pace)
-            matches[key] = recall.recollect(levels, left_out=rows[key], whole=True)
+            matches[key] = recall.recollect(levels, left_out=rows[key], whole=True, noise=match.noise)
             image = extractor.image(stream_of(levels, extractor.sensor))
             for scale, mean in extractor.means(image, self.views).items():
                 asked[scale][places[key]] = {0: mean}

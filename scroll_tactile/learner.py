@@ -749,7 +749,7 @@ class TactileLearner:
         return self._tuned_reader
 
     def close(self) -> None:
-        """Write a generation, so that opening replays nothing, and release the files; a second call does nothing.
+        """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
 
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -12,9 +13,10 @@ from pathlib import Path
 from uuid import uuid4
 
 from store.exceptions import DamageError, NotAStoreError, reported
-from store.files import is_file, open_regular, read_regular, remove_tree, sync_folder
+from store.files import is_file, open_regular, read_regular, replacing
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
-from store.log import LogFile, LogReader, Place
+from store.log import LogReader, Place
+from store.log_file import LogFile
 
 __all__ = ["ARCHIVE_BYTES", "Archive", "Files", "files_of", "is_archive", "write_archive"]
 
@@ -197,19 +199,9 @@ def write_archive(folder: Path, path: Path) -> None:
         named = [checkpoint_path(folder, each.number) for each in current.checkpoints]
         files = [folder / CURRENT_FILE, log_path(folder, current.log)]
         files += sorted(file for group in named for file in group.rglob("*") if file.is_file())
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with draft.open("xb") as file:
-                with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
-                    for each in files:
-                        entry = zipfile.ZipInfo(each.relative_to(folder).as_posix(), DATE)
-                        with each.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
-                            while part := source.read(2**20):
-                                target.write(part)
-                file.flush()
-                os.fsync(file.fileno())
-            draft.replace(path)
-            sync_folder(path.parent)
-        except BaseException:
-            remove_tree(draft)
-            raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path, draft), zipfile.ZipFile(draft, "x", zipfile.ZIP_STORED) as packed:
+            for each in files:
+                entry = zipfile.ZipInfo(each.relative_to(folder).as_posix(), DATE)
+                with each.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
+                    shutil.copyfileobj(source, target, 2**20)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 
 from store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
-from store.files import copy_regular, is_real_folder, remove_tree, same_folder, sync_folder, sync_tree
+from store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
+from store.found_log import Progress
 from store.layout import (
     CURRENT_FILE,
     PARTIAL,
@@ -19,7 +22,8 @@ from store.layout import (
     write_current,
 )
 from store.log import LogReader
-from store.survey import Progress, check_store
+from store.row_encoding import HEAD_BYTES, ROW, row_sequence
+from store.survey import check_store
 
 __all__ = ["back_up"]
 
@@ -37,24 +41,18 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
     with reported(destination, "backing up a store"):
         destination.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(mkdtemp(prefix=f"{destination.name}.", suffix=PARTIAL, dir=destination.parent))
-        try:
+        with replacing(destination, draft):
             shutil.copymode(source, draft)
             _copy(source, draft)
             _verify(source, draft, progress)
-            sync_tree(draft)
-            draft.rename(destination)
-            sync_folder(destination.parent)
-        except BaseException:
-            remove_tree(draft)
-            raise
 
 
 def _copy(source: Path, draft: Path) -> None:
     """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
     for _ in range(ATTEMPTS):
-        current = read_current(source / CURRENT_FILE)
+        current, last = read_current(source / CURRENT_FILE), 0
         try:
-            _copy_named(source, draft, current)
+            last = _copy_named(source, draft, current)
             failure: Exception | None = None
         except (OSError, StoreError) as error:
             if not isinstance(error, DamageError) and not is_missing(error):
@@ -64,23 +62,28 @@ def _copy(source: Path, draft: Path) -> None:
         if read_current(source / CURRENT_FILE) == current:
             if failure is not None:
                 raise failure
-            write_current(draft, current)
+            write_current(draft, replace(current, last=max(last, current.last)))
             return
         for entry in draft.iterdir():
             remove_tree(entry)
     raise StoreError(f"{source} changed {ATTEMPTS} times while it was copied: back it up when less is written")
 
 
-def _copy_named(source: Path, draft: Path, current: Current) -> None:
+def _copy_named(source: Path, draft: Path, current: Current) -> int:
+    """Copy what `current` names; return the last row of the log, or 0."""
+    last = 0
     for named in current.checkpoints:
         _copy_tree(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
     # The log last: it has every row that the checkpoints contain.
     with LogReader(log_path(source, current.log), payloads=False) as log:
-        for _ in log.refresh():
-            pass
+        for batch in log.refresh():
+            rows = [frame for frame in batch if frame.kind == ROW]
+            with suppress(ValueError):  # damage, which verifying the copy names
+                last = row_sequence(log.peek(rows[-1].offset, HEAD_BYTES)) if rows else last
         with log_path(draft, current.log).open("xb") as copy:
             for offset in range(0, log.place.offset, PART):
                 copy.write(log.bytes_at(offset, min(PART, log.place.offset - offset)))
+    return last
 
 
 def _copy_tree(source: Path, target: Path) -> None:

@@ -15,7 +15,7 @@ from store.chunks import ArrayFiles, file_digests, most_bytes
 from store.content import GROUP_VERSION, ArrayContent, read_content
 from store.encoding import array_digest
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
-from store.files import remove_tree, sync_folder, sync_tree
+from store.files import remove_tree, replacing, sync_folder
 from store.layout import PARTIAL, checkpoint_path
 from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
 
@@ -66,25 +66,22 @@ def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[
                 final.parent.mkdir()
                 sync_folder(folder)
             remove_tree(partial)
-            group = _write_zarr(partial, draft, described, draft.level)
-            if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
-                # Readers make no room for so much that so little stands for: anybody could claim it.
-                remove_tree(partial)
-                group = _write_zarr(partial, draft, described, None)
-            known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
-            digest = json_digest(known)
-            group.update_attributes(known | {"sha256": digest})
-            try:
-                _read_attributes(partial / "zarr.json", Files(folder))
-            except (ValueError, DamageError) as error:
-                raise RecordError(
-                    f"checkpoint {number} has more attributes than could be read again: {error}"
-                ) from error
-            sync_tree(partial)
-            partial.rename(final)
-            sync_folder(final.parent)
+            with replacing(final, partial):
+                group = _write_zarr(partial, draft, described, draft.level)
+                if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
+                    # Readers make no room for so much that so little stands for: anybody could claim it.
+                    remove_tree(partial)
+                    group = _write_zarr(partial, draft, described, None)
+                known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
+                digest = json_digest(known)
+                group.update_attributes(known | {"sha256": digest})
+                try:
+                    _read_attributes(partial / "zarr.json", Files(folder))
+                except (ValueError, DamageError) as error:
+                    raise RecordError(
+                        f"checkpoint {number} has more attributes than could be read again: {error}"
+                    ) from error
     except BaseException:
-        remove_tree(partial)
         remove_tree(final)
         raise
     return digest

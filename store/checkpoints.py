@@ -95,7 +95,9 @@ class Checkpoints:
             current = self._journal.current()
             named = self._write(draft, self._journal.place(draft.upto))
             if current.newest is None or named.upto >= current.newest.upto:
-                self._commit(replace(current, newest=named))
+                # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
+                # be on the disk all the same, and count after a crash.
+                self._journal.commit(replace(current, newest=named, last=self._journal.last()))
             self.remove_unnamed()
             self._journal.keep_index()
             return named.number
@@ -111,17 +113,6 @@ class Checkpoints:
             raise DamageError(f"{self._folder} has a log or a checkpoint of number {number - 1}", path=self._folder)
         return number
 
-    def _commit(self, current: Current) -> None:
-        # When this fails all folders stay, for the next commit or open to remove: what could not be synced may be on
-        # the disk all the same, and count after a crash.
-        with reported(self._folder, "committing"):
-            try:
-                write_current(self._folder, current)
-            except BaseException:
-                self._journal.unsettle()
-                raise
-        self._journal.committed(current)
-
     def compact(self, draft: Draft, newest: Draft | None) -> None:
         """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
         with self._committing:
@@ -130,9 +121,9 @@ class Checkpoints:
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
                 try:
-                    create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
+                    identity = create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
                     drafts = [draft] if newest is None else [draft, newest]
-                    identity, places = read_back(path, [each.upto for each in drafts])
+                    places = read_back(path, [each.upto for each in drafts])
                     named = [self._write(each, place) for each, place in zip(drafts, places, strict=True)]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
                         raise damage
@@ -140,7 +131,7 @@ class Checkpoints:
                     remove_tree(path)
                     raise
                 with reported(self._folder, "committing"):
-                    write_current(self._folder, Current(number, identity, newest=named[-1], base=named[0]))
+                    write_current(self._folder, Current(number, identity, named[-1], named[0], self._journal.last()))
             self.remove_unnamed()
 
     def commit_later(self, draft: Draft) -> None:
@@ -194,8 +185,8 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def read_back(path: Path, uptos: Sequence[int]) -> tuple[bytes, list[Place]]:
-    """Read a log that was just written; return its identity, and for each of these rows a place.
+def read_back(path: Path, uptos: Sequence[int]) -> list[Place]:
+    """Read a log that was just written; return for each of these rows a place.
 
     All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.
     """
@@ -208,4 +199,4 @@ def read_back(path: Path, uptos: Sequence[int]) -> tuple[bytes, list[Place]]:
             raise DamageError(
                 f"{path} does not read back as it was just written: its disk cannot be trusted", path=path
             )
-        return log.identity, found
+        return found

@@ -30,6 +30,7 @@ __all__ = [
     "open_regular",
     "read_regular",
     "remove_tree",
+    "replacing",
     "same_folder",
     "store_folder",
     "sync_file",
@@ -110,6 +111,22 @@ def new_file(path: Path, mode: str = "wb") -> IO[Any]:
     remove_tree(path)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | CAREFULLY
     return os.fdopen(os.open(path, flags, 0o666), mode, encoding=None if "b" in mode else "utf-8")
+
+
+@contextmanager
+def replacing(path: Path, draft: Path) -> Iterator[None]:
+    """In the block `draft`, a file or a folder, is written; then it takes the place of `path`, durably, or is removed.
+
+    Raises OSError, where it may all the same be in its place, though not durably.
+    """
+    try:
+        yield
+        (sync_tree if draft.is_dir() else sync_file)(draft)
+        draft.replace(path)
+    except BaseException:
+        remove_tree(draft)
+        raise
+    sync_folder(path.parent)
 
 
 def is_there(path: Path) -> bool:

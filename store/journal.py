@@ -7,24 +7,24 @@ import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from store.archive import Files
 from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
-from store.layout import CURRENT_FILE, Current, log_path
-from store.log import LogReader, Place
+from store.layout import CURRENT_FILE, Current, log_path, write_current
+from store.log import Place
 from store.log_writer import LogWriter
-from store.records import JSON, Head, Record, from_json
+from store.open_log import OpenLog
+from store.records import JSON, Head, Record
 from store.row_encoding import (
     ROW,
-    decode_head,
     decode_row,
     encode_row,
     head_without_arrays,
     key_prefix,
 )
-from store.rows import EVERY, Index, Rows, head_bytes
 
 __all__ = ["Journal"]
 
@@ -32,141 +32,6 @@ logger = logging.getLogger(__name__)
 
 LAST_SEQUENCE = 2**62  # far beyond what anybody appends
 ATTEMPTS = 8  # of a reader, while a writer puts another log in the place of the one
-MOST_PLACES = 4096
-
-
-class _OpenLog:
-    """The log that `CURRENT` names, opened, and what is known of its rows.
-
-    first: the last row before those that are known; read_all: whether there are none before these. places: rows, and
-    where in the log all behind them follow.
-    """
-
-    def __init__(self, files: Files, current: Current, *, write: bool) -> None:
-        self._files, self.current, self.path = files, current, log_path(files.folder, current.log)
-        self.rows, self.first, self._told = Rows(), 0, 0
-        named = current.newest
-        self.log = self._reader(None if named is None else named.place, write=write)
-        try:
-            if self.log.identity != current.log_identity:
-                raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
-            self.identity = self._read_identity()
-            self.index = Index(files.folder, current.log_identity, self.log.beginning)
-            if named is not None and self.log.place == named.place:
-                self.first = named.upto
-            self.read_all = self.first == 0
-            self.places = [(self.first, self.log.place)]
-            self.catch_up()
-            if write:
-                self._begin_writing()
-        except BaseException:
-            self.log.close()
-            raise
-
-    def _reader(self, place: Place | None, *, write: bool) -> LogReader:
-        """Return the log from a place on; where that is not in it a reader begins at the beginning."""
-        try:
-            return self._files.read_log(self.path, place=place)
-        except DamageError as damage:
-            if place is None:
-                raise
-            if write:
-                raise DamageError(f"{damage}: repair the store (repair_store)", path=self.path) from damage
-            logger.warning("%s; reading all of it", damage)
-            return self._files.read_log(self.path)
-
-    def _read_identity(self) -> dict[str, JSON]:
-        try:
-            return from_json(self.log.header.decode())
-        except ValueError as error:
-            raise DamageError(f"the identity in {self.path} was never written so: {error}", path=self.path) from error
-
-    def _begin_writing(self) -> None:
-        for damage in self.rows.damage.values():
-            raise DamageError(
-                f"{damage[0]}: repair the store (repair_store) before anything is appended behind it", path=self.path
-            )
-        self.log.close()
-        self.log = LogWriter(self.path, place=self.log.place)
-        # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
-        sync_folder(self.path.parent)
-
-    def catch_up(self) -> None:
-        """Take in what was committed since."""
-        for behind in self.rows.take(self.log):
-            self.note_place(behind)
-
-    def note_place(self, place: Place) -> None:
-        """Note the place behind all rows that are known."""
-        self.places.append((self.last_row, place))
-        if len(self.places) > MOST_PLACES:
-            del self.places[1:-1:2]
-
-    @property
-    def last_row(self) -> int:
-        """The sequence of the last row that is known."""
-        return self.rows.sequences[-1] if self.rows.sequences else self.first
-
-    @property
-    def last(self) -> int:
-        """The last row, or the last that a checkpoint contains, if later."""
-        # A checkpoint counts only when rows were lost: then their numbers must not be given out again.
-        return max([self.last_row, *(named.upto for named in self.current.checkpoints)])
-
-    def find(self, after: int) -> int:
-        """Return the index of the first row behind `after`, once all rows from there on are known."""
-        if after < self.first and not self.read_all:
-            self._read_before()
-        return bisect_right(self.rows.sequences, after)
-
-    def _read_before(self) -> None:
-        until = self.places[0][1].offset
-        earlier = Rows() if self._files.is_packed else self.index.read(until)
-        for _ in earlier.take(self.log.beginning_at(self.index.end), until):
-            pass
-        earlier.extend(self.rows)
-        self.rows, self.read_all = earlier, True
-
-    def tell_damage(self) -> None:
-        """Log a warning, once, for all that is damaged among the rows that are known."""
-        for damage in () if self._told == len(self.rows.damage) else self.rows.damage.values():
-            logger.warning(
-                "%s; what was there is passed over where rows of one kind, name or key are asked for", damage[0]
-            )
-        self._told = len(self.rows.damage)
-
-    def drop_index(self) -> bool:
-        """Read the log itself where an index was used, which may be wrong; whether one was."""
-        if not self.index.count:
-            return False
-        end, staged = self.log.place.offset, Rows()
-        for row in zip(self.rows.sequences, self.rows.offsets, self.rows.sizes, self.rows.keys, strict=True):
-            if row[1] >= end:
-                staged.append(*row)
-        self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
-        self.rows, self.first, self.read_all = Rows(), 0, True
-        for _ in self.rows.take(self.log.beginning_at(self.log.beginning), end):
-            pass
-        self.rows.extend(staged)
-        return True
-
-    def keep_index(self) -> None:
-        """Have the files of the index say what is known, where that is much more than they do."""
-        if len(self.rows) >= EVERY:
-            self.find(0)
-            try:
-                self.index.write(self.rows, self.log.place)
-            except OSError as error:
-                logger.warning("%s: the index of rows could not be written: %s", self.path, error)
-
-    def head(self, index: int) -> Head:
-        """Return the head of a row. Raises DamageError, and ValueError for what is none."""
-        size = self.rows.sizes[index]
-        return decode_head(head_bytes(self.log, self.rows.offsets[index], size), size)
-
-    def data(self, index: int) -> bytes:
-        """Return the bytes of a row, verified. Raises DamageError."""
-        return self.log.read(self.rows.offsets[index], self.rows.sizes[index])[1]
 
 
 class Journal:
@@ -178,17 +43,17 @@ class Journal:
 
     def __init__(self, files: Files, *, write: bool) -> None:
         self._files, self.folder, self._write = files, files.folder, write
-        self._guard = threading.RLock()
+        self._guard, self._naming = threading.RLock(), threading.Lock()
         self._batch = self._failed = False
         self._unsettled = False
         with reported(self.folder, "opening the journal"):
-            self._open: _OpenLog | None = self._opened()
+            self._open: OpenLog | None = self._opened()
 
-    def _opened(self) -> _OpenLog:
+    def _opened(self) -> OpenLog:
         for _ in range(ATTEMPTS):
             current = self._files.current()
             try:
-                return _OpenLog(self._files, current, write=self._write)
+                return OpenLog(self._files, current, write=self._write)
             except FileNotFoundError as error:
                 # A writer removes a log after another has taken its place.
                 if self._files.current() == current:
@@ -201,7 +66,7 @@ class Journal:
         raise StoreError(f"{self.folder} is compacted again and again: open it later")
 
     @contextmanager
-    def _using(self, doing: str) -> Iterator[_OpenLog]:
+    def _using(self, doing: str) -> Iterator[OpenLog]:
         with self._guard, reported(self.folder, doing):
             if self._open is None:
                 raise StoreClosedError(f"the store in {self.folder} is closed")
@@ -209,7 +74,7 @@ class Journal:
                 self._settle(self._open)
             yield self._open
 
-    def _settle(self, at: _OpenLog) -> None:
+    def _settle(self, at: OpenLog) -> None:
         """Find out what `CURRENT` names, and make it durable: what wrote it failed, or has put another log in place."""
         current = self._files.current()
         if current.log == at.current.log:
@@ -220,18 +85,13 @@ class Journal:
             at.log.close()
         self._unsettled = False
 
-    def unsettle(self) -> None:
-        """Take note that `CURRENT` may be another than before, or only in the system's memory."""
-        with self._guard:
-            self._unsettled = True
-
     @contextmanager
-    def _looking(self, doing: str) -> Iterator[_OpenLog]:
+    def _looking(self, doing: str) -> Iterator[OpenLog]:
         """The log in use, of a reader after it has read what was committed since."""
         with self._using(doing) as at:
             yield at if self._write or self._files.is_packed else self._renewed(at)
 
-    def _renewed(self, at: _OpenLog) -> _OpenLog:
+    def _renewed(self, at: OpenLog) -> OpenLog:
         current = self._files.current()
         if (current.log, current.log_identity) == (at.current.log, at.current.log_identity):
             at.current = current
@@ -257,10 +117,30 @@ class Journal:
         with self._looking("looking for checkpoints") as at:
             return at.current
 
-    def committed(self, current: Current) -> None:
-        """Take note of what was just written as `CURRENT`, with the same log."""
+    def commit(self, current: Current) -> None:
+        """Write `CURRENT`, with the same log."""
+        with reported(self.folder, "committing"):
+            try:
+                with self._naming:
+                    write_current(self.folder, current)
+            except BaseException:
+                # It may be another than before, or only in the system's memory.
+                with self._guard:
+                    self._unsettled = True
+                raise
         with self._using("committing") as at:
             at.current = current
+
+    def _note_last(self, at: OpenLog) -> None:
+        """Have `CURRENT` say which row is the last, so that a log that is cut off later is not taken for whole."""
+        try:
+            with self._naming:
+                if replace(self._files.current(), last=0) == replace(at.current, last=0):
+                    current = replace(at.current, last=at.last)
+                    write_current(self.folder, current)
+                    at.current = current
+        except (OSError, StoreError) as error:  # nothing is lost but this knowledge
+            logger.warning("%s could not say that row %d is the last: %s", self.folder / CURRENT_FILE, at.last, error)
 
     def last(self) -> int:
         """Return the sequence of the last row, or the last that a checkpoint contains, if later; or 0."""
@@ -288,6 +168,7 @@ class Journal:
                 raise
             finally:
                 self._batch = False
+            self._note_first(at)
 
     def refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -295,7 +176,7 @@ class Journal:
             if self._batch:
                 raise StoreError(f"{doing} is not possible in a batch of {self.folder}: end it first")
 
-    def _writing(self, doing: str) -> tuple[_OpenLog, LogWriter]:
+    def _writing(self, doing: str) -> tuple[OpenLog, LogWriter]:
         with self._using(doing) as at:
             assert isinstance(at.log, LogWriter), "a store that is read refuses before"
             return at, at.log
@@ -322,10 +203,17 @@ class Journal:
                 self._failed = True
                 self._undo(at, writer)
                 raise
+            if not self._batch:
+                self._note_first(at)
             return sequence
 
+    def _note_first(self, at: OpenLog) -> None:
+        """Have `CURRENT` say that the log has rows, as soon as that is so: without any it would look like a new one."""
+        if not at.current.last and at.last_row:
+            self._note_last(at)
+
     @staticmethod
-    def _undo(at: _OpenLog, writer: LogWriter) -> None:
+    def _undo(at: OpenLog, writer: LogWriter) -> None:
         """Take back what is not durable; what was committed before an interruption stays, and is known."""
         writer.rollback()
         at.rows.cut(bisect_left(at.rows.offsets, writer.place.offset))
@@ -369,7 +257,7 @@ class Journal:
             if head is not None and kind in (None, head.kind) and label in (None, head.label):
                 yield head
 
-    def _require_no_gap(self, at: _OpenLog, after: int, through: int, index: int) -> None:
+    def _require_no_gap(self, at: OpenLog, after: int, through: int, index: int) -> None:
         why = at.rows.damage.get(index)
         # Up to the base a repair may have left some out.
         first = 1 + (after if why is not None else max(after, at.current.compacted))
@@ -378,7 +266,7 @@ class Journal:
         missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
         raise self._damage(at, f"{missing}{'' if why is None else f' ({why[0]})'} from", through)
 
-    def _head(self, at: _OpenLog, index: int) -> Head:
+    def _head(self, at: OpenLog, index: int) -> Head:
         sequence = at.rows.sequences[index]
         try:
             head = at.head(index)
@@ -388,7 +276,7 @@ class Journal:
             raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
         return head
 
-    def _record(self, at: _OpenLog, index: int) -> Record:
+    def _record(self, at: OpenLog, index: int) -> Record:
         sequence = at.rows.sequences[index]
         try:
             row = decode_row(at.data(index))
@@ -407,14 +295,14 @@ class Journal:
         with self._looking("looking for a key") as at:
             at.find(0)
             at.tell_damage()
-            for index in at.rows.with_key(key):
-                try:
-                    head = self._head(at, index)
-                except DamageError as damage:
-                    logger.warning("%s", damage)
-                else:
+            sequences = [at.rows.sequences[index] for index in at.rows.with_key(key)]
+        for sequence in sequences:
+            try:
+                for head in self.rows(sequence - 1, sequence, arrays=False):
                     if head.key == key:
                         yield head
+            except DamageError as damage:
+                logger.warning("%s", damage)
 
     def keep_index(self) -> None:
         """Write what is known of the rows beside the log, so that nobody has to read it for that."""
@@ -430,7 +318,7 @@ class Journal:
         )
 
     @staticmethod
-    def _damage(at: _OpenLog, what: str, sequence: int) -> DamageError:
+    def _damage(at: OpenLog, what: str, sequence: int) -> DamageError:
         named = next((named for named in at.current.checkpoints if named.upto >= sequence), None)
         still = "no checkpoint contains it"
         if named is not None:
@@ -475,8 +363,10 @@ class Journal:
             return at.log.size
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
+        """Close the file, of which `CURRENT` says where it ends; a second call does nothing."""
         with self._guard, reported(self.folder, "closing the journal"):
             at, self._open = self._open, None
             if at is not None:
+                if self._write and at.current.last < at.last_row:
+                    self._note_last(at)
                 at.log.close()

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import is_real_folder, new_file, read_regular, remove_tree, sync_folder, sync_open
+from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing, sync_folder
 from store.framing import IDENTITY_BYTES
-from store.lock import HOLDER_FILE, LOCK_FILE
+from store.lock import HOLDER_FILE, LOCK_FILE, WriterLock
 from store.log import LogReader, Place
+from store.log_writer import create_log
 from store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
@@ -29,13 +30,14 @@ __all__ = [
     "checkpoint_path",
     "holds_store",
     "is_number",
+    "lock_to_write",
     "log_numbers",
     "log_path",
     "numbers",
     "read_current",
     "remove_unnamed",
     "require_unshared",
-    "strangers",
+    "unsafe_entries",
     "write_current",
 ]
 
@@ -45,7 +47,7 @@ LOG = "log-"
 CHECKPOINTS = "checkpoints"
 DERIVED = "derived"  # what follows from the rest, and can be deleted
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
-EARLIER_FILE = "journal.sqlite"  # of releases 0.x
+LEGACY_FILE = "journal.sqlite"  # of releases 0.x
 
 LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
 MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
@@ -85,12 +87,14 @@ class Current:
 
     log: the number of the log, and log_identity what all frames of it carry. newest: the checkpoint to begin with.
     base: the one that stands for the rows that gave up their arrays; it may be the same. None where there is none.
+    last: a row that the log has had; one that ends before it was cut off. 0 where nothing is known.
     """
 
     log: int
     log_identity: bytes
     newest: NamedCheckpoint | None = None
     base: NamedCheckpoint | None = None
+    last: int = 0
 
     @property
     def checkpoints(self) -> list[NamedCheckpoint]:
@@ -110,6 +114,7 @@ class Current:
             "log": [self.log, self.log_identity.hex()],
             "newest": None if self.newest is None else self.newest.to_json(),
             "base": None if self.base is None else self.base.to_json(),
+            "last": self.last,
         }
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
 
@@ -126,8 +131,9 @@ class Current:
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
             number, identity = known["log"]
-            named = [None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES]
-            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), *named)
+            newest, base = (None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES)
+            last = _count(known.get("last", 0))
+            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, base, last)
             if current.base is not None and (current.newest is None or current.newest.upto < current.base.upto):
                 raise ValueError("its base is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:
@@ -173,16 +179,8 @@ def write_current(folder: Path, current: Current) -> None:
     Everything that it names has to be durable.
     """
     draft = folder / (CURRENT_FILE + NEW)
-    try:
-        with new_file(draft) as file:
-            file.write(current.to_bytes())
-            file.flush()
-            sync_open(file.fileno())
-        draft.replace(folder / CURRENT_FILE)
-    except BaseException:
-        remove_tree(draft)
-        raise
-    sync_folder(folder)
+    with replacing(folder / CURRENT_FILE, draft), new_file(draft) as file:
+        file.write(current.to_bytes())
 
 
 def log_path(folder: Path, number: int) -> Path:
@@ -229,7 +227,7 @@ def holds_store(folder: Path) -> bool:
             return False
         if not folder.is_dir():
             raise NotAStoreError(f"{folder} is a file; a store is a folder")
-        for error in strangers(folder):
+        for error in unsafe_entries(folder):
             raise error
         try:
             read_current(folder / CURRENT_FILE)
@@ -241,8 +239,33 @@ def holds_store(folder: Path) -> bool:
         return os.path.lexists(folder / CURRENT_FILE)
 
 
+def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
+    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
+
+    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
+    """
+    with reported(folder, "making the folder"):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(folder.parent)
+    require_unshared(folder)
+    lock = WriterLock(folder)
+    try:
+        # Asked again, under the lock: another writer may have made the store, and left, since.
+        if not holds_store(folder):
+            if identity is None:
+                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
+            with reported(folder, "making the store"):
+                write_current(folder, Current(1, create_log(log_path(folder, 1), identity.encode())))
+                sync_folder(folder.parent)
+    except BaseException:
+        lock.release()
+        raise
+    return lock
+
+
 def _refuse_foreign(folder: Path) -> None:
-    if (folder / EARLIER_FILE).exists():
+    if (folder / LEGACY_FILE).exists():
         raise VersionError(
             f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
             "recordings, or keep that release to read it"
@@ -279,7 +302,7 @@ def _may_be_ours(name: str) -> bool:
     return name.startswith((LOG, CURRENT_FILE, HOLDER_FILE)) or name in (LOCK_FILE, CHECKPOINTS, DERIVED)
 
 
-def strangers(folder: Path) -> Iterator[DamageError]:
+def unsafe_entries(folder: Path) -> Iterator[DamageError]:
     """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
 
     A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never

@@ -12,46 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from store.exceptions import DamageError, LockedError, StoreError, reported
-from store.files import CAREFULLY, new_file, read_regular
+from store.files import new_file, read_regular
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-try:
-    import fcntl
-except ImportError:  # Windows has none
-    flock = None
-else:
-    flock = fcntl.flock
-
-__all__ = ["HOLDER_FILE", "LOCK_FILE", "WriterLock", "is_held"]
+__all__ = ["HOLDER_FILE", "LOCK_FILE", "WriterLock"]
 
 LOCK_FILE = "lock"
 HOLDER_FILE = "holder.json"
 LARGEST_NOTE = 4096  # bytes
 
 WITHOUT_LOCKS = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
-
-# Seconds, because a reader that asks whether a writer is there holds the lock for an instant.
-PATIENCE, PAUSE = 0.1, 0.01
-
-
-def is_held(folder: Path) -> bool:
-    """Return whether a writer holds the lock on the store in `folder`, or may, where that cannot be asked."""
-    if flock is None:
-        return True
-    try:
-        descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | CAREFULLY)
-    except OSError as error:
-        return not isinstance(error, FileNotFoundError)
-    try:
-        flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        # Where there are no locks there is no writer.
-        return isinstance(error, BlockingIOError | PermissionError)
-    finally:
-        os.close(descriptor)
-    return False
 
 
 class WriterLock:
@@ -71,7 +43,7 @@ class WriterLock:
         self._lock: BaseFileLock = FileLock(folder / LOCK_FILE, thread_local=False, fallback_to_soft=False)
         with reported(folder, "taking the writer's lock"):
             try:
-                self._lock.acquire(timeout=PATIENCE, poll_interval=PAUSE)
+                self._lock.acquire(blocking=False)
             except Timeout:
                 raise LockedError(self._refusal()) from None
             except (NotImplementedError, OSError) as error:

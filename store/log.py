@@ -6,27 +6,21 @@ cut, others of its own batch and nothing else; any other frame of the log there 
 
 from __future__ import annotations
 
-import hashlib
-import os
-import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from store.encoding import RATIO, SPARE
-from store.exceptions import DamageError, StoreClosedError, StoreError, VersionError, reported
-from store.files import open_regular
+from store.exceptions import DamageError, StoreError, VersionError, reported
 from store.framing import COMMIT, FRAME_BYTES, HEADER, LARGEST_PAYLOAD, MARK, NO_CHECKSUM, VERSION, Frame, read_frame
+from store.log_file import PART, LogFile, Window
 from store.records import LARGEST_NUMBER, payload_digest
 
-__all__ = ["LogFile", "LogReader", "Place", "find_identity"]
+__all__ = ["LogReader", "Place"]
 
-PART = 2**18  # bytes that are read at once
 # A window older than the file, what a writer is just writing, and damage look alike the first time, and not the third.
 ATTEMPTS = 3
-BLOCK = 512  # bytes, of st_blocks
 
 
 class Place(NamedTuple):
@@ -59,102 +53,6 @@ class Place(NamedTuple):
         if frame.number <= self.number:
             return (frame.offset, frame.number, frame.batch, frame.previous) == self
         return frame.batch == self.batch and frame.offset - self.offset >= FRAME_BYTES * (frame.number - self.number)
-
-
-class LogFile:
-    """A regular file, read and written at offsets from any thread; raises OSError, DamageError for anything else.
-
-    window: offset and size of the part of the file that is all there is, for one that is only read.
-    """
-
-    def __init__(self, path: Path, *, write: bool, window: tuple[int, int] | None = None) -> None:
-        self.path = path
-        self._begin = 0 if window is None else window[0]
-        self._end = None if window is None else window[1]
-        self._guard = threading.Lock()
-        self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
-
-    @property
-    def descriptor(self) -> int:
-        """The open file's number. Raises StoreClosedError."""
-        if self._descriptor < 0:
-            raise StoreClosedError(f"the log {self.path} is closed")
-        return self._descriptor
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Return so many bytes at an offset, fewer where the file ends."""
-        if self._end is not None:
-            size = max(0, min(size, self._end - offset))
-        with self._guard:
-            os.lseek(self.descriptor, self._begin + offset, os.SEEK_SET)
-            data = part = os.read(self.descriptor, size)
-            while part and len(data) < size:
-                part = os.read(self.descriptor, size - len(data))
-                data += part
-            return data
-
-    def write(self, offset: int, data: bytes | bytearray) -> None:
-        """Write all bytes at an offset, in one call unless the system takes fewer."""
-        with self._guard, memoryview(data) as rest:
-            os.lseek(self.descriptor, self._begin + offset, os.SEEK_SET)
-            done = 0
-            while done < len(rest):
-                done += os.write(self.descriptor, rest[done:])
-
-    def size(self) -> int:
-        """Return the size in bytes. Raises DamageError where next to nothing of it is on the disk."""
-        found = os.fstat(self.descriptor)
-        stored = getattr(found, "st_blocks", 0) * BLOCK  # 0 also where the file system does not tell
-        if stored and found.st_size > SPARE + RATIO * stored:
-            # No log is ever so: its end is filled with zeros that are written.
-            raise DamageError(
-                f"{self.path} says that it has {found.st_size} bytes, and {stored} are on the disk: nothing of it was "
-                "read. In a folder that comes from elsewhere trust nothing",
-                path=self.path,
-            )
-        return found.st_size if self._end is None else self._end
-
-    def is_at(self, path: Path) -> bool:
-        """Return whether `path` still names this file."""
-        try:
-            return os.path.samestat(path.lstat(), os.fstat(self.descriptor))
-        except FileNotFoundError:
-            return False
-
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        with self._guard:
-            descriptor, self._descriptor = self._descriptor, -1
-            if descriptor >= 0:
-                os.close(descriptor)
-
-
-class _Window:
-    """The part of a file that is being read, so that small frames need no call each."""
-
-    def __init__(self, file: LogFile) -> None:
-        self._file = file
-        self.drop()
-
-    def drop(self) -> None:
-        """Forget what was read: the file may have changed since."""
-        self._start, self._data = 0, b""
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Return at most PART bytes at an offset, fewer where the file ends."""
-        begin = offset - self._start
-        if not 0 <= begin <= begin + size <= len(self._data):
-            self._start, begin = offset, 0
-            self._data = self._file.read(offset, PART)
-        return self._data[begin : begin + size]
-
-    def digest(self, offset: int, size: int) -> bytes:
-        """Return the digest of so many bytes at an offset, or of those up to the end of the file."""
-        digest = hashlib.blake2b(digest_size=16)
-        while size > 0 and (part := self.read(offset, min(size, PART))):
-            digest.update(part)
-            offset, size = offset + len(part), size - len(part)
-        return digest.digest()
 
 
 class LogReader:
@@ -191,7 +89,7 @@ class LogReader:
         with reported(path, "opening the log"):
             self._file = LogFile(path, write=self.WRITES) if file is None else file
             try:
-                self._window = _Window(self._file)
+                self._window = Window(self._file)
                 self._torn: Place | None = None
                 self._proved: Frame | None = None
                 self._first: Frame | None = None
@@ -400,12 +298,6 @@ class LogReader:
             return self._file.size()
 
     @property
-    def moved(self) -> bool:
-        """Whether another log was put in its place, or none is there: this one can still be read, and grows no more."""
-        with reported(self.path, "looking for the log"):
-            return not self._file.is_at(self.path)
-
-    @property
     def beginning(self) -> Place:
         """The place of the first frame behind the header."""
         assert self._first is not None, "its header is damaged"
@@ -429,23 +321,3 @@ class LogReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def find_identity(file: LogFile) -> bytes | None:
-    """Return the identity that the frames of a log carry, by the first of them that can be found; None without one.
-
-    The file is closed.
-    """
-    with reported(file.path, "looking for frames"):
-        try:
-            for offset in range(0, file.size(), PART):
-                data = file.read(offset, PART + FRAME_BYTES - 1)
-                found = data.find(MARK)
-                while 0 <= found < PART:
-                    frame = read_frame(data[found : found + FRAME_BYTES], offset + found)
-                    if frame is not None:
-                        return frame.identity
-                    found = data.find(MARK, found + 1)
-        finally:
-            file.close()
-    return None

@@ -12,7 +12,7 @@ from pathlib import Path
 from shutil import disk_usage
 
 from store.exceptions import FULL, RecordError, StoreClosedError, StoreError, reported
-from store.files import new_file, remove_tree, sync_file, sync_folder, sync_open
+from store.files import new_file, replacing, sync_open
 from store.framing import (
     COMMIT,
     FRAME_BYTES,
@@ -24,7 +24,8 @@ from store.framing import (
     pack_frame,
     read_frame,
 )
-from store.log import PART, LogReader, Place
+from store.log import LogReader, Place
+from store.log_file import PART
 
 __all__ = ["LogWriter", "create_log"]
 
@@ -207,8 +208,8 @@ class LogWriter(LogReader):
         super().close()
 
 
-def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = ()) -> None:
-    """Put a new log, with these kinds and payloads, at `path`, whole and durable or not at all.
+def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = ()) -> bytes:
+    """Put a new log, with these kinds and payloads, at `path`, whole and durable or not at all; return its identity.
 
     header: of the caller, for good. A log that is there is replaced; readers keep it open as it was. Raises
     StoreFullError, ReadOnlyError or another StoreError.
@@ -216,22 +217,17 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
     if len(header) > LARGEST_PAYLOAD:
         raise RecordError(f"a log's first frame of {len(header)} bytes cannot be kept")
     draft = path.with_name(f"{path.name}.new")
-    with reported(path, "making a log"):
-        try:
-            with new_file(draft) as file:
-                file.write(pack_frame(os.urandom(IDENTITY_BYTES), 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
-            with LogWriter(draft) as log:
-                count = 0
-                for count, (kind, payload) in enumerate(frames, 1):
-                    log.stage(kind, payload)
-                    if count % TOGETHER == 0:
-                        log.commit()
-                log.commit()
-                if count:
-                    log.seal()  # all of them were durable, and may be all that the log ever holds
-            sync_file(draft)
-            draft.replace(path)
-            sync_folder(path.parent)
-        except BaseException:
-            remove_tree(draft)
-            raise
+    identity = os.urandom(IDENTITY_BYTES)
+    with reported(path, "making a log"), replacing(path, draft):
+        with new_file(draft) as file:
+            file.write(pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)[0])
+        with LogWriter(draft) as log:
+            count = 0
+            for count, (kind, payload) in enumerate(frames, 1):
+                log.stage(kind, payload)
+                if count % TOGETHER == 0:
+                    log.commit()
+            log.commit()
+            if count:
+                log.seal()  # all of them were durable, and may be all that the log ever holds
+    return identity

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,22 +14,24 @@ from store.archive import Files
 from store.checkpoints import read_back
 from store.exceptions import DamageError, reported
 from store.files import store_folder, sync_folder
+from store.found_log import Fault, Progress
 from store.layout import (
     DAMAGED,
     LOG,
     Current,
+    NamedCheckpoint,
     log_numbers,
     log_path,
     remove_unnamed,
     require_unshared,
-    strangers,
+    unsafe_entries,
     write_current,
 )
 from store.lock import WriterLock
 from store.log_writer import create_log
 from store.records import to_json
-from store.row_encoding import ROW, decode_head, head_without_arrays
-from store.survey import Fault, FoundCheckpoint, Progress, Survey, require_store
+from store.row_encoding import ROW, head_without_arrays
+from store.survey import FoundCheckpoint, Survey, require_store
 
 __all__ = ["Repair", "repair_store"]
 
@@ -69,7 +72,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     folder = store_folder(path)
     require_store(folder)
     with reported(folder, "looking at the store"):
-        for error in strangers(folder):
+        for error in unsafe_entries(folder):
             raise error
     require_unshared(folder)
     lock = WriterLock(folder)
@@ -90,7 +93,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
 class _Plan:
     """Rows 1 to `kept` stay, those up to `base` without arrays.
 
-    `start` is the checkpoint to begin with, `standing` the one that stands for the rows up to `base`; `fresh` tells
+    `start` is the checkpoint to begin with, `stand_in` the one that stands for the rows up to `base`; `fresh` tells
     whether that is another than before.
     """
 
@@ -98,7 +101,7 @@ class _Plan:
     base: int
     fresh: bool
     start: FoundCheckpoint | None
-    standing: FoundCheckpoint | None
+    stand_in: FoundCheckpoint | None
 
     @classmethod
     def of(cls, survey: Survey) -> _Plan:
@@ -125,7 +128,7 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
     if plan.fresh:
         lost.append(
             f"rows 1 to {plan.base} give up their arrays, {which} stands for them: none of them can be retracted any "
-            "more"
+            f"more{_counts_again(survey, plan)}"
         )
     if plan.kept < survey.last:
         behind = survey.faulty(newest + 1, survey.last)
@@ -143,6 +146,17 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
     return lost
 
 
+def _counts_again(survey: Survey, plan: _Plan) -> str:
+    """Return in words which rows, behind a base that is new, can have taken back one that it contains."""
+    behind = [sequence for sequence, _ in survey.log.rows if plan.base < sequence <= plan.kept]
+    if not behind:
+        return ""
+    kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
+    which = f"row {behind[0]}" if len(behind) == 1 else f"rows {behind[0]} to {behind[-1]}"
+    named = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    return f"; what {which} ({named}) took back of them counts again"
+
+
 def _repair(survey: Survey) -> Repair:
     if survey.identity is None:
         raise DamageError(
@@ -151,19 +165,20 @@ def _repair(survey: Survey) -> Repair:
             path=survey.log.path,
         )
     folder, plan = survey.folder, _Plan.of(survey)
-    number = 1 + max([*log_numbers(folder, unfinished=True), *_put_aside(folder), 0])
+    lost = _lost(survey, plan)
+    number = 1 + max([*log_numbers(folder, unfinished=True), *_numbers_aside(folder), 0])
     if log_path(folder, number) == survey.log.path:
         number += 1  # that of one which is gone
     path = log_path(folder, number)
-    create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
-    current = _current(path, number, plan)
+    identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
+    current = Current(number, identity, *_checkpoints(path, plan), plan.kept)
     aside = _move_aside(survey, path)
     write_current(folder, current)
     remove_unnamed(folder, current)
-    return Repair(plan.kept, _lost(survey, plan), aside)
+    return Repair(plan.kept, lost, aside)
 
 
-def _put_aside(folder: Path) -> Iterator[int]:
+def _numbers_aside(folder: Path) -> Iterator[int]:
     """Yield the numbers of logs that earlier repairs put aside."""
     for entry in folder.iterdir():
         stem, dot, _ = entry.name.removeprefix(LOG).partition(DAMAGED)
@@ -186,20 +201,19 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
                     sequence=sequence,
                 ) from error
         elif fault is not Fault.DAMAGED:
-            data = survey.log.head_data(sequence)
-            with suppress(ValueError):
-                yield ROW, head_without_arrays(decode_head(data, survey.log.row_size(sequence)))
+            with suppress(DamageError):
+                yield ROW, head_without_arrays(survey.log.head(sequence))
 
 
-def _current(path: Path, number: int, plan: _Plan) -> Current:
-    """Return what `CURRENT` is to say, after the new log was read back. Raises DamageError."""
-    found = [plan.start, plan.standing]
-    identity, places = read_back(path, [0 if each is None else each.upto for each in found])
-    named = [
+def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
+    """Return the newest checkpoint and the base, with places in the new log, which is read back. Raises DamageError."""
+    found = [plan.start, plan.stand_in]
+    places = read_back(path, [0 if each is None else each.upto for each in found])
+    newest, base = (
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)
-    ]
-    return Current(number, identity, *named)
+    )
+    return newest, base
 
 
 def _move_aside(survey: Survey, new: Path) -> Path | None:
@@ -210,25 +224,22 @@ def _move_aside(survey: Survey, new: Path) -> Path | None:
     others = log_numbers(survey.folder) if survey.current is None else []
     for other in (log_path(survey.folder, number) for number in others):
         if other not in (new, survey.log.path):
-            other.rename(_free_name(other))
-            sync_folder(survey.folder)
+            _put_aside(other)
     for found in survey.checkpoints:
         if not found.sound and found.folder.exists():
-            found.folder.rename(_free_name(found.folder))
-            sync_folder(found.folder.parent)
+            _put_aside(found.folder)
     path = survey.log.path
     if not path.exists() or DAMAGED in path.name:
         return path if path.exists() else None
-    aside = _free_name(path)
-    path.rename(aside)
-    sync_folder(path.parent)
-    return aside
+    return _put_aside(path)
 
 
-def _free_name(path: Path) -> Path:
-    """Return the path with "damaged" behind its name, and a number where something is there already."""
+def _put_aside(path: Path) -> Path:
+    """Rename to, and return, the path with "damaged" behind its name, and a number where something is there already."""
     aside, count = path.with_name(path.name + DAMAGED), 1
     while os.path.lexists(aside):
         count += 1
         aside = path.with_name(f"{path.name}{DAMAGED}-{count}")
+    path.rename(aside)
+    sync_folder(path.parent)
     return aside

@@ -27,14 +27,12 @@ from store.exceptions import (
     StoreError,
     reported,
 )
-from store.files import is_file, store_folder, sync_folder
+from store.files import is_file, store_folder
+from store.found_log import Progress
 from store.journal import Journal
-from store.layout import CHECKPOINTS, Current, holds_store, log_path, require_unshared, write_current
+from store.layout import CHECKPOINTS, holds_store, lock_to_write
 from store.lock import WriterLock
-from store.log import LogReader
-from store.log_writer import create_log
 from store.records import JSON, Checkpoint, Head, Record, check_key, check_text, check_time, from_json, to_json
-from store.survey import Progress
 
 __all__ = ["Store"]
 
@@ -88,7 +86,7 @@ class Store:
         self._lock: WriterLock | None = None
         with ExitStack() as undo:
             if mode == "write":
-                self._lock = _lock_to_write(folder, identity)
+                self._lock = lock_to_write(folder, identity)
                 undo.callback(self._lock.release)
             files = files_of(folder)
             undo.callback(files.close)
@@ -381,30 +379,3 @@ class Store:
 def _check_after(after: int) -> None:
     if after < 0:
         raise RecordError(f"after must not be negative, not {after}")
-
-
-def _lock_to_write(folder: Path, identity: str | None) -> WriterLock:
-    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
-
-    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
-    """
-    with reported(folder, "making the folder"):
-        if not folder.is_dir():
-            folder.mkdir(parents=True, exist_ok=True)
-            sync_folder(folder.parent)
-    require_unshared(folder)
-    lock = WriterLock(folder)
-    try:
-        # Asked again, under the lock: another writer may have made the store, and left, since.
-        if not holds_store(folder):
-            if identity is None:
-                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
-            with reported(folder, "making the store"):
-                create_log(log_path(folder, 1), identity.encode())
-                with LogReader(log_path(folder, 1)) as log:
-                    write_current(folder, Current(1, log.identity))
-                sync_folder(folder.parent)
-    except BaseException:
-        lock.release()
-        raise
-    return lock

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -12,10 +11,10 @@ from typing import Literal
 
 from store.archive import Files, files_of
 from store.checkpoint_files import CheckpointReader
-from store.encoding import decode_payload
-from store.exceptions import DamageError, NotAStoreError, VersionError, reported
+from store.exceptions import DamageError, NotAStoreError, reported
 from store.files import store_folder
-from store.framing import FRAME_BYTES, NO_CHECKSUM, read_frame
+from store.found_log import Fault, FoundLog, Progress
+from store.framing import NO_CHECKSUM
 from store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
@@ -30,34 +29,15 @@ from store.layout import (
     log_numbers,
     log_path,
     numbers,
-    strangers,
+    unsafe_entries,
 )
-from store.log import LogReader, Place, find_identity
-from store.records import JSON, from_json
-from store.row_encoding import ROW, decode_head, decode_row, row_sequence
-from store.rows import Rows, head_bytes
+from store.log import Place
+from store.records import JSON
 
-__all__ = ["Fault", "FoundCheckpoint", "FoundLog", "Problem", "Progress", "Survey", "check_store", "require_store"]
+__all__ = ["FoundCheckpoint", "Problem", "Survey", "check_store", "require_store"]
 
-# Called with what is being done, how many of it are done, and how many there are.
-Progress = Callable[[str, int, int], object]
-REPORT_EVERY = 256  # rows
 ATTEMPTS = 4
 NOWHERE = Place(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
-
-
-class Fault(enum.Enum):
-    """What can be wrong with a row, said of one and of several."""
-
-    MISSING = ("is missing", "are missing")
-    DAMAGED = ("fails its checksum", "fail their checksums")
-    NO_ARRAYS = ("has lost its arrays", "have lost their arrays")
-    DAMAGED_ARRAYS = ("has arrays that fail their checksum", "have arrays that fail their checksums")
-    FOREIGN_ARRAYS = ("has arrays that were never written so", "have arrays that were never written so")
-
-    def describe(self, first: int, last: int) -> str:
-        """Return in words that rows `first` to `last` have this fault."""
-        return f"row {first} {self.value[0]}" if first == last else f"rows {first} to {last} {self.value[1]}"
 
 
 @dataclass(frozen=True)
@@ -89,7 +69,7 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
         files = files_of(folder)
         if not files.is_packed:
             require_store(folder)
-            if strange := [Problem(error.path, str(error), "lost") for error in strangers(folder)]:
+            if strange := [Problem(error.path, str(error), "lost") for error in unsafe_entries(folder)]:
                 return strange
         with closing(files):
             for _ in range(ATTEMPTS):
@@ -137,146 +117,12 @@ class FoundCheckpoint:
         return -1 if self.named is None else self.named.upto
 
 
-class FoundLog:
-    """A log as it was found: the sequences of its rows, each with what is wrong with it, and other damage.
-
-    path: the log, or what an interrupted repair left of it. identity: the store's, None where that is lost.
-    compacted: the last row without arrays. damage: what is wrong with it but for rows. durable: as of `LogReader`.
-    """
-
-    def __init__(
-        self, files: Files, path: Path, identity: bytes | None, progress: Progress, durable: Place | None = None
-    ) -> None:
-        self.path, self.damage = path, list[str]()
-        self.identity: dict[str, JSON] | None = None
-        self.rows: list[tuple[int, Fault | None]] = []
-        self.torn, self.without_arrays = set[int](), set[int]()
-        self.compacted = 0
-        self._offsets: dict[int, tuple[int, int]] = {}
-        self._reader: LogReader | None = None
-        try:
-            known = find_identity(files.open_log(path)) if identity is None else identity
-            self._reader = files.read_log(path, identity=known)
-            self._reader.durable = durable
-        except FileNotFoundError:
-            self.damage.append(f"{path} is gone")
-            return
-        except DamageError as error:
-            self.damage.append(str(error))
-            return
-        if identity is not None and self._reader.identity != identity:
-            self.damage.append(f"{path} is the log of another store, or of another time: nothing of it was read")
-            self._reader.close()
-            self._reader = None
-            return
-        try:
-            self._read(self._reader, progress)
-        except DamageError as error:  # nothing more of the file can be read
-            self.damage.append(str(error))
-        except BaseException:
-            self.close()
-            raise
-
-    def _read(self, log: LogReader, progress: Progress) -> None:
-        if log.header_damage is not None:
-            self.damage.append(str(log.header_damage))
-        else:
-            try:
-                self.identity = from_json(log.header.decode())
-            except ValueError as error:
-                self.damage.append(f"the identity in {self.path} was never written so: {error}")
-        rows = Rows()
-        for done, _ in enumerate(rows.take(log)):
-            if done % REPORT_EVERY == 0:
-                progress("batches", done, done)
-        for index in range(len(rows) + 1):
-            for damage in rows.damage.get(index, ()):
-                self._note_damage(log, damage)
-            if index < len(rows):
-                if index % REPORT_EVERY == 0:
-                    progress("rows", index, len(rows))
-                self._note_row(log, rows.sequences[index], rows.offsets[index], rows.sizes[index])
-
-    def _note_damage(self, log: LogReader, damage: DamageError) -> None:
-        """Note a damaged frame: as a row with a fault where its first bytes still say which."""
-        before = self.rows[-1][0] if self.rows else 0
-        try:
-            offset = -1 if damage.offset is None else damage.offset
-            frame = read_frame(log.bytes_at(offset, FRAME_BYTES), offset) if offset >= 0 else None
-            if frame is not None and frame.identity == log.identity and frame.kind == ROW:
-                data = head_bytes(log, offset, frame.size)
-                sequence = row_sequence(data)
-                if sequence > before:
-                    decode_head(data, frame.size)
-                    self._offsets[sequence] = offset, frame.size
-                    self.rows.append((sequence, Fault.DAMAGED_ARRAYS))
-                    return
-        except ValueError:
-            pass
-        self.damage.append(str(damage))
-        self.torn.add(before)
-
-    def _note_row(self, log: LogReader, sequence: int, offset: int, size: int) -> None:
-        if self.rows and sequence <= self.rows[-1][0]:
-            self.damage.append(f"row {sequence} follows row {self.rows[-1][0]} in {self.path}")
-            return
-        fault = None
-        try:
-            row = decode_row(log.read(offset, size)[1])
-            if row.head.sequence != sequence:
-                fault = Fault.DAMAGED
-            elif row.payload is None:
-                self.without_arrays.add(sequence)
-                self.compacted = sequence
-            elif not _is_readable(row.payload):
-                fault = Fault.FOREIGN_ARRAYS
-        except (DamageError, ValueError):
-            fault = Fault.DAMAGED
-        self._offsets[sequence] = offset, size
-        self.rows.append((sequence, fault))
-
-    @property
-    def last(self) -> int:
-        """The sequence of its last row, 0 without any."""
-        return self.rows[-1][0] if self.rows else 0
-
-    @property
-    def is_read(self) -> bool:
-        """Whether anything of it was read."""
-        return self._reader is not None
-
-    def has_place(self, named: NamedCheckpoint) -> bool:
-        """Whether a checkpoint's place is in the log, and no row that it does not contain is before it."""
-        assert self._reader is not None
-        if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.upto):
-            return False
-        return self._reader.has_place(named.place)
-
-    def data(self, sequence: int) -> bytes:
-        """Return the bytes of a row, verified once more. Raises DamageError."""
-        assert self._reader is not None
-        return self._reader.read(*self._offsets[sequence])[1]
-
-    def head_data(self, sequence: int) -> bytes:
-        """Return the bytes of a row's head, not verified."""
-        assert self._reader is not None
-        return head_bytes(self._reader, *self._offsets[sequence])
-
-    def row_size(self, sequence: int) -> int:
-        """Return the bytes of a row."""
-        return self._offsets[sequence][1]
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._reader is not None:
-            self._reader.close()
-
-
 class Survey:
     """All that is found of a store, and whether it verifies.
 
     `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays a base
-    stands for, whether that base is sound or not. `last` is the last sequence of which there is any sign; `faults` are
+    stands for, whether that base is sound or not. `sound` are the checkpoints that recovery can resume from, the newest
+    first. `last` is the last sequence of which there is any sign; `faults` are
     the rows that do not verify, as (first, last, fault), ascending. A writer may be at work meanwhile. Raises
     VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
     against it.
@@ -294,6 +140,7 @@ class Survey:
         except DamageError as error:
             self.damage.append(Problem(error.path, str(error), "spare"))
         self.checkpoints = list(self._found())
+        self._sort_sound()
         self.log = self._found_log()
         self.identity = self.log.identity
         if self.identity is None and self.sound:
@@ -361,9 +208,10 @@ class Survey:
             if found.sound and found.identity != self.identity:
                 wrong = DamageError(f"{found.folder} is a checkpoint of another store", path=found.folder)
                 self.checkpoints[i] = replace(found, damage=[wrong], identity=None)
+        self._sort_sound()
 
     def _find_faults(self) -> None:
-        upto = max((found.upto for found in self.checkpoints), default=0)
+        known = 0 if self.current is None else self.current.last
         self.faults: list[tuple[int, int, Fault]] = []
         before = 0
         for sequence, fault in self.log.rows:
@@ -373,7 +221,7 @@ class Survey:
             elif sequence > self.compacted and sequence in self.log.without_arrays:
                 self._note(sequence, sequence, Fault.NO_ARRAYS)
             before = sequence
-        self.last = max(before, upto)
+        self.last = max([before, known, *(found.upto for found in self.checkpoints)])
         if before in self.log.torn:
             self.last = max(self.last, before + 1)
         self._note_gap(before, self.last)
@@ -397,11 +245,9 @@ class Survey:
             if max(begin, first) <= min(end, last)
         ]
 
-    @property
-    def sound(self) -> list[FoundCheckpoint]:
-        """The checkpoints that recovery can resume from, the newest first."""
+    def _sort_sound(self) -> None:
         found = [found for found in self.checkpoints if found.sound]
-        return sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
+        self.sound = sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
 
     @property
     def base(self) -> FoundCheckpoint | None:
@@ -468,14 +314,3 @@ def _or_aside(path: Path) -> Path:
     """Return a log's path, or where an interrupted repair put it."""
     aside = path.with_name(path.name + DAMAGED)
     return aside if not path.exists() and aside.exists() else path
-
-
-def _is_readable(payload: bytes) -> bool:
-    """Whether a payload is what `encode_payload` makes: anyone can make its digest; one of a newer release counts."""
-    try:
-        decode_payload(payload)
-    except VersionError:
-        return True
-    except ValueError:
-        return False
-    return True

@@ -84,7 +84,7 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 @memory.command()
 def repair(folder: MemoryFolder) -> None:
     """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
-    # Where it still opens, closing it writes a generation: a repair may give up the rows that led to it.
+    # Where it still opens, closing it writes a checkpoint: a repair may give up the rows that led to it.
     with suppress(ScrollTactileError, StoreError), opened_for_upkeep(folder):
         pass
     with progress_bar() as progress:

@@ -13,12 +13,12 @@ __all__ = ["apply_appended", "relabel"]
 
 
 def apply_appended(memory: Memory, store: Store, records: list[Record]) -> list[Added] | None:
-    """Apply the rows that a writer appended, and take an f* that it made; what changed, see `Memory.replay`."""
+    """Apply the rows that a writer appended, and take a tuned model that it made; what changed, see `Memory.replay`."""
     changed = [memory.replay(record, store) for record in records]
     memory.refill(store)
-    newest = store.latest() if store.newest != memory.generation else None
+    newest = store.latest() if store.newest != memory.checkpoint else None
     if newest is not None and newest.upto <= memory.sequence:
-        memory.generation = newest.number
+        memory.checkpoint = newest.number
         retractions = (head for head in store.heads(newest.upto, kind=RETRACT) if head.sequence <= memory.sequence)
         gone = min((row for head in retractions for row in unspanned(head.attributes["sequences"])), default=None)
         if gone is None or gone > cast(int, newest.attributes["tuned_upto"]):

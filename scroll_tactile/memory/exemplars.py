@@ -134,7 +134,7 @@ class Exemplar:
     @classmethod
     def of(cls, material: str, key: bytes, packed: Arrays, stages: Stages, codes: Codes) -> Exemplar:
         """The exemplar of a stream; stages: those that it reached. codes: its rows by scale, its own first."""
-        # Not by a view: f* is trained on windows.
+        # Not by a view: the tuned model is trained on windows.
         windows = [{scale: rows for scale, rows in stage.items() if scale.kind == "window"} for stage in stages]
         return cls(material, key, packed, SampledTouch.of(windows, codes).rows[-1], max(windows[-1]))
 

@@ -1,7 +1,7 @@
 """The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
-gate takes every row and generation for what it must be (see `row_checks`, `generation_checks`), and raises DamageError
+gate takes every row and checkpoint for what it must be (see `row_checks`, `checkpoint_checks`), and raises DamageError
 with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
 under another name is, and it fits.
 """
@@ -19,8 +19,8 @@ from typing import Literal, cast
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, MismatchError
+from scroll_tactile.memory.checkpoint_checks import CheckpointChecks
 from scroll_tactile.memory.expected import Unexpected
-from scroll_tactile.memory.generation_checks import GenerationChecks
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
 from scroll_tactile.memory.row_checks import RowChecks
 from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
@@ -39,7 +39,7 @@ WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionErr
 
 
 class Gate:
-    """What rows and generations in a folder must be, by the identity there, and the plan of windows it is read with.
+    """What rows and checkpoints in a folder must be, by the identity there, and the plan of windows it is read with.
 
     thorough: whether second moments are shown to be some; it takes as long as fitting a readout.
     """
@@ -49,7 +49,7 @@ class Gate:
         copies = identity.augmentation.copies if identity.augmentation else 0
         made_with = identity.sensor, identity.embedding.dimension, plan
         self._rows = RowChecks(*made_with, copies)
-        self._generations = GenerationChecks(*made_with, keeps=bool(identity.recall))
+        self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.recall))
 
     def head(self, head: Head) -> Head:
         """This row, which is what its kind must be but for its arrays. Raises as `record`."""
@@ -64,15 +64,15 @@ class Gate:
             if record.kind == OBSERVE:
                 self._rows.check_observed(record)
             elif record.kind == MERGE:
-                self._generations.check(record.arrays, record.attributes, None, thorough=self._thorough)
+                self._checkpoints.check(record.arrays, record.attributes, None, thorough=self._thorough)
         return record
 
-    def generation(self, generation: Checkpoint) -> Checkpoint:
-        """This generation. Raises DamageError."""
-        with self._refusing(f"generation {generation.number}"):
-            arrays, attributes, upto = generation.arrays, generation.attributes, generation.upto
-            self._generations.check(arrays, attributes, upto, thorough=self._thorough)
-        return generation
+    def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
+        """This checkpoint. Raises DamageError."""
+        with self._refusing(f"checkpoint {checkpoint.number}"):
+            arrays, attributes, upto = checkpoint.arrays, checkpoint.attributes, checkpoint.upto
+            self._checkpoints.check(arrays, attributes, upto, thorough=self._thorough)
+        return checkpoint
 
     @contextmanager
     def _refusing(self, what: str, sequence: int | None = None) -> Iterator[None]:
@@ -144,12 +144,12 @@ class MemoryStore(Store):
         if only is not None:
             return super().latest(only=only)
         newest = super().latest()
-        return None if newest is None else self.gate.generation(newest)
+        return None if newest is None else self.gate.checkpoint(newest)
 
     def base(self) -> Checkpoint | None:
         """As `Store.base`."""
         base = super().base()
-        return None if base is None else self.gate.generation(base)
+        return None if base is None else self.gate.checkpoint(base)
 
 
 def open_store(
@@ -173,19 +173,19 @@ def open_store(
     return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
 
 
-def require_counted(path: Path, generation: Checkpoint, heads: Sequence[Head]) -> None:
-    """Raise DamageError where a generation counts more touches of a material than the journal's rows name.
+def require_counted(path: Path, checkpoint: Checkpoint, heads: Sequence[Head]) -> None:
+    """Raise DamageError where a checkpoint counts more touches of a material than the journal's rows name.
 
     heads: all rows of the journal; where a repair lost some, nobody knows.
     """
     if heads and len(heads) < heads[-1].sequence:
         return
-    named = Counter(head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= generation.upto)
-    touches = generation.arrays["observations"].tolist()
-    for material, count in zip(cast("list[str]", generation.attributes["materials"]), touches, strict=True):
+    named = Counter(head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= checkpoint.upto)
+    touches = checkpoint.arrays["observations"].tolist()
+    for material, count in zip(cast("list[str]", checkpoint.attributes["materials"]), touches, strict=True):
         if count > named[material]:
             raise DamageError(
-                f"generation {generation.number} of {path} counts {count} touches of {material!r}, of which its "
+                f"checkpoint {checkpoint.number} of {path} counts {count} touches of {material!r}, of which its "
                 f"journal names {named[material]}: it was made by another program, or for another journal",
                 path=path,
             )
@@ -209,14 +209,14 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         heads, wrong = _in_rows(store)
         passed = [head for head in heads if head.sequence not in wrong]
         retractions = map(str, wrong_retractions(store.path, passed))
-        return [*_in_generations(store, heads), *wrong.values(), *retractions]
+        return [*_in_checkpoints(store, heads), *wrong.values(), *retractions]
 
 
-def _in_generations(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
+def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
     for read in (store.latest, store.base):
         try:
-            if (generation := read()) is not None:
-                require_counted(store.path, generation, heads)
+            if (checkpoint := read()) is not None:
+                require_counted(store.path, checkpoint, heads)
         except DamageError as damage:
             yield str(damage)
 

@@ -20,7 +20,7 @@ from scroll_tactile.memory.contents import Contents, StoredContents
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.merge import Choice, Incoming
+from scroll_tactile.memory.merge import Choice, MergePlan
 from scroll_tactile.memory.observations import compaction_point, observation_of, observations_from, observations_of
 from scroll_tactile.memory.packing import pack_memory
 from scroll_tactile.memory.rows import (
@@ -47,9 +47,9 @@ __all__ = ["Ledger"]
 logger = logging.getLogger(__name__)
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
-SNAPSHOT_EVERY = 128  # rows between generations: opening embeds so many again in half a second
+SNAPSHOT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
 LOOKS = 5  # of a reader at a memory that is written to meanwhile, before it is read anew
-MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a generation has all
+MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a checkpoint has all
 
 
 class Ledger:
@@ -172,12 +172,12 @@ class Ledger:
         return self.store
 
     def require_writing(self) -> None:
-        """Raise, before any work is done, what would keep a generation from being written."""
+        """Raise, before any work is done, what would keep a checkpoint from being written."""
         self.require_open()
         if self.store is None:
             return
         if self._batching:
-            raise InputError("no generation can be written in a batch: end it first")
+            raise InputError("no checkpoint can be written in a batch: end it first")
         if self.store.mode == "read":
             raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
         self._pass_over_failures(self.store)
@@ -185,8 +185,8 @@ class Ledger:
     def _pass_over_failures(self, store: Store) -> None:
         try:
             store.flush()
-        except StoreError as error:  # of an earlier generation: the next commit would raise it instead of committing
-            logger.warning("%s: no generation could be written: %s", store.path, error)
+        except StoreError as error:  # of an earlier checkpoint: the next commit would raise it instead of committing
+            logger.warning("%s: no checkpoint could be written: %s", store.path, error)
 
     def observe(
         self,
@@ -391,7 +391,7 @@ class Ledger:
             self._require_no_batch("a merge")
             with MemoryStore.open(other, mode="read") as source:
                 source.read_with(memory.plan, thorough=thorough)
-                incoming = Incoming.of(
+                plan = MergePlan.of(
                     store,
                     memory,
                     source,
@@ -403,10 +403,10 @@ class Ledger:
                     said=said,
                 )
                 with self._mutation(), store.batch():
-                    added = incoming.append_to(store, memory, lambda done, of: progress("merging", done, of))
+                    added = plan.append_to(store, memory, lambda done, of: progress("merging", done, of))
             self._changed()
             self._snapshot_if_due()
-        return Merged(added, incoming.shared, len(incoming.descriptions)), incoming.refused
+        return Merged(added, plan.shared, len(plan.descriptions)), plan.refused
 
     def pack(self, path: str | os.PathLike[str], rows: bool, readings: bool, source: str | None) -> None:
         """As `TactileLearner.pack`."""
@@ -423,7 +423,8 @@ class Ledger:
             self.require_writing()
             if upto > memory.base:
                 store.base()  # a damaged one has what the new one needs
-                newest = memory.to_arrays() if upto < memory.sequence else None  # with f*, which the base may lack
+                # With the tuned model, which the base may lack.
+                newest = memory.to_arrays() if upto < memory.sequence else None
                 base = memory.until(store, upto) if upto < memory.sequence else memory
                 arrays, attributes = base.to_arrays(upto, candidates_of(base, store))
                 with self._mutation():
@@ -442,10 +443,10 @@ class Ledger:
             memory, store = self.memory, self.store
             if store is None or store.mode == "write":
                 return False
-            if (store.newest, store.last, store.compacted) == (memory.generation, memory.sequence, memory.base):
+            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.base):
                 return False
             try:
-                # A checkpoint that came between the reads may be of rows behind these, and hold an f* that was made
+                # A checkpoint that came between the reads may be of rows behind these, and hold a tuned model from
                 # before them.
                 for _ in range(LOOKS):
                     if store.compacted != memory.base or store.last - memory.sequence > SNAPSHOT_EVERY:
@@ -453,7 +454,7 @@ class Ledger:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
-                    if store.newest == memory.generation and store.compacted == memory.base:
+                    if store.newest == memory.checkpoint and store.compacted == memory.base:
                         return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
@@ -472,7 +473,7 @@ class Ledger:
             return self.memory.to_arrays(candidates=candidates_of(self.memory, self.store))
 
     def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
-        """Keep f*, durably. Raises FineTuneError where something was retracted since its training began.
+        """Keep the tuned model, durably. Raises FineTuneError where something was retracted since its training began.
 
         made_from, upto, retractions: the memory, its sequence and its count of retractions when the training began.
         """
@@ -480,13 +481,13 @@ class Ledger:
             self.require_writing()
             memory = self.memory
             if memory is not made_from or memory.retractions != retractions:
-                raise FineTuneError("what f* was being made from was retracted meanwhile: fine-tune again")
+                raise FineTuneError("what the tuned model was being made from was retracted meanwhile: fine-tune again")
             before = memory.tuned, memory.tuned_upto
             memory.tuned, memory.tuned_upto = tuned, upto
             try:
                 self._snapshot()
             except BaseException:
-                # Ctrl-C may come when the generation is already current: closing writes the earlier f* again.
+                # Ctrl-C may come when the checkpoint is already current: closing writes the earlier tuned model again.
                 (memory.tuned, memory.tuned_upto), self._saved = before, -1
                 raise
 
@@ -503,7 +504,7 @@ class Ledger:
             self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes)
         except StoreError as error:
             # The journal has it all; only the next opening has more to replay.
-            logger.warning("%s: no generation could be written: %s", self.store.path, error)
+            logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
         self._saved = self._memory.sequence
         del arrays
         give_back_scratch()

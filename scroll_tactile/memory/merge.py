@@ -14,25 +14,25 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import MemoryStore, require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.packing import sums_without
-from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, standing
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.memory.state import Memory, apply_description
 from store import Checkpoint, Head, Record, Store
 from store.files import same_folder
 
-__all__ = ["Choice", "Incoming"]
+__all__ = ["Choice", "MergePlan"]
 
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
 
 @dataclass(frozen=True)
-class Incoming:
+class MergePlan:
     """What another memory would bring: rows to be appended, in order.
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
     that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
     under another name, and why that is refused. descriptions: by material, those that we have not. newest:
-    what a packed memory sums up. said: where touches come from that do not say it. Made by `Incoming.of`.
+    what a packed memory sums up. said: where touches come from that do not say it. Made by `MergePlan.of`.
     """
 
     source: MemoryStore
@@ -58,7 +58,7 @@ class Incoming:
         descriptions: Choice,
         clipped: Collection[bytes] = (),
         said: str | None = None,
-    ) -> Incoming:
+    ) -> MergePlan:
         """Look through both journals.
 
         contents: which touches we have. once: leave out streams that both observed, of one material with one content
@@ -74,7 +74,7 @@ class Incoming:
         base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
-        incoming = standing(heads)
+        incoming = active_rows(heads)
         both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
         refused, again = _by_first_names(incoming, contents, base, clipped) if one_name else ([], set())
         out = {*(both if once else ()), *again, *(head.sequence for head, _ in refused)}
@@ -139,7 +139,7 @@ class Incoming:
 
     def _rows_to_append(self, base: Checkpoint | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if base is not None:
-            left_out = ("tuned", "descriptions")  # f* stays there; descriptions come as rows of their own
+            left_out = ("tuned", "descriptions")  # the tuned model stays there; descriptions come as rows of their own
             attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None

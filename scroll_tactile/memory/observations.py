@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, cast
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory.rows import MEMBER, OBSERVE, SOURCE, retracted_by, standing
+from scroll_tactile.memory.rows import MEMBER, OBSERVE, SOURCE, active_rows, retracted_by
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.results import Observation, Receipt
 from store import Head, Record, Store
@@ -64,7 +64,7 @@ def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
     Raises ObservationError where there are none, and where some were compacted.
     """
     mine = [
-        head for head in standing(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
+        head for head in active_rows(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
     ]
     held = {head.sequence for head in memory.retractable(store)}
     if not mine:

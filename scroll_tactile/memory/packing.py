@@ -13,7 +13,7 @@ from scroll_tactile.memory.buffer import candidates_of
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, standing
+from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.memory.state import Memory
 from store import Checkpoint, DamageError, Head, Store
 from store.archive import write_archive
@@ -26,7 +26,7 @@ def pack_memory(
     store: Store, memory: Memory, path: Path, *, rows: bool = True, readings: bool = True, source: str | None = None
 ) -> None:
     """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
-    found = standing(store.heads())
+    found = active_rows(store.heads())
     heads = [head for head in found if head.kind != MERGE]
     with_rows = rows and readings and not memory.base and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
@@ -69,7 +69,7 @@ def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays
 
 def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
     """The exemplars among some touches, as a memory of this making has them."""
-    exemplars = memory.of_nothing().exemplars
+    exemplars = memory.empty_like().exemplars
     if exemplars is not None:
         exemplars.update((head.label, head.key, head.sequence) for head in touches if "nbytes" in head.attributes)
     return exemplars
@@ -93,7 +93,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     sums = memory.of_sums(found.arrays, found.attributes)
     if not left_out:
         return sums
-    gone, rest = memory.of_nothing(), memory.of_nothing()
+    gone, rest = memory.empty_like(), memory.empty_like()
     for sequence in left_out:
         record = source.record(sequence)
         columns, codes = memory.codes(record)

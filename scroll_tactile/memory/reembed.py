@@ -47,7 +47,7 @@ class Reembedding:
     source: the store of the other one. identity: of the new one. load: reads a memory from the new one's store. encode:
     embeds readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
 
-    Raises MismatchError where not every observation has its readings, DamageError where a generation counts touches
+    Raises MismatchError where not every observation has its readings, DamageError where a checkpoint counts touches
     that no row has, StoreError.
     """
 

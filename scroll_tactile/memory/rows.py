@@ -27,6 +27,7 @@ __all__ = [
     "Codes",
     "Encode",
     "Readings",
+    "active_rows",
     "only_readings",
     "pack_codes",
     "pack_readings",
@@ -34,7 +35,6 @@ __all__ = [
     "retracted_by",
     "row_codes",
     "spans",
-    "standing",
     "unpack_codes",
     "unpack_readings",
     "unspanned",
@@ -155,7 +155,7 @@ def retracted_by(rows: Iterable[Head]) -> set[int]:
     return {row for head in rows if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
-def standing(rows: Iterable[Head]) -> list[Head]:
+def active_rows(rows: Iterable[Head]) -> list[Head]:
     """The rows that something was learned from, compacted ones too, without the retracted ones."""
     heads = list(rows)
     retracted = retracted_by(heads)

@@ -1,4 +1,4 @@
-"""A memory: exact statistics, sampled touches, exemplars and f*, and how a store keeps them."""
+"""A memory: exact statistics, sampled touches, exemplars and the tuned model, and how a store keeps them."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ class Memory:
     - kept: touches for recall; None without `keeping`.
     - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
     - descriptions: material → what it is made of; the material need not have been observed.
-    - tuned: f*; None before a fine-tune, or after one of the observations behind it was retracted.
-    - tuned_upto: the last sequence that f* was trained on.
+    - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
+    - tuned_upto: the last sequence that the tuned model was trained on.
 
     Where it stands in the journal:
 
@@ -80,7 +80,7 @@ class Memory:
     - retracted: the retracted sequences after `base`.
     - excluded: the retracted sequences up to `base`, which the base was made without.
     - retractions: how many observations were retracted since the memory was loaded.
-    - generation, saved: the generation that it was loaded from, and the last row in that; None and 0 without one.
+    - checkpoint, saved: the checkpoint that it was loaded from, and the last row in that; None and 0 without one.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Memory:
         self.retracted: set[int] = set()
         self.excluded: set[int] = set()
         self.base = 0
-        self.generation: int | None = None
+        self.checkpoint: int | None = None
         self.saved = 0
         self.sequence = 0
         self.retractions = 0
@@ -227,7 +227,7 @@ class Memory:
         return [head for head in rows if head.sequence not in self.retracted]
 
     def put_back(self, record: Record) -> None:
-        """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and f*."""
+        """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and the tuned model."""
         columns, codes = self.codes(record)
         self.statistics.add(record.label, codes, columns)
         self.retracted.discard(record.sequence)
@@ -280,13 +280,13 @@ class Memory:
         wanted = self.kept is not None and self.kept.wants(record.label, record.key)
         return unpack_readings(record.arrays) if wanted else None
 
-    def of_nothing(self) -> Memory:
+    def empty_like(self) -> Memory:
         """Another memory of the same making."""
         return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode, self.keeping)
 
     def _base_samples(self, store: Store) -> Memory:
         """A memory with what the base holds; an empty one without a base."""
-        fresh = self.of_nothing()
+        fresh = self.empty_like()
         fresh.base = self.base
         self.require_base(store)
         try:
@@ -315,14 +315,14 @@ class Memory:
 
     def _counted(self, store: Store, upto: int) -> Counter[tuple[str, bytes]]:
         """How often each stream was observed, by material and key, up to a row and without what was retracted."""
-        gone = self.gone(store.heads(kind=RETRACT), upto)
+        gone = self.uncounted(store.heads(kind=RETRACT), upto)
         return Counter(
             (head.label, head.key)
             for head in store.heads()
             if head.sequence <= upto and head.kind in (OBSERVE, MEMBER) and head.sequence not in gone
         )
 
-    def gone(self, retractions: Iterable[Head], upto: int) -> set[int]:
+    def uncounted(self, retractions: Iterable[Head], upto: int) -> set[int]:
         """The observations that count no more at a row, by the journal and by the memory itself.
 
         The base was made without what a later row retracts of it, and a retraction may have been lost to damage since.
@@ -348,18 +348,18 @@ class Memory:
 
     def _join(self, record: Record) -> None:
         """Add another memory of the same making: a row that holds the arrays and attributes of its base."""
-        other = self.of_nothing()
+        other = self.empty_like()
         other._take(record.arrays, record.attributes, record.sequence)
         self.join(other, exemplars="exemplar-readings" in record.arrays)
 
     def of_sums(self, arrays: Arrays, attributes: Any) -> Memory:
         """Another memory of the same making, of what a partial holds; see `memory.partial`."""
-        other = self.of_nothing()
+        other = self.empty_like()
         other._take(arrays, attributes, None)
         return other
 
     def join(self, other: Memory, *, exemplars: bool = True) -> None:
-        """Add another memory of the same making; descriptions and f* are left out."""
+        """Add another memory of the same making; descriptions and the tuned model are left out."""
         self.statistics = self.statistics + other.statistics
         self.sample.update(other.sample)
         if self.kept is not None and other.kept is not None:
@@ -370,7 +370,7 @@ class Memory:
     def to_arrays(
         self, base_at: int | None = None, candidates: list[Exemplar] | None = None
     ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a generation.
+        """Arrays and attributes of a checkpoint.
 
         base_at: of a base, whose rows can no longer be retracted. candidates: those for exemplars, with their readings,
         for a base and for what leaves the journal behind.
@@ -415,37 +415,37 @@ class Memory:
         encode: Encode | None = None,
         keeping: Keeping | None = None,
     ) -> Memory:
-        """The memory that a store holds: its newest generation, then the journal's rows after it."""
+        """The memory that a store holds: its newest checkpoint, then the journal's rows after it."""
         for _ in range(ATTEMPTS - 1):
             newest = store.newest
             try:
                 memory = cls(dimension, plan, exemplars, encode, keeping)._loaded(store)
             except CompactedError:  # a writer compacted it between two reads
                 continue
-            # A generation that came between the reads may hold an f* from before the rows that were read.
+            # A checkpoint that came between the reads may hold a tuned model from before the rows that were read.
             if store.newest == newest:
                 return memory
         return cls(dimension, plan, exemplars, encode, keeping)._loaded(store)
 
     def _loaded(self, store: Store) -> Memory:
         self.base = store.compacted
-        # Without a sound generation the base raises what is lost; without a base the journal has every row.
+        # Without a sound checkpoint the base raises what is lost; without a base the journal has every row.
         newest = store.latest()
         start = store.base() if newest is None else newest
         if start is not None:
             self._take(start.arrays, start.attributes, 0)
             self.sequence = start.upto
-        self.generation = None if newest is None else newest.number
+        self.checkpoint = None if newest is None else newest.number
         self.saved = self.sequence
         for record in store.records(after=self.sequence):
             self.replay(record, store)
         self.refill(store)
-        logger.info("%s: generation %s, and rows up to %d", store.path, self.generation, self.sequence)
+        logger.info("%s: checkpoint %s, and rows up to %d", store.path, self.checkpoint, self.sequence)
         return self
 
     def until(self, store: Store, upto: int) -> Memory:
         """The memory of the observations up to `upto` that are not retracted: what a base at `upto` holds."""
-        memory, later = self._chosen(store, upto), self.of_nothing()
+        memory, later = self._chosen(store, upto), self.empty_like()
         for head in store.heads(self.base):  # whoever compacts has read all
             if head.sequence <= upto:
                 apply_description(memory.descriptions, head)
@@ -474,9 +474,9 @@ class Memory:
         self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
         self._take_tuned(arrays, attributes)
 
-    def take_tuned(self, generation: Checkpoint) -> None:
-        """Take f* from a generation, if it has another one."""
-        self._take_tuned(generation.arrays, generation.attributes)
+    def take_tuned(self, checkpoint: Checkpoint) -> None:
+        """Take the tuned model from a checkpoint, if it has another one."""
+        self._take_tuned(checkpoint.arrays, checkpoint.attributes)
 
     def _take_tuned(self, arrays: Arrays, attributes: Any) -> None:
         if "tuned" in attributes:

@@ -1,4 +1,4 @@
-"""The result of a fine-tune: f* as arrays, and the report that says whether it is used."""
+"""The result of a fine-tune: the tuned model as arrays, and the report that says whether it is used."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TuneMode = Literal["head", "adapters", "network"]
 class TuneReport:
     """The report of a fine-tune.
 
-    kept: whether `predict(tuned=True)` answers with f*; f answers where it did worse on exemplars held out.
+    kept: whether `predict(tuned=True)` answers with it; f answers where it did worse on exemplars held out.
     reason: why. mode: what was trained. exemplars: trained on. epochs: chosen on exemplars held out.
     held_out: "f" and "f*" → {"loss": mean log loss, "wrong": share of wrong answers} on them; empty without any.
-    seconds: that it took. digest: hex of the SHA-256 of f*'s weights.
+    seconds: that it took. digest: hex of the SHA-256 of the tuned model's weights.
     """
 
     kept: bool
@@ -38,7 +38,7 @@ class TuneReport:
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """f*: a linear head over mean features of each scale, and the network's tensors that were trained.
+    """The tuned model: a linear head over mean features of each scale, and the network's tensors that were trained.
 
     names: the materials it tells apart, C of them. heads: width of windows → float64 (d, C), of features as shares of
     the embedding's bound. bias: (C,). network: tensor name → float32, to be put over the embedding's own; empty
@@ -73,7 +73,7 @@ class Tuned:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> Tuned:
-        """The f* that `to_arrays` gave."""
+        """The tuned model that `to_arrays` gave."""
 
         def named(prefix: str) -> dict[str, npt.NDArray[Any]]:
             return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

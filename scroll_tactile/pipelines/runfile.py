@@ -11,7 +11,13 @@ from typing import Any
 
 from scroll_tactile.errors import InputError
 from store import LockedError
-from store.lock import flock
+
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    flock = None
+else:
+    flock = fcntl.flock
 
 __all__ = ["RunFile", "alone_in"]
 
@@ -123,8 +129,6 @@ def _locked(folder: Path, destination: Path) -> int | None:
             descriptor = os.open(folder, os.O_RDONLY)
         if descriptor is None or flock is None:
             break
-        import fcntl
-
         try:
             flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

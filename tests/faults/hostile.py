@@ -207,7 +207,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
     if options.quick:
         options.seconds = max(options.seconds, 60)  # with the tests, which may run on any machine
     if options.without == "gate":
-        for name in ("head", "record", "generation"):
+        for name in ("head", "record", "checkpoint"):
             setattr(Gate, name, lambda self, read: read)
     if options.recordings:
         recorded.warm()

@@ -18,7 +18,7 @@ from scroll_tactile.memory import ledger, merge, packing
 from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.memory.state import Memory
 from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, log_writer, repair, rows
-from store.files import sync_file
+from store.files import sync_file, sync_folder, sync_tree
 from store.layout import Current
 
 
@@ -63,6 +63,30 @@ def nothing(_: Any) -> Any:
     return lambda *given, **named: None
 
 
+def unsynced(_: Any) -> Any:
+    """As `replacing`, without a sync of the draft."""
+
+    @contextmanager
+    def replacing(path: Path, draft: Path) -> Iterator[None]:
+        yield
+        draft.replace(path)
+        sync_folder(path.parent)
+
+    return replacing
+
+
+def unsynced_name(_: Any) -> Any:
+    """As `replacing`, without a sync of the folder."""
+
+    @contextmanager
+    def replacing(path: Path, draft: Path) -> Iterator[None]:
+        yield
+        (sync_tree if draft.is_dir() else sync_file)(draft)
+        draft.replace(path)
+
+    return replacing
+
+
 # What is left out of the order of writes.
 
 
@@ -75,13 +99,13 @@ def _no_sync_of_the_log(patch: Patches) -> None:
 
 def _no_sync_of_a_new_log(patch: Patches) -> None:
     def make(create: Any) -> Any:
-        def created(*given: Any, **named: Any) -> None:
-            before = log_writer.sync_open, log_writer.sync_file
-            log_writer.sync_open = log_writer.sync_file = nothing(None)
+        def created(*given: Any, **named: Any) -> Any:
+            before = log_writer.sync_open, log_writer.replacing
+            log_writer.sync_open, log_writer.replacing = nothing(None), unsynced(None)
             try:
-                create(*given, **named)
+                return create(*given, **named)
             finally:
-                log_writer.sync_open, log_writer.sync_file = before
+                log_writer.sync_open, log_writer.replacing = before
 
         return created
 
@@ -89,23 +113,24 @@ def _no_sync_of_a_new_log(patch: Patches) -> None:
 
 
 def _no_sync_of_current(patch: Patches) -> None:
-    patch(layout, "sync_open", nothing)
+    patch(layout, "replacing", unsynced)
 
 
 def _no_sync_of_a_checkpoint(patch: Patches) -> None:
-    patch(checkpoint_files, "sync_tree", nothing)
+    patch(checkpoint_files, "replacing", unsynced)
 
 
 def _no_sync_of_a_folder(patch: Patches) -> None:
-    patch(layout, "sync_folder", nothing)
+    patch(layout, "replacing", unsynced_name)
 
 
 def _no_sync_of_checkpoints(patch: Patches) -> None:
     patch(checkpoint_files, "sync_folder", nothing)
+    patch(checkpoint_files, "replacing", unsynced_name)
 
 
 def _no_sync_of_a_backup(patch: Patches) -> None:
-    patch(backup, "sync_tree", nothing)
+    patch(backup, "replacing", unsynced)
 
 
 def _no_sync_at_opening(patch: Patches) -> None:
@@ -128,7 +153,7 @@ def _rename_before_sync(patch: Patches) -> None:
             draft = folder / "CURRENT.new"
             draft.write_bytes(current.to_bytes())
             draft.replace(folder / "CURRENT")
-            layout.sync_folder(folder)
+            sync_folder(folder)
             sync_file(folder / "CURRENT")
 
         return write
@@ -139,20 +164,26 @@ def _rename_before_sync(patch: Patches) -> None:
 def _current_before_checkpoint(patch: Patches) -> None:
     late: list[Path] = []
 
-    def make_sync(sync: Any) -> Any:
-        patch.everywhere(layout, "write_current", partial(make_write, sync))
-        return lambda path: late.append(path.with_name(path.name.removesuffix(".partial")))
+    def make_replacing(_: Any) -> Any:
+        @contextmanager
+        def replacing(path: Path, draft: Path) -> Iterator[None]:
+            with unsynced(None)(path, draft):
+                yield
+            late.append(path)
 
-    def make_write(sync: Any, write: Any) -> Any:
+        return replacing
+
+    def make_write(write: Any) -> Any:
         def written(folder: Path, current: Current) -> None:
             write(folder, current)
             while late:
                 if (path := late.pop()).exists():
-                    sync(path)
+                    sync_tree(path)
 
         return written
 
-    patch(checkpoint_files, "sync_tree", make_sync)
+    patch(checkpoint_files, "replacing", make_replacing)
+    patch.everywhere(layout, "write_current", make_write)
 
 
 def _removed_too_early(patch: Patches) -> None:
@@ -371,7 +402,7 @@ def _one_row_too_many(patch: Patches) -> None:
 
 
 def _numbers_given_out_again(patch: Patches) -> None:
-    patch(journal._OpenLog, "last", lambda _: lambda self: self.last_row)
+    patch(journal.OpenLog, "last", lambda _: lambda self: self.last_row)
 
 
 def _compaction_drops_a_row(patch: Patches) -> None:
@@ -430,11 +461,11 @@ def _all(heads: Any) -> Any:
 
 
 def _retraction_lost_in_a_merge(patch: Patches) -> None:
-    patch(merge, "standing", lambda _: _all)
+    patch(merge, "active_rows", lambda _: _all)
 
 
 def _retraction_lost_in_packing(patch: Patches) -> None:
-    patch(packing, "standing", lambda _: _all)
+    patch(packing, "active_rows", lambda _: _all)
 
 
 def _shared_twice(patch: Patches) -> None:

@@ -48,7 +48,7 @@ def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
         if int(folder.name) != base:
             spoil(path, int(folder.name))
     with TactileLearner.open(path, **SETTINGS) as again:
-        assert again.memory.generation == base
+        assert again.memory.checkpoint == base
         require_same(again, OBSERVED, {name: one for name, one in SAID.items() if name != "a"})
 
 

@@ -403,7 +403,7 @@ def test_arrays_of_a_generation_must_be_those_of_touches(path, field, place):
     changed = SUMS[field][place](arrays.pop(field))
     put_checkpoint(path, attributes, arrays | ({} if changed is None else {field: changed}))
     require_refused(
-        path, "generation 2 .*: (observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded)"
+        path, "checkpoint 2 .*: (observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded)"
     )
 
 
@@ -427,7 +427,7 @@ ABOUT = {
 def test_attributes_of_a_generation_must_be_those_of_touches(path, field, place):
     attributes, arrays = checkpoint_of(path)
     put_checkpoint(path, attributes | {field: ABOUT[field][place]}, arrays)
-    require_refused(path, f"generation 2 .*({field}|tuned|exemplar)")
+    require_refused(path, f"checkpoint 2 .*({field}|tuned|exemplar)")
 
 
 def hollow(attributes, arrays):

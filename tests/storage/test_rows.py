@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-import store.journal
+import store.open_log
 import store.rows
 from store import Store
 from store.records import payload_digest
@@ -17,7 +17,7 @@ from store.rows import HEADER
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(store.rows, "EVERY", 8)
-    monkeypatch.setattr(store.journal, "EVERY", 8)
+    monkeypatch.setattr(store.open_log, "EVERY", 8)
 
 
 def made(path, rows=100, seed=0):
@@ -77,6 +77,18 @@ def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, column):
     file.write_bytes(bytes(data) + payload_digest(bytes(data)))
     with Store.open(tmp_path / "s", mode="read") as kept:
         assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
+
+
+@pytest.mark.parametrize("field", [5, 6, 7])
+def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, field):
+    keys = made(tmp_path / "s")
+    file = files(tmp_path / "s")[-1]
+    data = file.read_bytes()[:-16]
+    head = list(HEADER.unpack_from(data))
+    head[field] = bytes(16) if field == 7 else head[field] - 1
+    data = HEADER.pack(*head) + data[HEADER.size :]
+    file.write_bytes(data + payload_digest(data))
+    require_all(tmp_path / "s", keys)
 
 
 def test_files_of_another_log_are_not_believed(tmp_path):

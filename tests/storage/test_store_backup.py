@@ -144,8 +144,8 @@ def test_a_log_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, m
                     real(source, draft, current)
                 commit(writer.compact, 20)
                 if len(times) == 2:
-                    return
-            real(source, draft, current)
+                    return None
+            return real(source, draft, current)
 
         monkeypatch.setattr(store.backup, "_copy_named", and_then)
         writer.backup(tmp_path / "copy")
@@ -213,15 +213,16 @@ def test_a_full_or_forbidden_disk_leaves_nothing(tmp_path, small_disk):
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
 def test_all_of_it_is_durable_before_it_appears(plain, tmp_path, monkeypatch):
-    events, fsync, rename = [], os.fsync, os.rename
+    events, fsync, replace = [], os.fsync, os.replace
     monkeypatch.setattr(
         os, "fsync", lambda file: (events.append(str(Path(f"/proc/self/fd/{file}").readlink())), fsync(file))
     )
-    monkeypatch.setattr(os, "rename", lambda old, new: (events.append(("rename", str(old))), rename(old, new)))
+    monkeypatch.setattr(os, "replace", lambda old, new: (events.append(("replace", str(old))), replace(old, new)))
     with Store.open(plain, mode="read") as opened:
         opened.backup(tmp_path / "copy")
-    (i,) = (i for i in range(len(events)) if events[i][0] == "rename")
-    draft, copy = events[i][1], tmp_path / "copy"
+    i = len(events) - 2
+    (kind, draft), copy = events[i], tmp_path / "copy"
+    assert kind == "replace"
     written = {str(path).replace(str(copy), draft) for path in (copy, *copy.rglob("*"))}
     assert set(events[:i]) >= written
     assert events[i + 1 :] == [str(tmp_path)]

@@ -10,7 +10,7 @@ import pytest
 from store_builds import as_after_a_crash, base, damage, flip_row, folders, log_of, newest, rows
 
 import store.checkpoints
-import store.layout
+import store.files
 from store import CompactedError, DamageError, RecordError, Store, StoreError, check_store
 from store.row_encoding import decode_row
 
@@ -346,7 +346,14 @@ def test_what_another_log_needs_is_durable_before_the_first_is_removed(opened, m
 def test_opening_makes_durable_what_it_found_before_it_removes_anything(opened, monkeypatch):
     """Its writer may have died after the rename and before the sync."""
     with monkeypatch.context() as broken, pytest.raises(KilledError):
-        failing(broken, "sync_folder", 1, KilledError(), after=False, owner=store.layout)
+        synced = []
+
+        def dies(path):
+            synced.extend([path] if path == opened.path else [])
+            if len(synced) == 2:  # after the new log, for `CURRENT`
+                raise KilledError
+
+        broken.setattr(store.files, "sync_folder", dies)
         compact(opened, 5)
     crashed = as_after_a_crash(opened, opened.path.with_name("c"))
     events = []

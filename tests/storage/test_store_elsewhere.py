@@ -35,7 +35,6 @@ from store import (
     repair_store,
 )
 from store.files import read_regular, same_folder
-from store.lock import is_held
 
 LOG = "log-00000001"
 
@@ -338,7 +337,6 @@ def test_where_there_are_no_locks_that_is_said_and_no_other_kind_is_taken(tmp_pa
 
     monkeypatch.setattr(fcntl, "flock", missing)
     monkeypatch.setattr("filelock._unix.fcntl.flock", missing)
-    monkeypatch.setattr("store.lock.flock", missing)
     for path in (tmp_path / "s", tmp_path / "new"):
         with pytest.raises(StoreError, match="has no locks") as caught:
             Store.open(path, identity={})
@@ -346,28 +344,6 @@ def test_where_there_are_no_locks_that_is_said_and_no_other_kind_is_taken(tmp_pa
         assert str(path) in str(caught.value)
     assert read_all(tmp_path / "s") == []
     assert contents(tmp_path / "s") == before
-
-
-def test_whether_a_writer_is_there_can_be_asked_without_keeping_one_out(tmp_path):
-    path = build(tmp_path / "s")
-    assert not is_held(path)
-    with Store.open(path):
-        assert is_held(path)
-    assert not is_held(path)
-    stop = threading.Event()
-
-    def ask():
-        while not stop.is_set():
-            is_held(path)
-
-    thread = threading.Thread(target=ask)
-    thread.start()
-    try:
-        for _ in range(50):
-            Store.open(path).close()
-    finally:
-        stop.set()
-        thread.join()
 
 
 def test_a_note_of_a_holder_is_shown_without_what_a_terminal_would_obey(tmp_path):

@@ -1,4 +1,4 @@
-"""What a generation, or the base that a merge brought, must be: sums that touches can have, and samples of them."""
+"""What a checkpoint, or the base that a merge brought, must be: sums that touches can have, and samples of them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, one_thread, within_scatter
 
-__all__ = ["GenerationChecks"]
+__all__ = ["CheckpointChecks"]
 
 MOST_STAGES = 2**10  # and scales that judge at one
 MODES = ("head", "adapters", "network")
@@ -34,8 +34,8 @@ JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as
 IntArray = npt.NDArray[np.int64]
 
 
-class GenerationChecks:
-    """The checks of generations of one sensor, dimension and plan of windows; each raises Unexpected.
+class CheckpointChecks:
+    """The checks of checkpoints of one sensor, dimension and plan of windows; each raises Unexpected.
 
     keeps: whether touches are kept for recall.
     """
@@ -44,7 +44,7 @@ class GenerationChecks:
         self._sensor, self._dimension, self._plan, self._keeps = sensor, dimension, plan, keeps
 
     def check(self, arrays: Arrays, attributes: Mapping[str, Any], upto: int | None, *, thorough: bool) -> None:
-        """Check all that a memory takes from a generation.
+        """Check all that a memory takes from a checkpoint.
 
         upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some.
         """
@@ -75,7 +75,7 @@ class GenerationChecks:
             expect(len(np.unique(sequences)) == len(sequences), field, "different rows", sequences)
         if upto is not None or "descriptions" in attributes:  # to a merge they are rows of their own
             _check_descriptions(attributes.get("descriptions"))
-        if upto is not None or "tuned" in attributes:  # a merge leaves f* where it is
+        if upto is not None or "tuned" in attributes:  # a merge leaves the tuned model where it is
             whole("tuned_upto", attributes.get("tuned_upto"), 0, upto or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
@@ -175,7 +175,7 @@ class GenerationChecks:
             expect(same, "exemplar-keys", "the content hashes of their readings", "others")
 
     def _check_tuned(self, arrays: Arrays, about: Any) -> None:
-        """An f*: whether a network takes its tensors is known when one is made."""
+        """A tuned model: whether a network takes its tensors is known when one is made."""
         expect(isinstance(about, dict), "tuned", "names, mode, kept and report", about)
         names = _names("tuned.names", about.get("names"))
         expect(bool(names) and len(set(names)) == len(names), "tuned.names", "different names", names)

@@ -37,7 +37,8 @@ from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.answer import Touch, answer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.model import Draft, Model, enough_memory
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor

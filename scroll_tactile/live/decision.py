@@ -87,9 +87,7 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     pairs, known = in_pairs(said, usual, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
     strange = max(BEYOND * float(np.nanmax(said.novelty)), UNMEASURED)
-    return DecisionRule(
-        (*(moment.columns for moment in moments), least), risk, sure, max(sure, together), strange
-    )
+    return DecisionRule((*(moment.columns for moment in moments), least), risk, sure, max(sure, together), strange)
 
 
 def _least_sure_of(said: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:
@@ -98,7 +96,9 @@ def _least_sure_of(said: Trajectories, known: npt.NDArray[np.bool_], risk: float
     return least_sure(np.where(known, chances.max(axis=2), np.nan), right, risk)
 
 
-def in_pairs(said: Trajectories, usual: FloatArray, dependence: Dependence) -> tuple[Trajectories, npt.NDArray[np.bool_]]:
+def in_pairs(
+    said: Trajectories, usual: FloatArray, dependence: Dependence
+) -> tuple[Trajectories, npt.NDArray[np.bool_]]:
     """What is said of touches left out behind another of their material, at each moment, and whether it is known.
 
     usual: the most novelty of a known touch at each moment. What comes first counts as at its last moment.

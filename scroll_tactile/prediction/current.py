@@ -21,7 +21,8 @@ from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import Draft, Model
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel", "FrozenModel"]

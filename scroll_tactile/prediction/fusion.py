@@ -50,10 +50,10 @@ class Moment:
     """How a touch is judged from so many columns on.
 
     columns: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
-    calibration: how their scores are read. model, match: g, and r that gives β (see `steepness`). alone: r where noise, or how unlike all
-    others the touch is, leaves the readouts nothing to say. odd: ε. odd_model: ε of the readouts' own probabilities.
-    familiar: the distance beside a usual one that 19 of 20 stay below. surprise, spread: of the kept touches, of known
-    touches. novelties: of these, ascending.
+    calibration: how their scores are read. model, match: g, and r that gives β (see `steepness`). alone: r where noise,
+    or how unlike all others the touch is, leaves the readouts nothing to say. odd: ε. odd_model: ε of the readouts' own
+    probabilities. familiar: the distance beside a usual one that 19 of 20 stay below. surprise, spread: of the kept
+    touches, of known touches. novelties: of these, ascending.
     """
 
     columns: int
@@ -113,8 +113,8 @@ class Trajectories:
 class Fusion:
     """The table of all moments, ascending, the last "complete"; recall: the kept touches, None where there are none.
 
-    paced: how complete touches are judged that were made at other paces, ascending by columns. trajectories: of the touches that it was fitted to, at all
-    moments before the last.
+    paced: how complete touches are judged that were made at other paces, ascending by columns. trajectories: of the
+    touches that it was fitted to, at all moments before the last.
     """
 
     moments: tuple[Moment, ...]
@@ -201,7 +201,9 @@ def fuse(
     others = [_at(recall, one, names, even) for one in paced]
     moments = _rows(recall, judged, said, judged[-1])
     of_paced = _rows(recall, paced, others, None)
-    return Fusion(tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names)))
+    return Fusion(
+        tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names))
+    )
 
 
 def _rows(
@@ -286,7 +288,18 @@ def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall |
     spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
     of_model = float(weights[0])
     moment = Moment(
-        columns, stage, calibration, of_model, match, lone, 0.0, alone, familiar, surprise, spread, calibration.novelties
+        columns,
+        stage,
+        calibration,
+        of_model,
+        match,
+        lone,
+        0.0,
+        alone,
+        familiar,
+        surprise,
+        spread,
+        calibration.novelties,
     )
     own = _chances(moment, said)[np.arange(len(said.targets)), said.targets]
     return replace(moment, odd=_odd_share(own, said.logs.shape[1], said.counts))

@@ -1,4 +1,4 @@
-"""The model: everything that predictions need of a memory, fitted to it alone, and followed as it changes."""
+"""The model: all that predictions need of a memory, fitted to it alone (see `prediction.fitting`), and followed."""
 
 from __future__ import annotations
 
@@ -11,36 +11,30 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import CapacityError, InputError, ScrollTactileError
+from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory, give_back_scratch
-from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
-from scroll_tactile.prediction.fusion import Fusion, Judged, Moment, chosen_of, fuse, moments_of
-from scroll_tactile.readouts.calibration import Calibration, calibrate_stage
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.prediction.fusion import Fusion, Moment
+from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.conformal import Conformal
-from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.deviation import recall_of
-from scroll_tactile.readouts.held_out import HeldOut, held_out
-from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
-from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName, Task
+from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.likelihood import MISSING, LevelArray
-from scroll_tactile.readouts.recollection import Kept, Recollection
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
-__all__ = ["Draft", "Hypothesis", "Judgement", "Model", "enough_memory"]
+__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["beginning", "complete", "paced"]
 """What a touch may be: the beginning of a usual one, a complete one, or a complete one at another pace."""
 
-
 # Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
 # less than that part of it. At 40 up to a thousand were solved for, and a touch took three to ten times as long.
 NEGLIGIBLE = 18.0
+
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
@@ -77,184 +71,7 @@ class Judgement:
     distance: float = 0.0
 
 
-@dataclass(frozen=True)
-class Draft:
-    """All that a model is fitted to, taken of a memory at one moment, so that fitting waits for nobody.
-
-    Raises InputError, from `of`, for the ridge of more materials than it can weigh.
-    """
-
-    kind: ReadoutName
-    memory: Memory
-    names: list[str]
-    stages: list[list[Scale]]
-    views: list[Scale]
-    tasks: dict[Scale, Task]
-    sample: list[tuple[str, bytes, SampledTouch]]
-    kept: list[Kept]
-    longest: int
-    least: int
-    touches: int
-
-    @classmethod
-    def of(cls, memory: Memory, kind: ReadoutName) -> Draft:
-        """The draft of a memory as it is now."""
-        statistics, sample = memory.statistics, list(memory.sample)
-        names = list(statistics.materials)
-        if kind == "ridge" and len(names) > EAGER:
-            raise InputError(
-                f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"'
-            )
-        # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
-        reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
-        judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
-        tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
-        stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
-        views = [view for view in memory.plan.views if view in tasks]
-        kept = memory.kept.touches() if memory.kept is not None and views else []
-        lengths = statistics.longest, statistics.usual_least
-        return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
-
-    def fit(self, extractor: FeatureExtractor) -> Model:
-        """Solve the readouts and calibrate them, once: the tasks are let go. extractor: reads kept touches' beginnings."""
-        with one_thread():
-            # One after the other, each task let go: of all at once the memory would be twice a model's.
-            readouts = {scale: Readout(self.tasks.pop(scale), self.memory.statistics) for scale in sorted(self.tasks)}
-            asked = [[*stage, *self.views] for stage in self.stages]
-            apart = {scale: left_out(readouts[scale], self.sample, asked, self.kind) for scale in readouts}
-            reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [
-                self._calibrated(stage, scales, readouts, apart) for stage, scales in enumerate(reached)
-            ]
-            whole, fusion = self._fused(readouts, calibrations, apart, extractor) if reached else (None, None)
-        give_back_scratch()
-        return Model(self, readouts, calibrations, apart, whole, fusion)
-
-    def _calibrated(
-        self, stage: int, scales: Sequence[Scale], readouts: Mapping[Scale, Readout], apart: Mapping[Scale, LeftOut]
-    ) -> Calibration:
-        """How scores are read at a stage; of a beginning, stage is any number that `apart` has it by."""
-        materials = [material for material, *_ in self.sample]
-        own = [(readouts[scale], apart[scale]) for scale in scales]
-        return calibrate_stage(stage, materials, own, self.kind, viewed=bool(self.views))
-
-    def _fused(
-        self,
-        readouts: Mapping[Scale, Readout],
-        calibrations: Sequence[Calibration],
-        apart: Mapping[Scale, LeftOut],
-        extractor: FeatureExtractor,
-    ) -> tuple[HeldOut, Fusion]:
-        """How far readouts and kept touches are believed, by the sampled touches that were held out."""
-        last, milestones = len(calibrations) - 1, self.memory.plan.milestones()
-        recall = recall_of(self.kept) if self.kept else None
-        both = [*self.stages[last], *self.views]
-        complete = self._calibrated(last, both, readouts, apart)
-        whole = held_out(last, both, self.sample, apart, complete)
-        least = max(1, min(self.least, self.longest))
-        columns = moments_of(milestones[: last + 1], least, 1, matched=recall is not None)
-        chosen, counts = chosen_of(whole, recall)
-        stages = [max(0, sum(length <= at for length in milestones[: last + 1]) - 1) for at in columns]
-        rows = {} if recall is None else recall.rows()
-        seen = self._beginnings(readouts, recall, chosen, columns, stages, extractor) if recall is not None else apart
-        # What came over a touch is looked for once, in all of it: that is most of what a comparison costs.
-        matches = {}
-        if recall is not None:
-            matches = {key: recall.recollect(recall.levels(rows[key]), left_out=rows[key]) for key in sorted({*chosen, *counts})}
-        judged = []
-        for i, (at, stage) in enumerate(zip(columns, stages, strict=True)):
-            scales, number = self.stages[stage], stage if recall is None else i
-            calibration = self._calibrated(number, scales, readouts, seen)
-            said, begun = held_out(number, scales, self.sample, seen, calibration), dict[bytes, Recollection]()
-            for key in chosen if recall is not None else ():
-                if (levels := recall.levels(rows[key])).shape[1] >= at:
-                    begun[key] = recall.recollect(levels[:, :at], left_out=rows[key], noise=matches[key].noise)
-            judged.append(Judged(at, stage, calibration, said, begun))
-        judged.append(Judged(least, last, complete, whole, matches))
-        if recall is None or not chosen:
-            return whole, fuse(recall, judged, judged[-1:], chosen, counts)
-        paced = [
-            self._paced(pace, readouts, recall, {key: matches[key] for key in chosen[i :: len(PACES)]}, last, extractor)
-            for i, pace in enumerate(PACES)
-        ]
-        return whole, fuse(recall, judged, paced, chosen, counts)
-
-    def _paced(
-        self,
-        pace: float,
-        readouts: Mapping[Scale, Readout],
-        recall: Recall,
-        chosen: Mapping[bytes, Recollection],
-        last: int,
-        extractor: FeatureExtractor,
-    ) -> Judged:
-        """What is said of some kept touches, each held out, had they been made at another pace."""
-        places, rows = {key: place for place, (_, key, _) in enumerate(self.sample)}, recall.rows()
-        asked: dict[Scale, dict[int, dict[int, FloatArray]]] = {scale: {} for scale in self.views}
-        matches = {}
-        for key, match in chosen.items():
-            levels = at_pace(recall.levels(rows[key]), pace)
-            matches[key] = recall.recollect(levels, left_out=rows[key], whole=True, noise=match.noise)
-            image = extractor.image(stream_of(levels, extractor.sensor))
-            for scale, mean in extractor.means(image, self.views).items():
-                asked[scale][places[key]] = {0: mean}
-        own = [[*stage, *self.views] for stage in self.stages]
-        said = {scale: left_out(readouts[scale], self.sample, own, self.kind, asked[scale]) for scale in self.views}
-        calibration = self._calibrated(0, self.views, readouts, said)
-        lengths = [recall.levels(rows[key]).shape[1] / pace for key in chosen]
-        columns = max(1, round(float(np.median(lengths)))) if lengths else 1
-        return Judged(columns, last, calibration, held_out(0, self.views, self.sample, said, calibration), matches)
-
-    def _beginnings(
-        self,
-        readouts: Mapping[Scale, Readout],
-        recall: Recall,
-        chosen: Sequence[bytes],
-        columns: Sequence[int],
-        stages: Sequence[int],
-        extractor: FeatureExtractor,
-    ) -> dict[Scale, LeftOut]:
-        """What the windows say of the beginnings of some kept touches, each held out; by the moment's number."""
-        places, rows = {key: place for place, (_, key, _) in enumerate(self.sample)}, recall.rows()
-        asked: dict[Scale, dict[int, dict[int, FloatArray]]] = {scale: {} for scale in readouts}
-        for key in chosen:
-            levels, cache = recall.levels(rows[key]), WindowCache()
-            touch = stream_of(levels, extractor.sensor)
-            for i, (at, stage) in enumerate(zip(columns, stages, strict=True)):
-                if at > levels.shape[1]:
-                    break
-                image = extractor.image(touch.first(at / touch.sensor.rate))
-                for scale, mean in extractor.means(image, self.stages[stage], cache=cache).items():
-                    asked[scale].setdefault(places[key], {})[i] = mean
-        own = [[*stage, *self.views] for stage in self.stages]
-        return {
-            scale: left_out(readout, self.sample, own, self.kind, asked[scale])
-            for scale, readout in readouts.items()
-            if scale not in self.views
-        }
-
-
-PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
-
-
-def at_pace(levels: LevelArray, pace: float) -> LevelArray:
-    """A touch as if it had been made so many times as fast, by linear interpolation: (C, T) to (C, T / pace)."""
-    columns = max(2, round(levels.shape[1] / pace))
-    places = np.linspace(0, levels.shape[1] - 1, columns)
-    first = places.astype(np.intp)
-    after, part = np.minimum(first + 1, levels.shape[1] - 1), places - first
-    low, high = levels[:, first], levels[:, after]
-    blended = np.rint(low * (1 - part) + high * part).astype(np.uint8)
-    return np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), blended)
-
-
-def scales_of(hypothesis: Hypothesis, windows: Sequence[Scale], views: Sequence[Scale]) -> list[Scale]:
-    """The scales that judge: of the beginning of a touch windows, of one at another pace the views, of others both."""
-    if hypothesis == "beginning" or not views:
-        return list(windows)
-    return list(views) if hypothesis == "paced" else [*windows, *views]
-
-
+@dataclass(eq=False)
 class Model:
     """Everything that predictions need of one state of a memory.
 
@@ -269,28 +86,25 @@ class Model:
     where nobody asks: otherwise a copy does.
     """
 
-    def __init__(
-        self,
-        draft: Draft,
-        readouts: dict[Scale, Readout],
-        calibrations: list[Calibration],
-        apart: dict[Scale, LeftOut],
-        whole: HeldOut | None,
-        fusion: Fusion | None,
-    ) -> None:
-        self.kind: ReadoutName = draft.kind
-        self.plan: WindowPlan = draft.memory.plan
-        self.names, self.longest, self.fitted_to = draft.names, draft.longest, draft.touches
+    kind: ReadoutName
+    plan: WindowPlan
+    names: list[str]
+    stages: list[list[Scale]]
+    views: list[Scale]
+    readouts: dict[Scale, Readout]
+    calibrations: list[Calibration]
+    apart: dict[Scale, LeftOut]
+    sample: list[tuple[str, bytes, SampledTouch]]
+    fusion: Fusion | None
+    dependence: Dependence
+    conformal: Conformal | None
+    least: int
+    longest: int
+    fitted_to: int
+
+    def __post_init__(self) -> None:
         self.known = frozenset(self.names)
-        self.readouts, self.apart = readouts, apart
         self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
-        self.calibrations = calibrations
-        self.stages, self.views = draft.stages, draft.views
-        self.fusion, self.held_out = fusion, whole
-        self.dependence = Dependence() if whole is None else dependence_of(whole)
-        self.conformal = Conformal(draft.kept) if fusion is not None and fusion.recall is not None else None
-        self.least = draft.least
-        self.sample = draft.sample
 
     @property
     def recall(self) -> Recall | None:
@@ -361,9 +175,13 @@ class Model:
         return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)
 
     def scales(self, hypothesis: Hypothesis, stage: int) -> list[Scale]:
-        """The scales that judge a touch at a stage, ascending."""
-        kind = hypothesis if stage == len(self.calibrations) - 1 else "beginning"
-        return scales_of(kind, self.stages[stage], self.views)
+        """The scales that judge a touch at a stage: of the beginning of one windows, of one at another pace the views.
+
+        Of others both, but before the last stage windows alone.
+        """
+        if hypothesis == "beginning" or not self.views or stage < len(self.calibrations) - 1:
+            return list(self.stages[stage])
+        return list(self.views) if hypothesis == "paced" else [*self.stages[stage], *self.views]
 
     def moment(self, hypothesis: Hypothesis, columns: int) -> Moment:
         """The row of the table by which a touch of so many columns is judged."""
@@ -417,7 +235,9 @@ class Model:
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
         """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
-        groups = [self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]]
+        groups = [
+            self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]
+        ]
         return [
             (stage, members)
             for stage, members in enumerate(groups)
@@ -505,7 +325,9 @@ class Model:
 
     def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch by the windows of a stage alone."""
-        distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in self.stages[stage]]
+        distances = [
+            self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in self.stages[stage]
+        ]
         return float(self.calibrations[stage].novelty(np.array(distances)))
 
 

@@ -19,15 +19,14 @@ et al. 2005). All are functions of the statistics and the sample, so of what was
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled
+from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.signals.windows import Scale
 
 __all__ = [
     "AHEAD",

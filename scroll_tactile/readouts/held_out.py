@@ -68,6 +68,6 @@ def held_out(
         [touches[place][1] for place in places],
         np.array([own[touches[place][0]] for place in places], dtype=np.intp),
         logits,
-        calibration.relative(strange).min(axis=1) if len(places) else np.zeros(0),
-        np.asarray(calibration.novelty(distances)) if len(places) else np.zeros(0),
+        calibration.relative(strange).min(axis=1) if places else np.zeros(0),
+        np.asarray(calibration.novelty(distances)) if places else np.zeros(0),
     )

@@ -19,8 +19,7 @@ from scroll_tactile.errors import (
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.prediction.beginnings import stream_of
-from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
 from scroll_tactile.readouts.recollection import Kept
@@ -124,7 +123,7 @@ class MemoryFacts:
         if self.model is None or not self.unseen:
             return None
         try:
-            return decision_rule(self.model, self.extractor, self.risk)
+            return decision_rule(self.model, self.risk)
         except CANNOT_EMBED as error:
             self.missing.append(f"When answers are decided: {error}")
             return None

@@ -20,7 +20,8 @@ from touches import PAD, SMALL
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import CapacityError, InputError
 from scroll_tactile.prediction import current
-from scroll_tactile.prediction.model import Draft, Model
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.system import System
 
@@ -357,7 +358,7 @@ import os, signal, sys, threading, time
 sys.path[:0] = sys.argv[3:]
 from prediction.test_current import PAD, SMALL, stream
 from scroll_tactile import TactileLearner
-from scroll_tactile.prediction.model import Draft
+from scroll_tactile.prediction.fitting import Draft
 
 fit, begun = Draft.fit, threading.Event()
 def slow(draft):

@@ -12,7 +12,7 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction import beginnings
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import Draft
+from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.readouts.likelihood import Likelihood, Noise
 from scroll_tactile.readouts.system import System
 from scroll_tactile.statistics.sample import TouchSample

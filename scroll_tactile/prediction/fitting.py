@@ -161,9 +161,10 @@ class _Fit:
             return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts)
         kept = _KeptTouches.held_out(self, recall, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
-        paced = (
-            [kept.paced(pace, chosen[i :: len(PACES)], last) for i, pace in enumerate(PACES)] if chosen else [complete]
-        )
+        if not chosen:
+            alone = self.judged((least, last), last, draft.views, apart, {})
+            return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], [alone], chosen, counts)
+        paced = [kept.paced(pace, chosen[i :: len(PACES)], last) for i, pace in enumerate(PACES)]
         return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts)
 
 

@@ -360,6 +360,8 @@ def _trajectories(moments: Sequence[Moment], said: Sequence[_Said], touches: int
     chances = np.full((touches, len(moments), materials), np.nan)
     novelty, targets = np.full((touches, len(moments)), np.nan), np.zeros(touches, np.intp)
     for i, (moment, one) in enumerate(zip(moments, said, strict=True)):
+        if not len(one.reached):
+            continue
         chances[one.reached, i] = tempered(_chances(moment, one), moment.odd)
         novelty[one.reached, i], targets[one.reached] = one.novelty, one.targets
     reached = np.isfinite(novelty).any(axis=1)

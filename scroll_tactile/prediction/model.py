@@ -269,7 +269,7 @@ class Model:
         names: Sequence[str],
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
-        scales, calibration = self.scales(hypothesis, stage), self._read_by(moment, stage)
+        scales, calibration = self.scales(hypothesis, stage), self._read_by(hypothesis, moment, stage)
         places = {scale: self._places(scale, names) for scale in scales}
         chosen, logits = np.arange(len(names)), np.zeros(len(names))
         if len(names) > EAGER:
@@ -306,9 +306,14 @@ class Model:
         )
         return calibration.believed(distances), float(calibration.relative(distances).min())
 
-    def _read_by(self, moment: Moment, stage: int) -> Calibration:
-        """How scores are read at a stage: of the moment's, or of materials that were never felt for so long."""
-        return moment.calibration if stage == moment.stage else self.calibrations[stage]
+    def _read_by(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
+        """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.
+
+        Or of a beginning where touches are so short that no moment comes before they are complete.
+        """
+        assert self.fusion is not None
+        begun = hypothesis == "beginning" and moment is self.fusion.complete
+        return self.calibrations[stage] if begun or stage != moment.stage else moment.calibration
 
     def _novelty(
         self,
@@ -321,7 +326,7 @@ class Model:
         """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
         scales = self.scales(hypothesis, stage)
         distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
-        return float(self._read_by(moment, stage).novelty(np.array(distances)))
+        return float(self._read_by(hypothesis, moment, stage).novelty(np.array(distances)))
 
     def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch by the windows of a stage alone."""

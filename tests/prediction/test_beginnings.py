@@ -62,10 +62,10 @@ def test_what_is_said_of_touches_left_out_is_what_a_memory_without_them_says(mod
     fresh = learned().model()
     early, said = early_answers(fresh, extractor), []
     left = beginnings._left(fresh, fresh.pooled)
-    keys = {key for key, row in fresh.pooled.recall.rows().items() if row in [touch.row for touch in left]}
+    keys = {key for key, row in fresh.recall.rows().items() if row in [touch.row for touch in left]}
     without = learned([(name, touch) for name, touch in TOUCHES if touch.key not in keys])
     without._current.present(without._ledger).beginnings = Measurement(found=Beginnings(early, 0))
-    rows = {row: key for key, row in fresh.pooled.recall.rows().items()}
+    rows = {row: key for key, row in fresh.recall.rows().items()}
     readings = {touch.key: touch for _, touch in TOUCHES}
     for i, one in enumerate(left):
         for k, moment in enumerate(early.moments):

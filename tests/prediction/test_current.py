@@ -75,10 +75,10 @@ def require_followed(learner):
 def slowly(monkeypatch, seconds):
     """Let every fit that a thread makes beside take longer."""
 
-    def fit(draft):
+    def fit(draft, extractor):
         if threading.current_thread() is not threading.main_thread():
             time.sleep(seconds)
-        return FIT(draft)
+        return FIT(draft, extractor)
 
     monkeypatch.setattr(Draft, "fit", fit)
 
@@ -141,7 +141,7 @@ def test_no_prediction_fits_in_the_foreground_while_touches_come_one_by_one(monk
     learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
     fitted = []
-    monkeypatch.setattr(Draft, "fit", lambda draft: fitted.append(threading.current_thread()) or FIT(draft))
+    monkeypatch.setattr(Draft, "fit", lambda *own: fitted.append(threading.current_thread()) or FIT(*own))
     for i in range(12):
         learner.observe("abcd"[i % 4], stream("abcd"[i % 4], 100 + i))
         learner.predict(stream(*PROBES[0]))
@@ -240,11 +240,11 @@ def test_following_that_is_cut_short_counts_no_touch_twice(monkeypatch, touches)
 def test_an_interruption_while_a_prediction_waits_for_the_coming_model_does_no_harm(monkeypatch):
     go, begun = threading.Event(), threading.Event()
 
-    def fit(draft):
+    def fit(draft, extractor):
         if threading.current_thread() is not threading.main_thread():
             begun.set()
             go.wait(30)
-        return FIT(draft)
+        return FIT(draft, extractor)
 
     learner = fed(OBSERVED)
     learner.predict(stream(*PROBES[0]))
@@ -361,11 +361,11 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.prediction.fitting import Draft
 
 fit, begun = Draft.fit, threading.Event()
-def slow(draft):
+def slow(draft, extractor):
     if threading.current_thread() is not threading.main_thread():
         begun.set()
         time.sleep(1.0)
-    return fit(draft)
+    return fit(draft, extractor)
 Draft.fit = slow
 learner = TactileLearner.open(sys.argv[1], sensor=PAD, embedding=SMALL)
 for i in range(8):

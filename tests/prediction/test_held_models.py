@@ -115,7 +115,7 @@ def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypa
         live.begin()
         live.push(touch("a", 9, 30))
         model = live._under_way.frozen.model
-        likelihood = model.pooled.recall.measured.likelihood
+        likelihood = model.recall.measured.likelihood
 
         def copied(noise, memo):
             if not count:
@@ -293,7 +293,7 @@ def _arrays(model):
         found |= {f"{scale} {name}": getattr(readout, name) for name in ("counts", "_means", "_solved", "_sizes")}
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
-    recall, conformal = model.pooled.recall, model.conformal
+    recall, conformal = model.recall, model.conformal
     found |= {f"kept {name}": getattr(recall, name) for name in ("_blocks", "_brought", "_squares", "_labels")}
     found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
     return found

@@ -116,11 +116,15 @@ class Model:
         """Whether it has so many materials that it reads those that are asked for from the memory."""
         return len(self.names) > EAGER
 
-    def copy(self) -> Model:
-        """Another model of the same state, for one of the two to follow; what following never changes, they share."""
+    def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
+        """Another model of the same state, for one of the two to follow; what following never changes, they share.
+
+        readouts: others, in place of copies.
+        """
         other = copy.copy(self)
-        other.readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
-        other._of_all = {}
+        if readouts is None:
+            readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
+        other.readouts, other._of_all = readouts, {}
         if self.fusion is not None and self.fusion.recall is not None and self.conformal is not None:
             other.fusion = replace(self.fusion, recall=self.fusion.recall.copy())
             other.conformal = self.conformal.copy()
@@ -156,19 +160,27 @@ class Model:
         return True
 
     def _recalls(self, memory: Memory, recall: Recall) -> bool:
-        """Take in what is kept in the memory now."""
-        assert self.conformal is not None and memory.kept is not None
+        """Take in what is kept in the memory now; False where that is nothing."""
+        assert self.conformal is not None and self.fusion is not None and memory.kept is not None
         kept, held = {(material, key) for material, key, _ in memory.kept}, recall.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
-        followed = recall.follow(added, held - kept)
-        if followed:
+        if not kept:
+            return False
+        if recall.follow(added, held - kept):
             self.conformal.follow(added, held - kept)
-        return followed
+        else:  # one is longer than all before it: what they say of themselves stays
+            touches = memory.kept.touches()
+            self.fusion = replace(self.fusion, recall=Recall(touches, recall.measured))
+            self.conformal = Conformal(touches)
+        return True
 
-    @property
-    def crowded(self) -> bool:
-        """Whether five eighths of what the readouts can follow has come."""
-        return any(readout.crowded for readout in self.readouts.values())
+    def crowded(self, behind: Sequence[Added]) -> bool:
+        """Whether five eighths of what the readouts can follow has come, with those that are still behind."""
+        for scale, readout in self.readouts.items():
+            columns = sum(len(codes[scale]) for _, codes, _ in behind if scale in codes)
+            if 3 * (readout.system.rank + columns) > 5 * (readout.system.room - columns):
+                return True
+        return False
 
     def is_last(self, columns: int) -> bool:
         """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""

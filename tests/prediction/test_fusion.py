@@ -131,7 +131,7 @@ def test_where_too_few_were_held_out_the_readouts_decide(count):
         assert moment.model == 1.0
         assert beta(moment) < 1e-3
         assert moment.familiarity(1e9, own_time=True) == 1.0
-        assert 0 < moment.odd <= moment.odd_model < 1
+        assert (moment.odd > 0) == (moment.odd_model > 0) == (count > 0)
 
 
 def test_without_kept_touches_the_readouts_have_the_word():
@@ -212,6 +212,6 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
 
 def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():
     calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, 100.0), np.ones(1))
-    row = dict(model=1.0, match=0.5, alone=0.5, odd=0.0, odd_model=0.0, familiar=np.inf, surprise=0.0, spread=1.0)
-    moment = Moment(10, 0, calibration, novelties=calibration.novelties, **row)
+    numbers = 1.0, 0.5, 0.5, 0.0, 0.0, np.inf, 0.0, 1.0
+    moment = Moment(10, 0, calibration, *numbers, calibration.novelties)
     assert [moment.threshold(share) for share in (0.05, 0.5)] == [calibration.threshold(share) for share in (0.05, 0.5)]

@@ -125,9 +125,9 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
         if material not in {other for other, *_ in rest}:
             continue
         dense = Dense(groups_of(rest), readout.penalty, readout.share, reference, total, Fraction(1))
-        for number, row in asked[places[material, key]].items():
+        for number, codes in asked[places[material, key]].items():
             judged.add((places[material, key], number))
-            place, row = found.rows[places[material, key], number], row.astype(np.int64)
+            place, row = found.rows[places[material, key], number], codes.astype(np.int64)
             scores = dense.lda(row, reference, readout.origin)
             if kind == "ridge":
                 shares = [float(dense.shares[name]) for name in reference]

@@ -30,7 +30,7 @@ __all__ = ["CurrentModel", "FrozenModel"]
 
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
-FEW = 6  # touches: of a memory with no more the calibration is worth waiting for
+FEW = 16  # touches: of a memory with no more the calibration is worth waiting for
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 

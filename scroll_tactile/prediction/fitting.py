@@ -184,7 +184,7 @@ class _Fit:
         recall = recall_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
         complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], apart, {})
-        columns = moments_of(milestones, least, 1, matched=recall is not None)
+        columns = moments_of(milestones, least, matched=recall is not None)
         moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
         chosen, counts = chosen_of(complete.held_out, recall)
         if recall is None:

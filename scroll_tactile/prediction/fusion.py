@@ -36,6 +36,7 @@ MOST_HELD_OUT = 96  # touches, each compared with all kept ones at every moment
 SURE = 0.99  # of the readouts' probability: a touch with less is compared with kept ones
 USUAL = 0.95  # of held-out touches are familiar
 PRIOR_TOUCHES = 0.5  # that half of what each is worth by itself counts as
+ALONE_TOUCHES = 5.0  # that what the kept touches are worth by themselves counts as
 SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count as
 LEAST_PRIOR = 1e-3
 ODD = 0.5  # touches more than those held out that are outliers
@@ -127,6 +128,10 @@ class Fusion:
         """How a complete touch is judged."""
         return self.moments[-1]
 
+    def reaches(self, columns: int) -> bool:
+        """Whether a complete touch may be so long by its pace alone: about half to twice as long as usual."""
+        return self.paced[0].columns <= APART * columns and columns <= APART * self.paced[-1].columns
+
     def at_pace(self, columns: int) -> Moment:
         """How a complete touch is judged of which the pace, not the end, makes it so many columns long."""
         return min(self.paced, key=lambda row: abs(math.log(row.columns / columns)))
@@ -136,17 +141,17 @@ class Fusion:
         return self.moments[max(0, bisect_right([moment.columns for moment in self.moments], columns) - 1)]
 
 
-def moments_of(milestones: Sequence[int], least: int, fewest: int, *, matched: bool) -> tuple[int, ...]:
-    """The moments before a touch is complete, in columns: `fewest` or more, and below `least`.
+def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple[int, ...]:
+    """The moments before a touch is complete, in columns: below `least`.
 
     milestones: lengths at which other readouts judge. matched: whether there are kept touches, of which any beginning
     can be seen: then there are two moments before the first milestone, and one between any two.
     """
-    found = {columns for columns in milestones if fewest <= columns < least}
+    found = {columns for columns in milestones if columns < least}
     if matched:
         between = [round(math.sqrt(low * high)) for low, high in pairwise([*sorted(found), least])] if found else []
-        for columns in [milestones[0] // 2, milestones[0] // 4, *between]:
-            if max(2, fewest) <= columns < least and all(max(columns, at) >= APART * min(columns, at) for at in found):
+        for columns in [milestones[0] // 3, 2 * milestones[0] // 3, *between]:
+            if 2 <= columns < least and all(max(columns, at) >= APART * min(columns, at) for at in found):
                 found.add(columns)
     return tuple(sorted(found))
 
@@ -282,7 +287,7 @@ def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall |
     prior = np.array([1.0, _worth(together) / 2])
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
     weights = _weights(said, shared, SHARED_TOUCHES)
-    by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, PRIOR_TOUCHES, said.counts)
+    by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, ALONE_TOUCHES, said.counts)
     match, lone = (match_of(float(value), said.certainty) for value in (weights[1], by_itself[0]))
     surprise = float(np.average(said.surprise, weights=said.counts))
     spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)

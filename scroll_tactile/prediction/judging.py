@@ -50,8 +50,10 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model))
     levels = levels_seen(encoded.stream)
     ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
-    if levels.shape[1] != recall.longest and levels.shape[1] > 1:
-        ways.append((recall.recollect(levels, whole=True), "paced", False))
+    if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
+        whole = recall.recollect(levels, whole=True)
+        if whole.evidence > 0 or ways[0][0].evidence < whole.evidence - 1:  # TRIAL
+            ways.append((whole, "paced", False))
     filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
     answers = []
     for way, hypothesis, own_time in ways:

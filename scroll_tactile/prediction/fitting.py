@@ -111,8 +111,11 @@ class Draft:
         lengths = statistics.longest, statistics.usual_least
         return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
 
-    def fit(self, extractor: FeatureExtractor) -> Model:
-        """Solve the readouts and fit how they are read, once: the tasks are let go. extractor: reads kept touches."""
+    def fit(self, extractor: FeatureExtractor | None) -> Model:
+        """Solve the readouts and fit how they are read, once: the tasks are let go.
+
+        extractor: reads kept touches; without it nothing is fitted to their beginnings, nor to them at other paces.
+        """
         with one_thread():
             # One after the other, each task let go: of all at once the memory would be twice a model's.
             readouts = {scale: Readout(self.tasks.pop(scale), self.memory.statistics) for scale in sorted(self.tasks)}
@@ -147,7 +150,7 @@ class _Fit:
 
     draft: Draft
     readouts: Mapping[Scale, Readout]
-    extractor: FeatureExtractor
+    extractor: FeatureExtractor | None
 
     def left_out(self, scale: Scale, asked: Asked | None = None) -> LeftOut:
         """What a scale says of the sampled touches, each held out; where `asked` is given, of that in their place."""
@@ -190,9 +193,11 @@ class _Fit:
         if recall is None:
             judged = [self.judged(moment, moment[1], draft.stages[moment[1]], apart, {}) for moment in moments]
             return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts)
+        if self.extractor is None:
+            moments = []
         kept = _KeptTouches.held_out(self, recall, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
-        if not chosen:
+        if not chosen or self.extractor is None:
             alone = self.judged((least, last), last, draft.views, apart, {})
             return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], [alone], chosen, counts)
         paced = [kept.paced(pace, chosen[i :: len(PACES)], last) for i, pace in enumerate(PACES)]
@@ -241,28 +246,30 @@ class _KeptTouches:
 
     def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, LeftOut]:
         """What each scale of windows says of their beginnings, by the moment's number."""
-        fit, draft = self.fit, self.fit.draft
+        fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
         asked: Asked = {scale: {} for scale in fit.readouts if scale not in draft.views}
-        for key in self.chosen:
-            touch, cache = stream_of(self.levels[key], fit.extractor.sensor), WindowCache()
+        for key in self.chosen if moments else ():
+            assert extractor is not None
+            touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
             for number, (columns, stage) in enumerate(moments):
                 if columns > len(touch):
                     break
-                image = fit.extractor.image(touch.first(columns / touch.sensor.rate))
-                for scale, mean in fit.extractor.means(image, draft.stages[stage], cache=cache).items():
+                image = extractor.image(touch.first(columns / touch.sensor.rate))
+                for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
                     asked[scale].setdefault(self.places[key], {})[number] = mean
         return {scale: fit.left_out(scale, asked) for scale in asked}
 
     def paced(self, pace: float, keys: Sequence[bytes], last: int) -> Judged:
         """What the views and the kept touches say of some of them, had they been made so many times as fast."""
-        fit, views = self.fit, self.fit.draft.views
+        fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
+        assert extractor is not None
         asked: Asked = {scale: {} for scale in views}
         matches = {}
         for key in keys:
             levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
             matches[key] = self.recall.recollect(levels, left_out=self.rows[key], whole=True, noise=noise)
-            image = fit.extractor.image(stream_of(levels, fit.extractor.sensor))
-            for scale, mean in fit.extractor.means(image, views).items():
+            image = extractor.image(stream_of(levels, extractor.sensor))
+            for scale, mean in extractor.means(image, views).items():
                 asked[scale][self.places[key]] = {0: mean}
         lengths = [self.levels[key].shape[1] / pace for key in keys]
         columns = max(1, round(float(np.median(lengths)))) if lengths else 1

@@ -52,7 +52,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
     if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
         whole = recall.recollect(levels, whole=True)
-        if whole.evidence > 0 or ways[0][0].evidence < whole.evidence - 1:  # TRIAL
+        if whole.evidence > 0:  # at no other pace is it any more like what is kept
             ways.append((whole, "paced", False))
     filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
     answers = []

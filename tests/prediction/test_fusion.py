@@ -63,11 +63,11 @@ def beta(moment, certainty=0.5):
 
 
 def test_moments_are_few_and_hold_the_milestones():
-    assert moments_of((30, 77, 195), 400, 1, matched=False) == (30, 77, 195)
-    assert moments_of((30, 77, 195), 400, 1, matched=True) == (7, 15, 30, 48, 77, 123, 195, 279)
-    assert moments_of((30, 77, 195), 100, 1, matched=False) == (30, 77)
-    assert moments_of((30,), 20, 1, matched=True) == (7, 15)
-    assert moments_of((4,), 2, 1, matched=True) == moments_of((4,), 2, 1, matched=False) == ()
+    assert moments_of((30, 77, 195), 400, matched=False) == (30, 77, 195)
+    assert moments_of((30, 77, 195), 400, matched=True) == (10, 20, 30, 48, 77, 123, 195, 279)
+    assert moments_of((30, 77, 195), 100, matched=False) == (30, 77)
+    assert moments_of((30,), 20, matched=True) == (10,)
+    assert moments_of((4,), 2, matched=True) == moments_of((4,), 2, matched=False) == ()
 
 
 @pytest.mark.parametrize("sharpness", [0.25, 1.0, 4.0])

@@ -37,7 +37,8 @@ from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.prediction.answer import Touch, answer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.model import Draft, Model, enough_memory
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
@@ -118,7 +119,7 @@ class TactileLearner:
         self._unverified: tuple[Identity, Path] | None = None
         self._snapshot_of: str | None = None
         self._range_said = False
-        self._current = CurrentModel(self._settings)
+        self._current = CurrentModel(self._settings, self._extractor)
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self) -> Memory:
@@ -659,7 +660,7 @@ class TactileLearner:
     def model(self) -> Model:
         """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in it."""
         with self._locked() as ledger, enough_memory():
-            model = Draft.of(ledger.memory, self._settings.readout).fit()
+            model = Draft.of(ledger.memory, self._settings.readout).fit(self._extractor)
             model.freeze(ledger.memory.statistics)
             return model
 

@@ -87,12 +87,12 @@ def _fold(recordings: Recordings, fold: int, every: int, progress: Progress) -> 
     learner = _learned(recordings, fold)
     extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
     model = learner.model()
-    rules = [decision_rule(model, extractor, risk) for risk in RISKS]
+    rules = [decision_rule(model, risk) for risk in RISKS]
     tested = np.flatnonzero(recordings.fold == fold)[::every].tolist()
     rate, moments = recordings.sensor.rate, rules[0].moments
 
     def predicted(stream: Stream) -> Prediction:
-        # By the model that the rules are of: the learner's own would measure its beginnings once more, to the same end.
+        # By the model that the rules are of: the learner's own would be fitted once more, to the same end.
         encoded = extractor.encode(stream, model.longest, lambda columns: model.needed(model.names, columns))
         return answer(model, extractor, model.names, [(encoded, None)], learner.settings.false_alarms)
 

@@ -1,7 +1,7 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
 A touch is decided at the first moment at which its prediction is known and as probable as `sure`, or as strange as
-`strange`. Both are set by touches left out, run through all moments (see `prediction.beginnings`): the novelty that
+`strange`. Both are set by touches left out, run through all moments (see `prediction.fusion`): the novelty that
 none of them comes near, and the least probability above which, with every higher one, so few of n are
 decided wrongly that
 
@@ -24,12 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.prediction.beginnings import early_answers
-from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.fusion import Trajectories
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.early import Rehearsal
 from scroll_tactile.results import Prediction
 
 __all__ = ["DecisionRule", "decision_rule"]
@@ -71,34 +69,36 @@ class DecisionRule:
         return prediction.novelty >= self.strange
 
 
-def decision_rule(model: Model, extractor: FeatureExtractor, risk: float) -> DecisionRule:
-    """The rule of a model at a risk: a function of what was observed, measured on touches left out.
+def decision_rule(model: Model, risk: float) -> DecisionRule:
+    """The rule of a model at a risk: a function of what was observed, measured on touches held out.
 
-    Of a memory that keeps no touches, or too few, the probabilities are taken as they are, of whole touches alone.
-    Raises InputError for a risk that is no share between 0 and 1.
+    Of a memory of which too few touches can be held out, the probabilities are taken as they are, of whole touches
+    alone. Raises InputError for a risk that is no share between 0 and 1.
     """
     if not 0 < risk < 1:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
     least = max(1, min(model.least, model.longest))
-    early = early_answers(model, extractor)
-    if early is None:
+    said = None if model.fusion is None else model.fusion.trajectories
+    if model.fusion is None or said is None or len(said.targets) < FEWEST or not said.novelty.size:
         return DecisionRule((least,), risk, 1 - risk, 1 - risk, 2 * UNMEASURED)
-    said, usual = early.fitted, np.array([np.quantile(moment.novelties, KNOWN) for moment in early.moments])
+    moments = model.fusion.moments[:-1]
+    usual = np.array([np.quantile(m.novelties, KNOWN) if len(m.novelties) else np.inf for m in moments])
     sure = _least_sure_of(said, said.novelty <= usual, risk)
     pairs, known = in_pairs(said, usual, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
     strange = max(BEYOND * float(np.nanmax(said.novelty)), UNMEASURED)
-    moments = (*(moment.columns for moment in early.moments), least)
-    return DecisionRule(moments, risk, sure, max(sure, together), strange)
+    return DecisionRule((*(moment.columns for moment in moments), least), risk, sure, max(sure, together), strange)
 
 
-def _least_sure_of(said: Rehearsal, known: npt.NDArray[np.bool_], risk: float) -> float:
+def _least_sure_of(said: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:
     chances = said.chances
     right = chances.argmax(axis=2) == said.targets[:, None]
     return least_sure(np.where(known, chances.max(axis=2), np.nan), right, risk)
 
 
-def in_pairs(said: Rehearsal, usual: FloatArray, dependence: Dependence) -> tuple[Rehearsal, npt.NDArray[np.bool_]]:
+def in_pairs(
+    said: Trajectories, usual: FloatArray, dependence: Dependence
+) -> tuple[Trajectories, npt.NDArray[np.bool_]]:
     """What is said of touches left out behind another of their material, at each moment, and whether it is known.
 
     usual: the most novelty of a known touch at each moment. What comes first counts as at its last moment.
@@ -118,7 +118,7 @@ def in_pairs(said: Rehearsal, usual: FloatArray, dependence: Dependence) -> tupl
             chances[row, moment] = dependence.probability([said.chances[at] for at in both])
             novelty[row, moment] = dependence.standard([said.novelty[at] for at in both])
             known[row, moment] = novelty[row, moment] <= (usual[last] + usual[moment]) / 2
-    return Rehearsal(chances, novelty, said.targets[[second for _, second in pairs]]), known
+    return Trajectories(chances, novelty, said.targets[[second for _, second in pairs]]), known
 
 
 def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -> float:

@@ -303,7 +303,7 @@ class LiveSession:
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
             with self._memory.turn(model):
-                known[self._risk] = decision_rule(model, self._memory.extractor, self._risk)
+                known[self._risk] = decision_rule(model, self._risk)
         return known[self._risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:

@@ -150,7 +150,10 @@ def _pooled(
 
 
 def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int) -> str:
-    """Log probabilities (materials,) in double precision: the readouts' scores, weighed as the stage is calibrated."""
+    """Log probabilities (materials,) in double precision: the readouts' scores, weighed as the stage is calibrated.
+
+    A share of them is left for touches that are unlike all others, as in a prediction.
+    """
     stage, scales = _scales(model, columns)
     logits = ""
     for scale, weight in zip(scales, model.calibrations[stage].weights, strict=True):
@@ -163,7 +166,10 @@ def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int
         scores = graph.add("Add", graph.add("MatMul", about, graph.constant(weights)), graph.constant(offsets))
         weighed = graph.add("Mul", scores, graph.constant(np.float64(weight)))
         logits = graph.add("Add", logits, weighed) if logits else weighed
-    return graph.add("Squeeze", graph.add("LogSoftmax", logits, axis=1), graph.constant(np.array([0])))
+    odd = model.moment("complete" if columns >= model.least else "beginning", columns).odd_model
+    familiar = graph.add("Mul", graph.add("Softmax", logits, axis=1), graph.constant(np.float64(1 - odd)))
+    chances = graph.add("Add", familiar, graph.constant(np.float64(odd / len(model.names))))
+    return graph.add("Squeeze", graph.add("Log", chances), graph.constant(np.array([0])))
 
 
 def _slice(graph: Graph, what: str, first: int, after: int, *, axis: int) -> str:

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.comparing import levels_seen
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.prediction.judging import judged, levels_seen
 from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.prediction.recalling import judged
 from scroll_tactile.results import Prediction
 from scroll_tactile.statistics.moments import one_thread
 
@@ -43,11 +42,11 @@ def answer(
         said = [_judged(model, extractor, candidates, touch, logits) for touch, logits in own]
     if len(said) == 1:
         probability, novelty = said[0].probability, said[0].novelty
-        threshold = said[0].calibration.threshold(false_alarms)
+        threshold = said[0].moment.threshold(false_alarms)
     else:
         probability = model.dependence.probability([judgement.probability for judgement in said])
         novelty = model.dependence.standard([judgement.novelty for judgement in said])
-        threshold = math.fsum(judgement.calibration.threshold(false_alarms) for judgement in said) / len(said)
+        threshold = math.fsum(judgement.moment.threshold(false_alarms) for judgement in said) / len(said)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
     names = [candidates[place] for place in order.tolist()]
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
@@ -66,7 +65,7 @@ def _judged(
 ) -> Judgement:
     if logits is None:
         return judged(model, extractor, candidates, touch)
-    return model.judge(candidates, touch.means, touch.columns, logits)
+    return model.judge(candidates, touch.means, touch.columns, "complete", logits)
 
 
 def _typicality(model: Model, names: Sequence[str], touches: Sequence[Encoded]) -> tuple[float, ...]:

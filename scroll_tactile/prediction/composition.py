@@ -67,7 +67,7 @@ class Composer:
         stage = self._stage(encoded.columns)
         heads = self.stages[stage]
         z = combined(self.model, stage, self.spaces[stage].names, encoded.means)
-        new = float(heads.novel(self.model.novelty(stage, False, encoded.means, self.model.names)))
+        new = float(heads.novel(self.model.novelty(stage, encoded.means, self.model.names)))
         # Bayes: the curve is that of as many new touches as known ones.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected

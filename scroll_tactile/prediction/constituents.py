@@ -176,7 +176,7 @@ def _touches_apart(model: Model, stage: int, names: Sequence[str]) -> list[_Touc
     places = [[left.names.index(name) for name in names] for left in apart]
     touches = []
     for number in judged_touches(stage, apart):
-        material = model.materials[number]
+        material, *_ = model.sample[number]
         if material not in names:
             continue
         rows = [left.rows[number, stage] for left in apart]

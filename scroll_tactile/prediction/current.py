@@ -1,10 +1,10 @@
 """The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
 
-Right after an observation the readouts are those of all that was observed (see `readouts.readout`). What else is
-fitted, the shrinkage and the calibration, follows when the memory has grown by three sixteenths, or three quarters of
-what the readouts can follow has come: a sixteenth before, or an eighth, a thread begins to fit it, to the integers. A
-call waits for that thread only where the readouts can follow no further, and in a memory of few touches, where each of
-them counts. Otherwise touches that come faster than the thread fits have an earlier calibration a little longer.
+Right after an observation the readouts are those of all that was observed (see `readouts.readout`). They can follow so
+many touches; before that many have come a thread solves them again, from the integers. What else is fitted, the
+shrinkage and the table, follows when the memory has grown by three sixteenths: a sixteenth before, another thread
+begins to fit it. No call waits for that one, but in the smallest of memories, where each touch counts: touches that
+come faster than it fits have an earlier calibration a little longer.
 """
 
 from __future__ import annotations
@@ -13,23 +13,24 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from weakref import ReferenceType, ref
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.measurement import Measurement
-from scroll_tactile.prediction.model import Draft, Measures, Model
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.fitting import Draft, Renewal
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.settings import Settings
 
 __all__ = ["CurrentModel", "FrozenModel"]
 
 BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
 LEAST = 2  # touches, in the smallest of memories
-FEW = 64  # touches: of a memory with no more the calibration is worth waiting for
-MEASURED = 1.5  # times as many touches as when beginnings were last measured: until then nobody waits for that
+FEW = 16  # touches: of a memory with no more the calibration is worth waiting for
 MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
 
 
@@ -40,18 +41,31 @@ class FrozenModel:
         self.model = model
 
 
+@dataclass
+class _Job:
+    """A model that a thread makes, and what came since it was begun; None where that was too much to be followed."""
+
+    future: Future[Model]
+    since: list[Added] | None = field(default_factory=list)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is there, and can be followed to the memory as it is."""
+        return self.since is not None and self.future.done() and self.future.exception() is None
+
+
 class CurrentModel:
     """The model of one memory. Whoever calls holds the ledger's lock."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._kind = settings.readout
+    def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
+        self._kind, self._extractor = settings.readout, extractor
         self._version = -1
         self._model: Model | None = None
         self._exact = False  # whether the model was fitted to the memory as it is, and not followed
         self._behind: list[Added] | None = []  # what came since the model; None where it cannot be followed
-        self._coming: Future[Model] | None = None
-        self._since: list[Added] = []  # what came since the coming one was begun
-        self._worker: ThreadPoolExecutor | None = None
+        self._fit: _Job | None = None
+        self._renewal: _Job | None = None
+        self._workers: dict[str, ThreadPoolExecutor] = {}
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
         self._lent: list[ReferenceType[FrozenModel]] = []
@@ -76,7 +90,7 @@ class CurrentModel:
         self.take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
-        before = None if model is None else model.beginnings
+        before = model
         if model is not None and (behind is None or self._due(model, memory)):
             model = None
         if model is not None and behind:
@@ -85,86 +99,103 @@ class CurrentModel:
             model = model.copy() if self._holder(model) is not None else model
             if not model.follow(memory, behind):
                 model = None
-        # The last one is let go first, and its memory given back: each is some tens of MB.
-        present = self._adopted(memory) if model is None else model
-        if before is not None and before is not present.beginnings and _serves(before, present, memory):
-            # Measuring takes seconds, and a call would wait for it.
-            present.beginnings = Measurement(before)
-            self._exact = False
+        present = self._next(memory, before) if model is None else model
         self._model, self._behind = present, []
         self.prepare(ledger)
         return present
 
     def prepare(self, ledger: Ledger) -> None:
-        """Begin to fit the next model where enough has come since the last. Raises nothing: an observation is kept."""
+        """Begin to make the next model where enough has come since the last. Raises nothing: an observation is kept."""
         self.take_in(ledger)
-        model, touches = self._model, ledger.memory.statistics.touches
-        if model is None or self._behind is None or self._coming is not None:
+        model, memory = self._model, ledger.memory
+        if model is None:
             return
-        lag = abs(touches - model.fitted_to)
-        if lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16) or (lag and model.crowded):
-            # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
-            with suppress(MemoryError, InputError, RuntimeError):
-                self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-                self._since = []
-                self._coming = self._worker.submit(_fit, Draft.of(ledger.memory, self._kind), model.beginnings.measures)
+        lag = abs(memory.statistics.touches - model.fitted_to)
+        # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
+        with suppress(MemoryError, InputError, RuntimeError):
+            if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
+                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._extractor))
+            if self._renewal is None and self._behind and model.crowded(self._behind) and _has_all_of(memory, model):
+                self._renewal = _Job(self._worker("renewal").submit(Renewal.of(model, memory).solve))
+
+    def _worker(self, name: str) -> ThreadPoolExecutor:
+        if name not in self._workers:
+            self._workers[name] = ThreadPoolExecutor(1, f"scroll-tactile {name}")
+        return self._workers[name]
 
     def settle(self, ledger: Ledger) -> Model:
         """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
         memory = ledger.memory
         self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
-            self._model, self._coming = None, None
+            self._model, self._fit, self._renewal = None, None, None
             self._model, self._behind = self._fitted(memory), []
         return self._model
 
     def close(self) -> None:
-        """End the thread that fits; a later prediction begins another where it needs one."""
-        worker, self._worker = self._worker, None
-        if worker is not None:
+        """End the threads; a later prediction begins others where it needs them."""
+        workers, self._workers = self._workers, {}
+        for worker in workers.values():
             worker.shutdown()
 
     def take_in(self, ledger: Ledger) -> None:
         """Note what has changed since it was last noted."""
-        if self._process != os.getpid():  # a forked process has not the thread
-            self._process, self._worker, self._coming = os.getpid(), None, None
+        if self._process != os.getpid():  # a forked process has not the threads
+            self._process, self._workers, self._fit, self._renewal = os.getpid(), {}, None, None
         if ledger.version == self._version:
             return
         if self._model is not None and self._holder(self._model) is None:
             self._model.read(ledger.memory.statistics)  # lets a snapshot go, which would keep all that changes
         added = ledger.added if self._model is not None else None
         # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
-        (behind, coming), (self._behind, self._coming) = (self._behind, self._coming), (None, None)
+        behind, jobs = self._behind, (self._fit, self._renewal)
+        self._behind, self._fit, self._renewal = None, None, None
         self._version = ledger.version
         ledger.follow, ledger.added = True, []
         if added is not None:
-            coming = coming if coming is not None and _with(self._since, added) is not None else None
-            self._behind, self._coming = _with(behind, added), coming
+            for job in jobs:
+                if job is not None:
+                    job.since = _with(job.since, added)
+            self._behind, (self._fit, self._renewal) = _with(behind, added), jobs
 
     def _due(self, model: Model, memory: Memory) -> bool:
         """Whether another model takes its place: it is late, and the next is there or worth waiting for."""
         late = abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, ADOPT * model.fitted_to // 16)
         if late and model.fitted_to <= FEW:
             return True
+        if self._fit is not None and self._fit.future.done() and not self._fit.ready:
+            self._fit = None  # it cannot be followed: another is begun
         # Not only where it can follow no further: until then two models would be held most of the time.
         pressed = any(readout.pressed for readout in model.readouts.values())
-        return (late or pressed) and self._coming is not None and self._coming.done()
+        ready = pressed and self._renewal is not None and self._renewal.ready
+        return ready or (late and self._fit is not None and self._fit.ready)
 
-    def _adopted(self, memory: Memory) -> Model:
-        """The coming model, followed to the memory as it is; a new one where there is none, or it cannot follow."""
-        coming = self._coming
-        if coming is not None and coming.exception() is None:  # it waits; interrupted there, the next call does
-            model, since = coming.result(), self._since
-            self._exact, self._coming, self._since = not since, None, []
-            del coming
-            if not self._due(model, memory) and model.follow(memory, since):
-                give_back_scratch()
+    def _next(self, memory: Memory, before: Model | None) -> Model:
+        """The model that takes the place of the one before: as a thread fitted it, or with readouts solved again."""
+        fit, renewal = self._fit, self._renewal
+        if fit is not None and fit.ready:
+            self._fit = None
+            model, since = fit.future.result(), fit.since or []
+            late = abs(memory.statistics.touches - model.fitted_to) >= LEAST and model.fitted_to <= FEW
+            if not late and model.follow(memory, since):
+                self._exact, self._renewal = not since, None
                 return model
-        self._coming = None
-        return self._fitted(memory)
+        if before is None or before.fitted_to <= FEW or not _has_all_of(memory, before):
+            self._fit = self._renewal = None
+            return self._fitted(memory)
+        if renewal is not None and renewal.since is not None:
+            self._renewal = None
+            if renewal.future.exception() is None:  # it waits, for a part of what solving them here takes
+                model = renewal.future.result()
+                if model.follow(memory, renewal.since):
+                    self._exact = False
+                    return model
+        self._exact, self._renewal = False, None
+        model = Renewal.of(before, memory).solve()
+        return model if model.follow(memory, []) else self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit()
+        model = Draft.of(memory, self._kind).fit(self._extractor)
         self._exact = True
         return model
 
@@ -176,20 +207,9 @@ class CurrentModel:
         return self._composer[3]
 
 
-def _fit(draft: Draft, measures: Measures | None) -> Model:
-    """A model; where beginnings are asked for, with how it judges them."""
-    model = draft.fit()
-    if measures is not None:
-        model.early(measures)
-    return model
-
-
-def _serves(before: Measurement[Model], present: Model, memory: Memory) -> bool:
-    """Whether a model judges beginnings as one before it does, which was measured, or is being measured."""
-    if not before.asked_for or present.beginnings.asked_for:
-        return False
-    found = before.found
-    return found is None or MEASURED * found.touches >= memory.statistics.touches
+def _has_all_of(memory: Memory, model: Model) -> bool:
+    """Whether all materials of a model are in the memory."""
+    return model.known <= memory.statistics.materials.keys()
 
 
 def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
+from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
@@ -21,7 +22,7 @@ from scroll_tactile.signals.windows import SHAPE, WHOLE, Extent, Scale, WindowPl
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
-__all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache"]
+__all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache", "stream_of"]
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
@@ -242,3 +243,14 @@ class FeatureExtractor:
         frame = self._plan.widths[0] if self._sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column
         return stream.first((longest // frame + before) / self._sensor.rate)
+
+
+def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
+    """The readings that kept levels stand for; what was missing as the last before it."""
+    low, high = sensor.limits
+    lacking = levels == MISSING
+    if lacking.any():
+        last = np.maximum.accumulate(np.where(lacking, 0, np.arange(levels.shape[1])), axis=1)
+        levels = np.take_along_axis(levels, last, axis=1)
+    readings = low + (high - low) * (levels.T.astype(np.float32) / np.float32(LEVELS - 1))
+    return validate(readings.clip(low, high), sensor)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.comparing import Compared
+from scroll_tactile.prediction.fusion import SURE, tempered
+from scroll_tactile.prediction.judging import fused
 from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.prediction.recalling import together
-from scroll_tactile.readouts.calibration import Calibration, common_names
-from scroll_tactile.readouts.leave_one_out import LeftOut
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.readouts.held_out import held_out
 
 __all__ = ["UnseenTouch", "unseen_touches"]
 
@@ -61,51 +59,27 @@ def unseen_touches(model: Model, false_alarms: float) -> list[UnseenTouch]:
 
 
 def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
-    rows = {} if model.pooled is None else model.pooled.recall.rows()
-    held = set() if model.pooled is None else model.pooled.recall.held
-    names_at: dict[tuple[Scale, ...], list[str]] = {}
-    for touch, (material, key, _) in enumerate(model.sample):
-        found = _judged(model, touch)
-        if found is None:
-            continue
-        stage, scales, calibration = found
-        apart = [model.apart[scale] for scale in scales]
-        names = names_at.setdefault(tuple(scales), common_names(apart))
-        if material not in names or len(names) < 2:
-            continue
-        said, pooled = _said(apart, names, touch, stage, calibration), model.pooled
-        kept = pooled is not None and (material, key) in held
-        if pooled is not None and kept and (said.probability.max() < pooled.sure or said.strange > pooled.familiar):
-            recollection = pooled.recall.recollect(pooled.recall.levels(rows[key]), left_out=rows[key])
-            said = together(pooled, names, Compared(said, recollection, own_time=True), None)
-        threshold = calibration.threshold(false_alarms)
-        yield UnseenTouch(material, key, tuple(names), said.probability, said.novelty, threshold)
-
-
-def _judged(model: Model, touch: int) -> tuple[int, list[Scale], Calibration] | None:
-    """The last stage that a sampled touch was left out at, the scales that judge there, and how they are read."""
-    last = len(model.calibrations) - 1
-    for stage in range(last, -1, -1):
-        viewed = stage == last and model.whole is not None
-        scales = [*model.stages[stage], *(model.views if viewed else [])]
-        if all((touch, stage) in model.apart[scale].rows for scale in scales):
-            whole = model.whole if viewed else None
-            return stage, scales, model.calibrations[stage] if whole is None else whole
-    return None
-
-
-def _said(
-    apart: Sequence[LeftOut], names: Sequence[str], touch: int, stage: int, calibration: Calibration
-) -> Judgement:
-    """What the readouts say of a touch that they never observed."""
-    rows = [left.rows[touch, stage] for left in apart]
-    places = [[left.names.index(name) for name in names] for left in apart]
-    strange = np.array([left.strangeness[row] for left, row in zip(apart, rows, strict=True)])
-    weights = calibration.believed(strange)
-    logits = np.zeros(len(names))
-    for weight, left, row, own in zip(weights, apart, rows, places, strict=True):
-        logits += weight * left.scores[row][own]
-    distances = [left.distances[row][own].min() for left, row, own in zip(apart, rows, places, strict=True)]
-    novelty = float(calibration.novelty(np.array(distances)))
-    chances = np.exp(logits - logits.max())
-    return Judgement(chances / chances.sum(), novelty, calibration, float(calibration.relative(strange).min()))
+    fusion, seen = model.fusion, set[int]()
+    if fusion is None:
+        return
+    recall = fusion.recall
+    rows = {} if recall is None else recall.rows()
+    for stage in range(len(model.calibrations) - 1, -1, -1):
+        scales, whole = model.scales("complete", stage), stage == len(model.calibrations) - 1
+        calibration = fusion.complete.calibration if whole else model.calibrations[stage]
+        held = held_out(stage, scales, model.sample, model.apart, calibration)
+        moment = next((moment for moment in reversed(fusion.moments) if moment.stage == stage), fusion.complete)
+        for i, place in enumerate(held.places):
+            if place in seen:
+                continue
+            seen.add(place)
+            material, key, _ = model.sample[place]
+            chances, novelty = np.exp(held.logs[i]), float(held.novelty[i])
+            said = Judgement(chances, novelty, moment, float(held.distance[i]))
+            if recall is not None and key in rows and (chances.max() < SURE or said.distance > moment.familiar):
+                way = recall.recollect(recall.levels(rows[key]), left_out=rows[key])
+                said = fused(recall, held.names, said, way, own_time=True)
+            else:
+                said = replace(said, probability=tempered(chances, moment.odd_model))
+            threshold = moment.threshold(false_alarms)
+            yield UnseenTouch(material, key, tuple(held.names), said.probability, said.novelty, threshold)

@@ -19,22 +19,21 @@ et al. 2005). All are functions of the statistics and the sample, so of what was
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled
+from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.signals.windows import Scale
 
 __all__ = [
+    "AHEAD",
     "FEWEST",
     "PRIOR_WEIGHT",
     "UNMEASURED",
     "Calibration",
-    "calibrate",
     "calibrate_stage",
     "common_names",
     "fit_weights",
@@ -100,25 +99,6 @@ class Calibration:
 
 TINY = 1e-300
 UNMEASURED = 5.0  # spreads: where too little could be left out to measure the distances of known touches
-
-
-def calibrate(
-    sample: Sampled,
-    stages: Sequence[Sequence[Scale]],
-    readouts: Mapping[Scale, Readout],
-    apart: Mapping[Scale, LeftOut],
-    kind: ReadoutName,
-) -> list[Calibration]:
-    """Calibrate every stage, given as the scales that judge there, of which all have a readout.
-
-    readouts: that have followed nothing yet. apart: what each says of the touches left out.
-    """
-    materials = [material for material, *_ in sample]
-    return [
-        calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
-        for stage, scales in enumerate(stages)
-        if all(scale in readouts for scale in scales)
-    ]
 
 
 def calibrate_stage(

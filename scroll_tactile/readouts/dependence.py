@@ -13,14 +13,14 @@ it is by itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.pooled import Apart
+from scroll_tactile.readouts.held_out import HeldOut
 
 __all__ = ["Dependence", "dependence_of"]
 
@@ -52,27 +52,20 @@ class Dependence:
         return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
 
 
-def dependence_of(apart: Mapping[bytes, Apart]) -> Dependence:
-    """Fit both to touches left out. apart: by key, what a model says of them."""
-    groups: dict[str, list[Apart]] = {}
-    for _, touch in sorted(apart.items()):
-        groups.setdefault(touch.material, []).append(touch)
-    several = {material: touches for material, touches in sorted(groups.items()) if len(touches) > 1}
-    pairs = [pair for touches in several.values() for pair in zip(touches[::2], touches[1::2], strict=False)]
+def dependence_of(held: HeldOut) -> Dependence:
+    """Fit both to held-out touches."""
+    groups: dict[int, list[int]] = {}
+    for row in sorted(range(len(held.keys)), key=held.keys.__getitem__):
+        groups.setdefault(int(held.targets[row]), []).append(row)
+    several = [rows for _, rows in sorted(groups.items()) if len(rows) > 1]
+    pairs = [pair for rows in several for pair in zip(rows[::2], rows[1::2], strict=False)]
     if len(pairs) < FEWEST or len(groups) < 2:
         return Dependence()
-    names = sorted(set.intersection(*(set(touch.logits) for touch in apart.values())))
-    scores = np.array([[_log_chances(first, names) + _log_chances(second, names)] for first, second in pairs])
+    scores = np.array([[held.logs[first] + held.logs[second]] for first, second in pairs])
     prior = np.array([1 / (1 + USUAL)])
-    weight = float(fit_weights(scores, [names.index(pair[0].material) for pair in pairs], prior, PRIOR_TOUCHES)[0])
+    weight = float(fit_weights(scores, [int(held.targets[first]) for first, _ in pairs], prior, PRIOR_TOUCHES)[0])
     rho = float(np.clip(1 / max(weight, TINY) - 1, 0.0, 1.0))
-    return Dependence(rho, _correlation([[touch.novelty for touch in touches] for touches in several.values()]))
-
-
-def _log_chances(touch: Apart, names: Sequence[str]) -> FloatArray:
-    logits = np.array([touch.logits[name] for name in names])
-    top = logits.max()
-    return np.asarray(logits - top - np.log(np.exp(logits - top).sum()))
+    return Dependence(rho, _correlation([held.novelty[rows].tolist() for rows in several]))
 
 
 def _correlation(groups: Sequence[Sequence[float]]) -> float:

@@ -16,7 +16,7 @@ observed several times leaves with all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,23 +54,34 @@ class LeftOut:
     strangeness: FloatArray
 
 
-def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], kind: ReadoutName) -> LeftOut:
+def left_out(
+    readout: Readout,
+    sample: Sampled,
+    stages: Sequence[Sequence[Scale]],
+    kind: ReadoutName,
+    asked: Mapping[int, Mapping[int, FloatArray]] | None = None,
+) -> LeftOut:
     """Leave each sampled touch out of the readout of a scale, which has followed nothing yet.
 
-    stages: the scales that judge at each stage, ascending. Touches of materials that have no others are not there.
+    stages: the scales that judge at each stage, ascending. asked: by the touch's place in the sample, by any number,
+    what is scored in place of its own rows, codes (d,): numbers then stand for stages. Touches of materials that have
+    no others are not there.
     """
     names = [readout.names[place] for place in readout.reference]
     own = {name: i for i, name in enumerate(names)}
-    groups: dict[int, list[tuple[int, list[int], FloatArray, float, int]]] = {}
+    groups: dict[tuple[int, int], list[tuple[int, list[int], FloatArray, float, int, FloatArray]]] = {}
     for number, (material, _, touch) in enumerate(sample):
         judged = rows_at(touch, stages, readout.scale)
-        if not judged or material not in own:
+        if not judged or material not in own or (asked is not None and not asked.get(number)):
             continue
         weight = float(max(touch.learned[judged[0]], len(judged)))
         if readout.counts[readout.reference[own[material]]] > weight:
-            at = touch.pairs[judged, 0].tolist()
             rows = touch.rows[judged] - readout.origin
-            groups.setdefault(len(judged), []).append((number, at, rows, weight, own[material]))
+            at, scored = touch.pairs[judged, 0].tolist(), rows
+            if asked is not None:
+                at, scored = sorted(asked[number]), np.stack([asked[number][i] for i in sorted(asked[number])])
+                scored = scored - readout.origin
+            groups.setdefault((len(judged), len(at)), []).append((number, at, rows, weight, own[material], scored))
     index: dict[tuple[int, int], int] = {}
     parts = []
     leaving = _Leaving(readout, kind) if groups else None
@@ -78,9 +89,9 @@ def left_out(readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]
         for number, at, *_ in members:
             for stage in at:
                 index[number, stage] = len(index)
-        rows, weights, owners = (np.stack([member[i] for member in members]) for i in (2, 3, 4))
+        rows, weights, owners, scored = (np.stack([member[i] for member in members]) for i in (2, 3, 4, 5))
         assert leaving is not None
-        parts.append(leaving.out(np.asarray(rows), np.asarray(weights), np.asarray(owners)))
+        parts.append(leaving.out(rows, weights, owners, None if asked is None else scored))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
     strangeness = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
     return LeftOut(index, names, joined[0], joined[1], joined[2], strangeness)
@@ -117,60 +128,75 @@ class _Leaving:
             self.onto_spread = np.linalg.solve(factor, spread)
 
     def out(
-        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp]
+        self,
+        rows: FloatArray,
+        weights: FloatArray,
+        own: npt.NDArray[np.intp],
+        asked: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, each of shape (M·k, R), and strangeness (M·k,), of rows about the origin (M, k, d).
+        """Scores, z and distances, each of shape (M·q, R), and strangeness (M·q,), without the rows of each touch.
 
-        weights: the rows of the statistics that each touch stands for, shape (M,). own: its material among the
-        reference, shape (M,).
+        rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
+        for, (M,). own: its material among the reference, (M,). asked: what is scored, about the origin, (M, q, d); the
+        rows themselves unless given.
         """
         touches, count, dimension = rows.shape
+        asked = rows if asked is None else asked
+        queries = asked.shape[1]
         with one_thread():
             white = self.readout.system.whiten(rows.reshape(-1, dimension)).reshape(rows.shape)
+            scored = white if asked is rows else self.readout.system.whiten(asked.reshape(-1, dimension))
+            scored = scored.reshape(asked.shape)
             counts = self.counts[own]
             stretch = np.sqrt(weights * counts / (counts - weights))[:, None]
             share = np.sqrt(weights / count)[:, None, None]
             columns = _columns(white, share, stretch * (white.mean(axis=1) - self.means[own]))
             inner = np.linalg.inv(columns @ columns.transpose(0, 2, 1) - np.eye(count))
-            onto = white @ columns.transpose(0, 2, 1)  # U K⁻¹ p of the rows, (M, k, columns)
+            onto = scored @ columns.transpose(0, 2, 1)  # U K⁻¹ p of what is scored, (M, q, columns)
             classes = (columns @ self.means.T).transpose(0, 2, 1)  # and of the means, (M, R, columns)
             onto_inner, classes_inner = onto @ inner, classes @ inner
-            z = white @ self.means.T - onto_inner @ classes.transpose(0, 2, 1)
+            z = scored @ self.means.T - onto_inner @ classes.transpose(0, 2, 1)
             sizes = np.square(self.means).sum(axis=1) - np.einsum("nri,nri->nr", classes, classes_inner)
             i = np.arange(touches)
             change = np.sqrt(weights / (counts * (counts - weights)))
             z[i, :, own] += change[:, None] * onto_inner[:, :, -1]
             sizes[i, own] += 2 * change * classes_inner[i, own, -1] - np.square(change) * (1 + inner[:, -1, -1])
-            length = np.square(white).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto_inner)
-            whole, leverage = self._whole(white, columns, weights, share)
+            length = np.square(scored).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto_inner)
+            whole, leverage, across = self._whole(white, scored, columns, weights, share)
         gamma = self.readout.gamma
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
-        scores = lda if self.kind == "lda" else self._ridge(white, own, leverage, weights)
-        strange = self._strangeness(rows, weights, own, scores.argmax(axis=2))
-        flat = [part.reshape(touches * count, -1) for part in (scores, centred, distances)]
+        scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
+        strange = self._strangeness(rows, asked, weights, own, scores.argmax(axis=2))
+        flat = [part.reshape(touches * queries, -1) for part in (scores, centred, distances)]
         return flat[0], flat[1], flat[2], strange.reshape(-1)
 
     def _strangeness(
-        self, rows: FloatArray, weights: FloatArray, own: npt.NDArray[np.intp], best: npt.NDArray[np.intp]
+        self,
+        rows: FloatArray,
+        asked: FloatArray,
+        weights: FloatArray,
+        own: npt.NDArray[np.intp],
+        best: npt.NDArray[np.intp],
     ) -> FloatArray:
-        """Of rows, shape (M, k, d), from the material `best` of each, shape (M, k), without the touch's own rows."""
+        """Of what is asked, (M, q, d), from the material `best` of each, (M, q), without the touch's own rows."""
         means, counts = self.readout.means_solved()[0], self.counts[own]
         nearest = means[best]
         back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
         nearest -= (best == own[:, None])[:, :, None] * back[:, None]
-        strangeness: FloatArray = np.square(rows - nearest) @ self.readout.precision
+        strangeness: FloatArray = np.square(asked - nearest) @ self.readout.precision
         return strangeness
 
     def _whole(
-        self, white: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The squared length of each row about the mean of all under T without its touch, (M, k), and B, (M, k, k).
+        self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The squared length of what is scored about the mean of all under T without its touch, (M, q).
 
-        leaving: the columns that leave K, whitened, shape (M, k, d).
+        And B of the touch's rows, (M, k, k), and of what is scored with them, (M, q, k). leaving: the columns that
+        leave K, whitened, shape (M, k, d).
         """
-        count, half = white.shape[1], white - self.center
+        count, half, asked = white.shape[1], white - self.center, scored - self.center
         rest = (self.total - weights)[:, None]
         middle = half.mean(axis=1)
         columns = np.sqrt(self.excess) * _columns(half, share, np.sqrt(weights[:, None] * self.total / rest) * middle)
@@ -178,12 +204,13 @@ class _Leaving:
         if self.excess > 1:
             columns = np.concatenate([columns, np.sqrt(self.excess - 1) * leaving], axis=1)
             signs = np.repeat([-1.0, 1.0], count)
-        moved = half + (weights[:, None] / rest * middle)[:, None, :]
+        moved = asked + (weights[:, None] / rest * middle)[:, None, :]
         inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
         onto = self._products(moved, columns)
         length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
         whole = length - np.einsum("nki,nki->nk", onto, onto @ inner)
-        return whole, np.square(share) * (self._products(half, half) + 1 / self.total)
+        leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, asked))
+        return whole, leverage, across
 
     def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """xᵀ T⁻¹ y of whitened vectors, shape (M, a, b)."""
@@ -191,19 +218,29 @@ class _Leaving:
         return np.asarray(left @ right.transpose(0, 2, 1) - near[0] @ near[1].transpose(0, 2, 1))
 
     def _ridge(
-        self, white: FloatArray, own: npt.NDArray[np.intp], leverage: FloatArray, weights: FloatArray
+        self,
+        white: FloatArray,
+        scored: FloatArray,
+        own: npt.NDArray[np.intp],
+        leverage: FloatArray,
+        across: FloatArray,
+        weights: FloatArray,
     ) -> FloatArray:
-        z = self.readout.gamma * (white @ self.means.T)
-        z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
-        fitted = self.readout.shares + z @ self.derived.background
+        fitted, asked = (self._fitted(rows) for rows in (white, scored))
         targets = np.zeros_like(fitted)
         targets[np.arange(len(own)), :, own] = 1.0
-        scores = np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - leverage @ targets)
+        scores = asked + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
         # With the shares of all touches, as a new one is judged: that a material lacks the very touch that is judged
         # would be all that a heavily shrunk ridge says, and its scores would be believed not at all.
         counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
         shares = counts / (self.total - weights)[:, None]
         return np.asarray(scores + (self.readout.shares - shares)[:, None, :])
+
+    def _fitted(self, white: FloatArray) -> FloatArray:
+        """The scores of the whole ridge."""
+        z = self.readout.gamma * (white @ self.means.T)
+        z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
+        return np.asarray(self.readout.shares + z @ self.derived.background)
 
 
 def _columns(rows: FloatArray, share: FloatArray, way: FloatArray) -> FloatArray:

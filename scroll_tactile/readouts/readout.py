@@ -113,7 +113,8 @@ class Readout:
     Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """
 
-    def __init__(self, task: Task, statistics: Statistics | Snapshot) -> None:
+    def __init__(self, task: Task, statistics: Statistics | Snapshot, like: Readout | None = None) -> None:
+        """Solve it. like: an earlier one of the same reference, to which scores stay comparable."""
         self.scale = task.scale
         self.names = list(task.names)
         self.places = {name: place for place, name in enumerate(self.names)}
@@ -124,6 +125,8 @@ class Readout:
         matrix = task.scatter
         trace, dimension = float(np.trace(matrix)), len(matrix)
         self.share = shrinkage(matrix, task.touches, task.times) if trace > 0 else 0.0
+        if like is not None and trace > 0:
+            self.share = like.share
         all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)
         places = np.concatenate([task.reference, np.setdiff1d(all_places, task.reference)])
         means = _class_means(task.counts[places], task.sums[places], self.origin)
@@ -131,7 +134,7 @@ class Readout:
         spread = trace / dimension * self.share / (1 - self.share)
         self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
         matrix[np.diag_indices(dimension)] += self.penalty
-        self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix)
+        self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix) if like is None else like.precision
         self._held: dict[int, int] = {}  # place → row of these
         self._room = np.empty((0, 2, dimension))
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
@@ -153,11 +156,6 @@ class Readout:
         """p of the reference materials, shape (R,)."""
         counts = self.counts[self.reference]
         return np.asarray(counts / counts.sum())
-
-    @property
-    def crowded(self) -> bool:
-        """Whether five eighths of the columns have come that may come before it has to be solved again."""
-        return 3 * self.system.rank > 5 * self.system.room
 
     @property
     def pressed(self) -> bool:

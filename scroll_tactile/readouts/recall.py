@@ -314,14 +314,16 @@ class Recall:
         if not asked.whole:
             return self._rows(rows, asked.levels.shape[1])
         columns = asked.levels.shape[1]
-        places = np.arange(columns)[None, :] * ((self._columns[rows] - 1) / max(columns - 1, 1))[:, None]
-        first = places.astype(np.intp)
-        after = np.minimum(first + 1, self._columns[rows, None] - 1)
-        part = (places - first)[:, None, :].astype(np.float32)
-        kept = self._rows(rows).reshape(len(rows), self.channels, -1)
-        low, high = (np.take_along_axis(kept, place[:, None, :], axis=2) for place in (first, after))
-        brought: LevelArray = np.rint(low * (1 - part) + high * part).astype(np.uint8)
-        brought[(low == MISSING) | (high == MISSING)] = MISSING
+        brought = np.empty((len(rows), self.channels, columns), np.uint8)
+        for length in np.unique(self._columns[rows]).tolist():  # touches of one length are brought to another alike
+            same = np.flatnonzero(self._columns[rows] == length)
+            places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
+            first = places.astype(np.intp)
+            part = (places - first).astype(np.float32)
+            kept = self._rows(rows[same], length).reshape(len(same), self.channels, length)
+            low, high = kept[:, :, first], kept[:, :, np.minimum(first + 1, length - 1)]
+            brought[same] = np.rint(low * (1 - part) + high * part)
+            brought[same] = np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), brought[same])
         return brought.reshape(len(rows), -1)
 
     def _shortlist(self, noises: Sequence[Noise], asked: _Asked, count: int, left_out: int | None) -> Rows:

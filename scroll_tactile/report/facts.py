@@ -19,9 +19,9 @@ from scroll_tactile.errors import (
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.prediction.beginnings import stream_of
-from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.drawing import as_counted
@@ -41,11 +41,13 @@ class MemoryFacts:
     """What a memory knows.
 
     risk: the share of wrong answers among those decided. missing: what the page lacks and why, filled as it is made.
+    unread: whether the embedding is not at hand, and nothing was fitted to beginnings.
     """
 
     learner: TactileLearner
     risk: float
     missing: list[str] = field(default_factory=list)
+    unread: bool = False
 
     def lacks(self, what: str, why: str) -> str:
         """Note that something is missing, and say so in its place."""
@@ -66,12 +68,21 @@ class MemoryFacts:
     def model(self) -> Model | None:
         """The model, just fitted; None of an empty memory, and where none can be fitted."""
         try:
-            return self.learner.model() if self.counts else None
+            return self._fitted() if self.counts else None
         except CapacityError:
             raise
         except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit
             self.missing.append(f"Nothing could be fitted: {error}")
             return None
+
+    def _fitted(self) -> Model:
+        try:
+            return self.learner.model()
+        except CANNOT_EMBED as error:
+            self.missing.append(f"When answers are decided: {error}")
+            self.unread = True
+            with enough_memory():
+                return Draft.of(self.learner.memory, self.learner.settings.readout).fit(None)
 
     @cached_property
     def unseen(self) -> list[UnseenTouch]:
@@ -121,13 +132,9 @@ class MemoryFacts:
     @cached_property
     def rule(self) -> DecisionRule | None:
         """When an answer is safe to act on; None where nothing can be left out, or embedded."""
-        if self.model is None or not self.unseen:
+        if self.model is None or not self.unseen or self.unread:
             return None
-        try:
-            return decision_rule(self.model, self.extractor, self.risk)
-        except CANNOT_EMBED as error:
-            self.missing.append(f"When answers are decided: {error}")
-            return None
+        return decision_rule(self.model, self.risk)
 
     @cached_property
     def soon(self) -> Soon | None:

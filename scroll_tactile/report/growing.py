@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,14 +12,16 @@ from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule
 from scroll_tactile.prediction.answer import answer
-from scroll_tactile.prediction.beginnings import early_answers, without
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.unseen import UnseenTouch
+from scroll_tactile.readouts.calibration import FEWEST
+from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.sample import SampledTouch
 
 __all__ = ["Growing", "Soon", "chosen", "growing", "soon"]
 
@@ -74,14 +76,13 @@ class Soon:
 
 def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
     """How soon answers come, by touches left out of which beginnings are judged; None where none are kept for it."""
-    early = early_answers(model, extractor)
-    if early is None:
+    if model.fusion is None or len(model.fusion.trajectories.targets) < FEWEST:
         return None
-    said, rate = early.fitted, extractor.sensor.rate
+    said, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
     done, wrong = np.zeros(len(said.targets), bool), np.zeros(len(said.targets), bool)
     right, decided, mistaken = [], [], []
-    for i, moment in enumerate(early.moments):
-        threshold = moment.calibrated(model.calibrations[-1]).threshold(false_alarms)
+    for i, moment in enumerate(moments):
+        threshold = moment.threshold(false_alarms)
         chances, novelty = said.chances[:, i], said.novelty[:, i]
         reached = np.isfinite(novelty)
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
@@ -96,7 +97,7 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
         right.append(float((best == said.targets)[reached].mean()) if reached.any() else 0.0)
         decided.append(float(done.mean()))
         mistaken.append(float(wrong.mean()))
-    seconds = tuple(moment.columns / rate for moment in early.moments)
+    seconds = tuple(moment.columns / rate for moment in moments)
     return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(said.targets))
 
 
@@ -130,7 +131,6 @@ def growing(
 
     Raises EmbeddingMismatchError where only its user can make the memory's embedding, and what that raises.
     """
-    early_answers(model, extractor)  # of the whole model, not of one that lacks a touch
     found = []
     for touch in touches:
         stream = extractor.stream(streams[touch.key])
@@ -147,8 +147,8 @@ def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
     """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
     sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
     with one_thread():
-        other = without(model, touch.material, sampled)
-    recall = None if model.pooled is None else model.pooled.recall
+        other = _left_by(model, touch.material, sampled)
+    recall = model.recall
     if recall is None or (touch.material, touch.key) not in recall.held:
         yield other
         return
@@ -158,6 +158,18 @@ def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
         yield other
     finally:
         recall.follow([kept])
+
+
+def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:
+    """The model of which the readouts never observed a sampled touch; its material has others."""
+    stages = [[*stage, *model.views] for stage in model.stages]
+    readouts = dict(model.readouts)
+    for scale, readout in model.readouts.items():
+        if own := rows_at(sampled, stages, scale):
+            # As many rows as it added: of windows that are learned one by one the sample has the mean.
+            times = max(1, round(sampled.learned[own[0]] / len(own)))
+            readouts[scale] = readout.without(material, np.repeat(sampled.rows[own], times, axis=0))
+    return replace(model, readouts=readouts)
 
 
 def _answers(

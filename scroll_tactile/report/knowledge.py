@@ -32,12 +32,12 @@ def separations(learner: TactileLearner, model: Model) -> tuple[list[str], Float
     calibration believes it. Materials that were never touched long enough are left out. None are there before a
     calibration is.
     """
-    last = len(model.calibrations) - 1
-    if last < 0:
+    if model.fusion is None:
         return [], np.zeros((0, 0))
-    scales = [*model.stages[last], *model.views]
-    calibration = model.calibrations[last] if model.whole is None else model.whole
-    weights = calibration.weights if model.kind == "lda" else np.full(len(scales), PRIOR / len(scales))
+    scales = model.scales("complete", len(model.calibrations) - 1)
+    weights = (
+        model.fusion.complete.calibration.weights if model.kind == "lda" else np.full(len(scales), PRIOR / len(scales))
+    )
     names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
     total, statistics = np.zeros((len(names), len(names))), learner.memory.statistics
     with one_thread():

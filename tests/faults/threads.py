@@ -45,9 +45,9 @@ import numpy as np
 import scroll_tactile.learner
 import scroll_tactile.memory.ledger
 import scroll_tactile.memory.state
-import scroll_tactile.prediction.beginnings
+import scroll_tactile.prediction.fitting
+import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.model
-import scroll_tactile.readouts.pooled
 import scroll_tactile.readouts.readout
 from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
@@ -541,8 +541,7 @@ def short_fits() -> Iterator[None]:
     of_one = Likelihood(np.full(LEVELS, 4.0), np.ones(LEVELS))
     made = lru_cache(maxsize=256)(of_one._made)
     with ExitStack() as patched:
-        for place in (scroll_tactile.readouts.pooled, scroll_tactile.prediction.beginnings):
-            patched.enter_context(patch.object(place, "LEFT_OUT", TAKEN_OUT))
+        patched.enter_context(patch.object(scroll_tactile.prediction.fusion, "MOST_HELD_OUT", TAKEN_OUT))
         patched.enter_context(patch.object(Likelihood, "_made", lambda _, noise: made(noise)))
         yield
 
@@ -558,7 +557,8 @@ class FewSampled(TouchSample):
 def read_when_asked() -> Iterator[None]:
     """While it lasts few materials are held, and few changes followed, as if there were thousands."""
     with ExitStack() as patched:
-        for place in (scroll_tactile.prediction.model, scroll_tactile.readouts.readout):
+        own = scroll_tactile.prediction
+        for place in (own.model, own.fitting, scroll_tactile.readouts.readout):
             patched.enter_context(patch.object(place, "EAGER", FEW))
         patched.enter_context(patch.object(scroll_tactile.readouts.readout, "MOST_HELD", 2 * FEW))
         patched.enter_context(patch.object(scroll_tactile.memory.ledger, "MOST_ADDED", FEW))

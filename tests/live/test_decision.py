@@ -10,9 +10,8 @@ from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
-from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.fusion import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.early import Rehearsal
 from scroll_tactile.results import Prediction
 
 SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6)
@@ -37,8 +36,7 @@ def model_of(learner):
 
 
 def rule_of(learner, risk):
-    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
-    return decision_rule(model_of(learner), extractor, risk)
+    return decision_rule(model_of(learner), risk)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +140,7 @@ def test_touches_left_out_are_rehearsed_behind_another_of_their_material():
     chances = np.stack([likely, 1 - likely], axis=2)
     novelty = np.array([[0.0, 1.0], [2.0, 0.5], [1.0, np.nan], short, [0.0, 0.0]])
     dependence = Dependence(0.5, 0.0)
-    pairs, known = in_pairs(Rehearsal(chances, novelty, np.array([0, 0, 0, 0, 1])), np.array([1.0, 2.0]), dependence)
+    pairs, known = in_pairs(Trajectories(chances, novelty, np.array([0, 0, 0, 0, 1])), np.array([1.0, 2.0]), dependence)
     assert pairs.targets.tolist() == [0, 0, 0]
     for row, (first, second) in enumerate([(chances[0, 1], 1), (chances[1, 1], 2), (chances[2, 0], 0)]):
         expected = dependence.probability([first, chances[second, 0]])
@@ -161,7 +159,7 @@ def test_touches_that_err_alike_take_more_to_be_decided_together(learner):
     right = np.where(odd, 0.3, 0.8)[:, None] + rng.uniform(-0.1, 0.1, (80, 3))
     chances = np.zeros((80, 3, 20))
     chances[np.arange(80), :, names], chances[np.arange(80), :, (names + 1) % 20] = right, 1 - right
-    alone = Rehearsal(chances, np.zeros((80, 3)), names)
+    alone = Trajectories(chances, np.zeros((80, 3)), names)
     pairs, known = in_pairs(alone, np.ones(3), Dependence(0.0, 0.0))
     assert known.all()
     levels = [

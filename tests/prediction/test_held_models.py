@@ -10,11 +10,10 @@ from touches import PAD, SMALL
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
-from scroll_tactile.prediction import beginnings
+from scroll_tactile.live import session
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import Draft
+from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.readouts.likelihood import Likelihood, Noise
-from scroll_tactile.readouts.system import System
 from scroll_tactile.statistics.sample import TouchSample
 from store import StoreClosedError
 
@@ -85,28 +84,23 @@ def once(monkeypatch, what, name, call):
 
 
 def test_a_session_begins_while_another_thread_observes_and_predicts(monkeypatch):
-    other, learner, measured, branches = learned(), learned(), [], []
-    own, branch = beginnings.early_of, System.branch
+    other, learner, ruled = learned(), learned(), []
+    own = session.decision_rule
 
-    def early_of(*args):
-        measured.append(own(*args))
-        return measured[-1]
-
-    def branching(system):
-        branches.append(True)
-        if len(branches) == 9:  # in the midst of taking a touch out of a readout
+    def decision_rule(model, risk):
+        if len(ruled) == 1:  # in the midst of beginning
             beside(changing(learner))
-        return branch(system)
+        ruled.append((model.fusion, own(model, risk)))
+        return ruled[-1][1]
 
-    monkeypatch.setattr(beginnings, "early_of", early_of)
-    monkeypatch.setattr(beginnings, "LEFT_OUT", 9)
+    monkeypatch.setattr(session, "decision_rule", decision_rule)
     other.live(contact="manual").close()
-    monkeypatch.setattr(System, "branch", branching)
     learner.live(contact="manual").close()
     assert "n" in learner.materials
-    undisturbed, found = measured
-    assert found.fitted.chances.tobytes() == undisturbed.fitted.chances.tobytes()
-    assert found.fitted.novelty.tobytes() == undisturbed.fitted.novelty.tobytes()
+    (undisturbed, rule), (found, again) = ruled
+    assert again == rule
+    assert found.trajectories.chances.tobytes() == undisturbed.trajectories.chances.tobytes()
+    assert found.trajectories.novelty.tobytes() == undisturbed.trajectories.novelty.tobytes()
 
 
 def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypatch):
@@ -115,7 +109,7 @@ def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypa
         live.begin()
         live.push(touch("a", 9, 30))
         model = live._under_way.frozen.model
-        likelihood = model.pooled.recall.measured.likelihood
+        likelihood = model.recall.measured.likelihood
 
         def copied(noise, memo):
             if not count:
@@ -293,7 +287,7 @@ def _arrays(model):
         found |= {f"{scale} {name}": getattr(readout, name) for name in ("counts", "_means", "_solved", "_sizes")}
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
-    recall, conformal = model.pooled.recall, model.conformal
+    recall, conformal = model.recall, model.conformal
     found |= {f"kept {name}": getattr(recall, name) for name in ("_blocks", "_brought", "_squares", "_labels")}
     found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
     return found
@@ -305,7 +299,7 @@ def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
     for seed in range(12):
         learner.observe("a", touch("a", 60 + seed, 20))
     assert learner.memory.statistics.usual_least == 20
-    assert draft.fit().least == other.model().least == 50
+    assert draft.fit(learner._extractor).least == other.model().least == 50
 
 
 def test_tables_are_there_for_any_number_of_threads():

@@ -14,7 +14,6 @@ from scroll_tactile.readouts.calibration import (
     FEWEST,
     PRIOR_WEIGHT,
     Calibration,
-    calibrate,
     calibrate_stage,
     fit_weights,
     scale_weights,
@@ -49,7 +48,11 @@ def stages_of(statistics, pool, kind="lda", stages=STAGES):
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
     readouts = {task.scale: Readout(task, statistics) for task in tasks}
     apart = {scale: left_out(readout, pool, stages, kind) for scale, readout in readouts.items()}
-    return calibrate(pool, stages, readouts, apart, kind)
+    materials = [material for material, *_ in pool]
+    return [
+        calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
+        for stage, scales in enumerate(stages)
+    ]
 
 
 def calibrated(kind="lda", **settings):

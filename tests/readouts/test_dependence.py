@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile.readouts.dependence import USUAL, Dependence, dependence_of
-from scroll_tactile.readouts.pooled import Apart
+from scroll_tactile.readouts.held_out import HeldOut
 
 NAMES = [f"m{i}" for i in range(12)]
 
@@ -14,16 +14,30 @@ NAMES = [f"m{i}" for i in range(12)]
 def apart(shared, of_each=12, seed=0):
     """Touches whose logits are off by an error of each material, a part `shared` of it, and one of their own."""
     rng = np.random.default_rng(seed)
-    found = {}
-    for i, name in enumerate(NAMES):
+    rows = []
+    for i in range(len(NAMES)):
         common, odd = rng.normal(size=len(NAMES)), rng.normal()
         for _ in range(of_each):
             error = np.sqrt(shared) * common + np.sqrt(1 - shared) * rng.normal(size=len(NAMES))
             logits = 1.5 * (1.5 * np.eye(len(NAMES))[i] + error)
             novelty = np.sqrt(shared) * odd + np.sqrt(1 - shared) * rng.normal()
             key = int(rng.integers(2**62)).to_bytes(8, "big")
-            found[key] = Apart(name, dict(zip(NAMES, logits.tolist(), strict=True)), 1.0, float(novelty))
-    return found
+            rows.append((key, i, logits, float(novelty)))
+    return held(rows)
+
+
+def held(rows):
+    """What is said of touches (key, material's number, logits, novelty)."""
+    logits = np.array([row[2] for row in rows]).reshape(len(rows), len(NAMES))
+    logs = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+    targets, novelty = np.array([row[1] for row in rows], dtype=np.intp), np.array([row[3] for row in rows])
+    return HeldOut(NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty)
+
+
+def picked(found, places):
+    """Some of them, in this order."""
+    every = list(zip(found.keys, found.targets.tolist(), found.logs, found.novelty.tolist(), strict=True))
+    return held([every[place] for place in places])
 
 
 def test_touches_that_say_the_same_count_less():
@@ -36,10 +50,10 @@ def test_touches_that_say_the_same_count_less():
 
 def test_it_is_of_the_set():
     found = apart(0.5)
-    assert dependence_of(dict(reversed(found.items()))) == dependence_of(found)
+    assert dependence_of(picked(found, range(len(found.keys))[::-1])) == dependence_of(found)
 
 
-@pytest.mark.parametrize("touches", [{}, dict(itertools.islice(apart(0.5).items(), 5))])
+@pytest.mark.parametrize("touches", [held([]), picked(apart(0.5), range(5))], ids=["none", "five"])
 def test_few_touches_have_the_usual(touches):
     assert dependence_of(touches) == Dependence(USUAL, USUAL)
 

@@ -99,6 +99,47 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     assert sorted(found.rows.values()) == list(range(len(found.scores)))
 
 
+@settings(max_examples=15, deadline=None)
+@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), st.sampled_from(["lda", "ridge"]), st.booleans())
+def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_been_observed(
+    kinds, seed, offset, kind, again
+):
+    """The beginnings of a touch, or the touch at another pace: other rows, of which the readout has none."""
+    touches = touches_of(kinds, seed, offset)
+    statistics, sample = learned(touches, again=again)
+    reference = statistics.names(SCALE)
+    readout = Readout(Task.of(statistics, SCALE, reference), statistics)
+    total = Fraction(int(statistics.second(SCALE).rows))
+    places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
+    rng = np.random.default_rng(seed + 1)
+    asked = {
+        place: {2 * at: np.rint(rng.normal(size=WIDTH) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
+        for place in places.values()
+    }
+    found = left_out(readout, sample, STAGES, kind, asked)
+    every = Dense(groups_of(touches), readout.penalty, readout.share)
+    variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
+    judged = set()
+    for i, (material, key, *_) in enumerate(touches):
+        rest = [other for j, other in enumerate(touches) if i != j]
+        if material not in {other for other, *_ in rest}:
+            continue
+        dense = Dense(groups_of(rest), readout.penalty, readout.share, reference, total, Fraction(1))
+        for number, codes in asked[places[material, key]].items():
+            judged.add((places[material, key], number))
+            place, row = found.rows[places[material, key], number], codes.astype(np.int64)
+            scores = dense.lda(row, reference, readout.origin)
+            if kind == "ridge":
+                shares = [float(dense.shares[name]) for name in reference]
+                scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
+            require_near(found.scores[place], scores)
+            require_near(found.distances[place], dense.distances(row, reference))
+            best = dense.means[reference[int(found.scores[place].argmax())]]
+            away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
+            require_near(found.strangeness[place], sum(a**2 / v for a, v in zip(away, variances, strict=True)))
+    assert found.rows.keys() == judged
+
+
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
     """The shares of what is left would tell against the material of the touch that is judged, and outdo the rest."""

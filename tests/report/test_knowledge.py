@@ -9,8 +9,7 @@ from scroll_tactile import sensors as known
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.pipelines.metrics import calibration_error
-from scroll_tactile.prediction.beginnings import stream_of
-from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
 from scroll_tactile.readouts.likelihood import levels_of
 from scroll_tactile.report.channels import channels_of, drift
@@ -55,7 +54,7 @@ def grown(learner, touches, rule=None):
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
     streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
     unseen = [touch for touch in unseen_touches(model, 0.05) if touch.key in touches]
-    rule = rule or decision_rule(model, extractor, 0.05)
+    rule = rule or decision_rule(model, 0.05)
     return model, growing(learner, model, extractor, rule, unseen, streams)
 
 
@@ -70,8 +69,8 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
         expected = dict(other.predict(touch.first(seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
-    assert (name, touch.key) in model.pooled.recall.held
-    assert len(model.pooled.recall) == 24
+    assert (name, touch.key) in model.recall.held
+    assert len(model.recall) == 24
 
 
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
@@ -113,8 +112,8 @@ def test_separations_are_the_log_odds_between_means(learner):
     assert names == sorted(NAMES)
     assert np.array_equal(apart, apart.T)
     assert (np.diagonal(apart) == 0).all()
-    scales = [*model.stages[len(model.calibrations) - 1], *model.views]
-    weights = (model.whole or model.calibrations[-1]).weights
+    scales = model.scales("complete", len(model.calibrations) - 1)
+    weights = model.fusion.complete.calibration.weights
     total = 0.0
     for scale, weight in zip(scales, weights, strict=True):
         readout, statistics = model.readouts[scale], learner.memory.statistics

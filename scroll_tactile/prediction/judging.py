@@ -1,0 +1,111 @@
+"""A touch judged: by the readouts, and beside kept touches where it is not as those that were learned.
+
+A touch that the readouts know well is theirs alone. One that lies far from all that was learned, that they are not sure
+of, or that has another length than those learned, is compared with kept touches as well (see `readouts.recall`): with
+their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
+own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the evidence for each, per value.
+Channels that never change are filled in with what the kept touches have there, and the touch is judged again. Of noise
+
+    p_y ∝ exp(g (1 − t) log d_y + β S_y),
+
+t which part of how the touch differs from kept ones is noise (`Recollection.trust`): it takes the readouts' word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.prediction.fusion import SURE, tempered
+from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
+from scroll_tactile.readouts.likelihood import LevelArray, levels_of
+from scroll_tactile.readouts.recall import Recall
+from scroll_tactile.readouts.recollection import Recollection
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["fused", "judged", "levels_seen"]
+
+FloatArray = npt.NDArray[np.float64]
+
+COUNTED = 30.0  # values, as which the evidence for a hypothesis counts: neighbours say the same
+TINY = 1e-300
+
+
+def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
+    """What a model says of an encoded touch, of which the candidates may be the materials."""
+    fusion, columns = model.fusion, encoded.columns
+    assert fusion is not None
+    usual: Hypothesis = "complete" if columns >= model.least else "beginning"
+    alone = model.judge(candidates, encoded.means, columns, usual)
+    recall = fusion.recall
+    if recall is None or (
+        alone.probability.max() >= SURE
+        and alone.distance <= alone.moment.familiar
+        and model.least <= len(encoded.stream) <= model.longest
+    ):
+        return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model))
+    levels = levels_seen(encoded.stream)
+    ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
+    if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
+        whole = recall.recollect(levels, whole=True)
+        if whole.evidence > 0:  # at no other pace is it any more like what is kept
+            ways.append((whole, "paced", False))
+    filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
+    answers = []
+    for way, hypothesis, own_time in ways:
+        said = alone if filled is encoded and hypothesis == usual else None
+        said = said or model.judge(candidates, filled.means, columns if own_time else len(encoded.stream), hypothesis)
+        answers.append(fused(recall, candidates, said, way, own_time=own_time))
+    evidence = np.array([way.evidence for way, *_ in ways])
+    weights = np.exp(COUNTED * (evidence - evidence.max()))
+    probability = weights @ np.array([answer.probability for answer in answers])
+    return replace(answers[int(weights.argmax())], probability=probability / probability.sum())
+
+
+def fused(
+    recall: Recall,
+    candidates: Sequence[str],
+    said: Judgement,
+    way: Recollection,
+    *,
+    own_time: bool,
+) -> Judgement:
+    """What the readouts and the kept touches say of a touch together.
+
+    own_time: whether it was compared with beginnings, and not with whole touches brought to its length.
+    """
+    moment = said.moment
+    familiarity = moment.familiarity(said.distance, own_time)
+    logs = (1 - way.trust) * np.log(np.maximum(said.probability, TINY))
+    logits = familiarity * moment.model * logs + _scores(recall, candidates, way) * moment.steepness(way, familiarity)
+    chances = np.exp(logits - logits.max())
+    chances = tempered(chances / chances.sum(), moment.odd)
+    novelty = (1 - way.trust) * said.novelty + way.trust * moment.matched_novelty(way)
+    return replace(said, probability=chances, novelty=float(novelty))
+
+
+def levels_seen(stream: Stream) -> LevelArray:
+    """The levels of a touch, (C, T), MISSING where a reading was."""
+    readings = stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
+    return levels_of(readings, stream.sensor)
+
+
+def _scores(recall: Recall, candidates: Sequence[str], way: Recollection) -> FloatArray:
+    """What the kept touches say of the candidates, (C,); the least of those of which none is kept."""
+    places, least = {name: i for i, name in enumerate(recall.materials)}, float(way.scores.min())
+    return np.array([way.scores[places[name]] if name in places else least for name in candidates])
+
+
+def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recollection: Recollection) -> Encoded:
+    """The touch with its stuck channels as kept touches have them, where that changes any of its levels."""
+    stream = encoded.stream
+    readings = recollection.filled(stream.readings, stream.sensor)
+    if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
+        return encoded
+    readings.setflags(write=False)
+    needed = [*encoded.means]
+    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: needed)

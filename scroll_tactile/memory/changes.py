@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import cast
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.rows import OBSERVE, RETRACT, Added, spans, unspanned
+from scroll_tactile.memory.rows import OBSERVE, RETRACT, Added, retracted_by, spans
 from scroll_tactile.memory.state import Memory
 from store import Record, Store
 
@@ -19,8 +20,9 @@ def apply_appended(memory: Memory, store: Store, records: list[Record]) -> list[
     newest = store.latest() if store.newest != memory.checkpoint else None
     if newest is not None and newest.upto <= memory.sequence:
         memory.checkpoint = newest.number
-        retractions = (head for head in store.heads(newest.upto, kind=RETRACT) if head.sequence <= memory.sequence)
-        gone = min((row for head in retractions for row in unspanned(head.attributes["sequences"])), default=None)
+        # Of all kinds: a damaged row that is passed over may be a retraction.
+        behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.upto))
+        gone = min(retracted_by(behind), default=None)
         if gone is None or gone > cast(int, newest.attributes["tuned_upto"]):
             memory.take_tuned(newest)
     return None if None in changed else [each for added in changed for each in added or ()]

@@ -42,7 +42,8 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
 def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
     """The sequences of all observations of a material, ascending.
 
-    Raises UnknownMaterialError for one never observed, and ObservationError where some were compacted.
+    Raises UnknownMaterialError for one never observed, ObservationError where some were compacted, and DamageError
+    where a damaged row may be one of them.
     """
     count = memory.statistics.materials.get(material, 0)
     if not count:
@@ -51,6 +52,8 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
         )
     found = [head.sequence for head in memory.retractable(store, material)]
     if len(found) != count:
+        for _ in store.heads(memory.base):  # one that is damaged was passed over
+            pass
         raise ObservationError(
             f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
             "compacted, and their features given up. Retract the others one by one, by their receipts"

@@ -8,6 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -222,7 +223,7 @@ class Memory:
         return material, codes, -1
 
     def retractable(self, store: Store, material: str | None = None) -> list[Head]:
-        """The observations whose arrays the journal still holds, of one material or all, in order."""
+        """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
         rows = store.heads(self.base, kind=OBSERVE, label=material)
         return [head for head in rows if head.sequence not in self.retracted]
 
@@ -243,12 +244,33 @@ class Memory:
 
     def _chosen(self, store: Store, upto: int) -> Memory:
         """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
-        fresh = self._base_samples(store)
-        for head in store.heads(self.base, kind=MERGE):
-            if head.sequence <= upto:
+        fresh, heads = self._base_samples(store), self._behind_base(store, upto)
+        for head in heads:
+            if head.kind == MERGE:
                 fresh._join(store.record(head.sequence))
-        fresh.choose([head for head in self.retractable(store) if head.sequence <= upto], store, self)
+        observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in self.retracted]
+        fresh.choose(observed, store, self)
         return fresh
+
+    def _behind_base(self, store: Store, upto: int) -> list[Head]:
+        """The rows up to one from which samples are chosen.
+
+        A damaged row may be of any kind: without it other touches would be chosen, and be saved as if they were the
+        right ones. So DamageError is raised; only who reads, and saves nothing, gets what is left, with a warning.
+        """
+        try:
+            return list(takewhile(lambda head: head.sequence <= upto, store.heads(self.base)))
+        except DamageError as damage:
+            if store.mode == "write":
+                raise DamageError(
+                    f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair "
+                    "the memory (scroll-tactile memory repair)",
+                    path=damage.path,
+                    sequence=damage.sequence,
+                ) from damage
+            logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
+        left = (head for kind in (MERGE, OBSERVE) for head in store.heads(self.base, kind=kind))
+        return [head for head in left if head.sequence <= upto]
 
     def choose(self, heads: Sequence[Head], source: Rows, made: Memory) -> None:
         """Choose samples and exemplars among what they hold and some observations, whose rows `source` has.

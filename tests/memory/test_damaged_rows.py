@@ -1,0 +1,80 @@
+"""A row whose frame or head is damaged has no kind any more: nobody may go on as if no touch had been there."""
+
+import pytest
+from forging import log_of
+from touches import OBSERVED, SETTINGS, filled, require_same, without
+
+from scroll_tactile import TactileLearner
+from store import DamageError, check_store
+from store.framing import FRAME_BYTES
+from store.log import LogReader
+from store.row_encoding import ROW
+
+DAMAGED = 5  # a row, of the second touch of "b"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "m"
+
+
+def harm(path, place):
+    """Flip a bit in the frame of a row, or in its head."""
+    with LogReader(log_of(path)) as log:
+        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
+    data = bytearray(log_of(path).read_bytes())
+    data[frames[DAMAGED - 1].offset + place] ^= 1
+    log_of(path).write_bytes(data)
+
+
+PLACES = pytest.mark.parametrize("place", [29, 86, FRAME_BYTES + 50], ids=["batch", "checksum", "head"])
+
+
+@PLACES
+def test_samples_are_not_chosen_again_without_a_damaged_row(path, place):
+    learner, receipts = filled(path)
+    learner.close()
+    harm(path, place)
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        for change in (
+            lambda: learner.retract(receipts[0]),
+            lambda: learner.forget(OBSERVED[0][0]),
+            lambda: learner.relabel(receipts[0], "other"),
+        ):
+            with pytest.raises(DamageError, match="row 5 ") as caught:
+                change()
+            assert caught.value.sequence == DAMAGED
+            require_same(learner, OBSERVED, exemplars=False)
+    with TactileLearner.open(path, **SETTINGS) as again:
+        assert again.memory.sequence == len(OBSERVED)
+        require_same(again, OBSERVED, exemplars=False)
+
+
+@PLACES
+def test_a_material_with_a_damaged_row_is_not_said_to_be_compacted(path, place):
+    filled(path)[0].close()
+    harm(path, place)
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        with pytest.raises(DamageError, match="row 5 "):
+            learner.forget(OBSERVED[DAMAGED - 1][0])
+        require_same(learner, OBSERVED, exemplars=False)
+
+
+@PLACES
+def test_a_retraction_that_is_replayed_needs_the_row_to_write_and_not_to_read(path, place, caplog):
+    learner, receipts = filled(path)
+    learner.close()
+    learner = TactileLearner.open(path, **SETTINGS)
+    learner.retract(receipts[0])
+    learner._ledger.store.close()  # as if the power failed: the retraction is to be replayed
+    harm(path, place)
+    before = log_of(path).read_bytes()
+    with pytest.raises(DamageError, match="row 5 "):
+        TactileLearner.open(path, **SETTINGS)
+    assert log_of(path).read_bytes() == before
+    assert check_store(path)
+    caplog.clear()
+    with TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+        whole = without(0)
+        assert reader.materials == {name: sum(one[0] == name for one in whole) for name in reader.materials}
+        assert "samples of touches are chosen without it" in caplog.text

@@ -19,7 +19,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.calibration import Calibration, calibrate_stage
+from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.deviation import recall_of
@@ -190,18 +190,21 @@ class _Fit:
         columns = moments_of(milestones, least, matched=recall is not None)
         moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
         chosen, counts = chosen_of(complete.held_out, recall)
+        weight = PRIOR_WEIGHT[draft.kind]
         if recall is None:
             judged = [self.judged(moment, moment[1], draft.stages[moment[1]], apart, {}) for moment in moments]
-            return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts)
+            return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts, weight)
         if self.extractor is None:
             moments = []
         kept = _KeptTouches.held_out(self, recall, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
         if not chosen or self.extractor is None:
             alone = self.judged((least, last), last, draft.views, apart, {})
-            return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], [alone], chosen, counts)
+            return complete.held_out, fuse(
+                recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
+            )
         paced = [kept.paced(pace, chosen[i :: len(PACES)], last) for i, pace in enumerate(PACES)]
-        return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts)
+        return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)

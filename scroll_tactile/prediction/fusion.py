@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
 from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.likelihood import CLEAN
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
 
@@ -193,32 +194,34 @@ def fuse(
     paced: Sequence[Judged],
     chosen: Sequence[bytes],
     counts: Mapping[bytes, float],
+    prior_weight: float,
 ) -> Fusion:
     """Fit the table to held-out touches.
 
     judged: what is said by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
     ascending by columns. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
-    as complete ones, and how many touches each stands for.
+    as complete ones, and how many touches each stands for. prior_weight: of the readouts' scores, where they are
+    believed as they are.
     """
     names, even = judged[-1].held_out.names, dict.fromkeys(chosen, 1.0)
     said = [_at(recall, one, names, even) for one in judged[:-1]]
     said.append(_at(recall, judged[-1], names, counts))
     others = [_at(recall, one, names, even) for one in paced]
-    moments = _rows(recall, judged, said, judged[-1])
-    of_paced = _rows(recall, paced, others, None)
+    moments = _rows(recall, judged, said, judged[-1], prior_weight)
+    of_paced = _rows(recall, paced, others, None, prior_weight)
     return Fusion(
         tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names))
     )
 
 
 def _rows(
-    recall: Recall | None, judged: Sequence[Judged], said: Sequence[_Said], complete: Judged | None
+    recall: Recall | None, judged: Sequence[Judged], said: Sequence[_Said], complete: Judged | None, prior_weight: float
 ) -> list[Moment]:
     """Rows of the table, each drawn to its neighbours."""
     rows = []
     for i, one in enumerate(judged):
         near = [other for other in said[max(0, i - 1) : i + 2] if len(other.targets) >= FEWEST]
-        rows.append(_fitted(one, said[i], near, recall, complete=one is complete))
+        rows.append(_fitted(one, said[i], near, recall, prior_weight, complete=one is complete))
     return rows
 
 
@@ -270,7 +273,9 @@ def _picked(scores: FloatArray, material: Mapping[str, int], names: Sequence[str
     return [float(scores[material[name]]) if name in material else least for name in names]
 
 
-def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall | None, *, complete: bool) -> Moment:
+def _fitted(
+    judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall | None, prior_weight: float, *, complete: bool
+) -> Moment:
     """A moment; near: what is said at the moments near it, this one among them, where that is enough."""
     held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
@@ -278,7 +283,8 @@ def _fitted(judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall |
     familiar = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
     if recall is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
-        match = UNSEEN if recall is not None else 0.5
+        power = float(calibration.weights.sum()) / prior_weight
+        match = 0.5 if recall is None else match_of(power * UNSEEN, recall.measured.likelihood.table(CLEAN).certainty)
         spread = 1.0 / UNMEASURED
         return Moment(
             columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread, calibration.novelties

@@ -42,8 +42,9 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     usual: Hypothesis = "complete" if columns >= model.least else "beginning"
     alone = model.judge(candidates, encoded.means, columns, usual)
     recall = fusion.recall
+    sure = SURE if alone.moment.odd_model else 0.0  # with one touch of each, any other looks as if noise came over it
     if recall is None or (
-        alone.probability.max() >= SURE
+        alone.probability.max() >= sure
         and alone.distance <= alone.moment.familiar
         and model.least <= len(encoded.stream) <= model.longest
     ):

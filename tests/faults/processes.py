@@ -37,6 +37,7 @@ from store import CompactedError, LockedError
 
 KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "describe", "compact", "fine_tune")
 SNAPSHOT_EVERY = 6
+LOOKS = 16  # of a reader, while a writer compacts
 PACE = 0.1  # seconds, at most, between two operations of the writer
 HELD = re.compile(r"by process (\d+) on (\S+) since (\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\S*)")
 
@@ -136,6 +137,16 @@ def write(channel: Connection, path: Path, seed: int, seconds: float) -> None:
     channel.send(None)
 
 
+def _seen_at_last(reader: Any) -> dict[str, Any]:
+    """What a reader sees, who looks again where the readings of its state are gone: a writer may compact many times."""
+    for _ in range(LOOKS):
+        try:
+            return seen(reader)
+        except CompactedError:
+            reader.refresh()
+    return seen(reader)
+
+
 def read(channel: Connection, path: Path, seed: int) -> None:
     """A reader: opens, refreshes, predicts until told to stop; tells what it saw, and between which instants."""
     rng, reader, looks = random.Random(seed), None, []
@@ -151,11 +162,7 @@ def read(channel: Connection, path: Path, seed: int) -> None:
                     reader, how = opened(path, "read"), "open"
                 elif how == "refresh":
                     reader.refresh()
-                try:
-                    found = seen(reader)
-                except CompactedError:  # of its state the readings are gone: it is told to look again
-                    reader.refresh()
-                    found = seen(reader)
+                found = _seen_at_last(reader)
                 ended = time.monotonic()
                 answer = reader.predict(stream((rng.randrange(4), 60)))
                 shares = [share for _, share in answer.ranking]

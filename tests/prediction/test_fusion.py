@@ -55,7 +55,7 @@ def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
 
 
 def fused(*moments, keys=KEYS):
-    return fuse(RECALL, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0))
+    return fuse(RECALL, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
 
 
 def beta(moment, certainty=0.5):
@@ -116,9 +116,9 @@ def test_a_moment_is_drawn_to_its_neighbours():
     near = [judged(columns, evidence(rng, KEYS) * 8, None) for columns in (10, 30)]
     last = judged(40, evidence(rng, KEYS), None)
     counts = dict.fromkeys(KEYS, 1.0)
-    between = fuse(RECALL, [near[0], scarce, near[1], last], [last], KEYS, counts).moments[1]
-    alone = fuse(RECALL, [scarce, last], [last], KEYS, counts).moments[0]
-    expected = [fuse(RECALL, [one, last], [last], KEYS, counts).moments[0].model for one in near]
+    between = fuse(RECALL, [near[0], scarce, near[1], last], [last], KEYS, counts, 1.0).moments[1]
+    alone = fuse(RECALL, [scarce, last], [last], KEYS, counts, 1.0).moments[0]
+    expected = [fuse(RECALL, [one, last], [last], KEYS, counts, 1.0).moments[0].model for one in near]
     assert max(expected) < between.model < alone.model
 
 
@@ -137,7 +137,7 @@ def test_where_too_few_were_held_out_the_readouts_decide(count):
 def test_without_kept_touches_the_readouts_have_the_word():
     rng = np.random.default_rng(5)
     own = judged(10, evidence(rng, KEYS), None)
-    fusion = fuse(None, [own], [own], [], {})
+    fusion = fuse(None, [own], [own], [], {}, 1.0)
     assert fusion.complete.model == 1.0
     assert fusion.trajectories.novelty.size == 0
 
@@ -147,7 +147,7 @@ def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     fusion = fused(*(judged(columns, evidence(rng, KEYS), None) for columns in (10, 20, 40)))
     assert [fusion.at(columns).columns for columns in (1, 10, 19, 20, 500)] == [10, 10, 10, 20, 40]
     paced = [judged(columns, evidence(rng, KEYS), None) for columns in (20, 80)]
-    fusion = fuse(RECALL, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0))
+    fusion = fuse(RECALL, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
     assert [fusion.at_pace(columns).columns for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
 
 

@@ -33,7 +33,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["PACES", "Draft", "at_pace"]
+__all__ = ["PACES", "Draft", "Renewal", "at_pace"]
 
 FloatArray = npt.NDArray[np.float64]
 Asked = dict[Scale, dict[int, dict[int, FloatArray]]]

@@ -28,7 +28,18 @@ from scroll_tactile.readouts.likelihood import CLEAN
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
 
-__all__ = ["SURE", "Fusion", "Judged", "Moment", "Trajectories", "chosen_of", "fuse", "moments_of", "tempered"]
+__all__ = [
+    "SURE",
+    "Fusion",
+    "Judged",
+    "Moment",
+    "Trajectories",
+    "chosen_of",
+    "fuse",
+    "match_scores",
+    "moments_of",
+    "tempered",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -55,7 +66,7 @@ class Moment:
     calibration: how their scores are read. model, match: g, and r that gives β (see `steepness`). alone: r where noise,
     or how unlike all others the touch is, leaves the readouts nothing to say. odd: ε. odd_model: ε of the readouts' own
     probabilities. familiar: the distance beside a usual one that 19 of 20 stay below. surprise, spread: of the kept
-    touches, of known touches. novelties: of these, ascending.
+    touches, of known touches.
     """
 
     columns: int
@@ -69,11 +80,10 @@ class Moment:
     familiar: float
     surprise: float
     spread: float
-    novelties: FloatArray
 
     def steepness(self, recollection: Recollection, familiarity: float) -> float:
         """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts are believed by so much, c its certainty."""
-        beside, alone = (1 / (1 + (1 / r - 1) * recollection.certainty) for r in (self.match, self.alone))
+        beside, alone = (_steepness(r, recollection.certainty) for r in (self.match, self.alone))
         share = (1 - recollection.trust) * familiarity
         return share * beside + (1 - share) * alone
 
@@ -92,11 +102,13 @@ class Moment:
         return (recollection.surprise - self.surprise) / self.spread
 
     def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds: the conformal quantile of held-out ones."""
-        if len(self.novelties) < FEWEST:
-            return UNMEASURED
-        rank = int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
-        return float(self.novelties[rank - 1]) if rank <= len(self.novelties) else float(2 * self.novelties[-1])
+        """The novelty that a share `false_alarms` of known touches exceeds; see `Calibration.threshold`."""
+        return self.calibration.threshold(false_alarms)
+
+    @property
+    def novelties(self) -> FloatArray:
+        """Those of the held-out touches that it was calibrated on, ascending."""
+        return self.calibration.novelties
 
 
 @dataclass(frozen=True)
@@ -252,8 +264,8 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Map
         at = []
     found = [among[chosen[number]] for number in at]
     ways = [judged.matches[chosen[number]] for number in at]
-    material = {} if recall is None else {name: i for i, name in enumerate(recall.materials)}
-    scores = np.array([_picked(way.scores, material, names) for way in ways]).reshape(len(ways), len(names))
+    matched = [] if recall is None else [match_scores(recall, names, way) for way in ways]
+    scores = np.array(matched).reshape(len(ways), len(names))
     certainty = np.maximum([way.certainty for way in ways], LEAST_CERTAINTY)
     usual = float(np.median(certainty)) if ways else 1.0
     return _Said(
@@ -268,9 +280,10 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Map
     )
 
 
-def _picked(scores: FloatArray, material: Mapping[str, int], names: Sequence[str]) -> list[float]:
-    least = float(scores.min())
-    return [float(scores[material[name]]) if name in material else least for name in names]
+def match_scores(recall: Recall, names: Sequence[str], way: Recollection) -> FloatArray:
+    """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
+    places, least = {name: i for i, name in enumerate(recall.materials)}, float(way.scores.min())
+    return np.array([way.scores[places[name]] if name in places else least for name in names])
 
 
 def _fitted(
@@ -286,9 +299,7 @@ def _fitted(
         power = float(calibration.weights.sum()) / prior_weight
         match = 0.5 if recall is None else match_of(power * UNSEEN, recall.measured.likelihood.table(CLEAN).certainty)
         spread = 1.0 / UNMEASURED
-        return Moment(
-            columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread, calibration.novelties
-        )
+        return Moment(columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread)
     together = _joined(near)
     prior = np.array([1.0, _worth(together) / 2])
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
@@ -298,20 +309,7 @@ def _fitted(
     surprise = float(np.average(said.surprise, weights=said.counts))
     spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
     of_model = float(weights[0])
-    moment = Moment(
-        columns,
-        stage,
-        calibration,
-        of_model,
-        match,
-        lone,
-        0.0,
-        alone,
-        familiar,
-        surprise,
-        spread,
-        calibration.novelties,
-    )
+    moment = Moment(columns, stage, calibration, of_model, match, lone, 0.0, alone, familiar, surprise, spread)
     own = _chances(moment, said)[np.arange(len(said.targets)), said.targets]
     return replace(moment, odd=_odd_share(own, said.logs.shape[1], said.counts))
 
@@ -340,8 +338,7 @@ def _weights(said: _Said, prior: FloatArray, touches: float) -> FloatArray:
 
 def _chances(moment: Moment, said: _Said) -> FloatArray:
     """The probability of the materials at a moment, (n, C), before outliers."""
-    steepness = 1 / (1 + (1 / moment.match - 1) * said.certainty)
-    logits = moment.model * said.logs + steepness * said.scores
+    logits = moment.model * said.logs + _steepness(moment.match, said.certainty) * said.scores
     chances = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(chances / chances.sum(axis=1, keepdims=True))
 
@@ -360,6 +357,11 @@ def _odd_share(own: FloatArray, materials: int, counts: FloatArray) -> float:
 def tempered(chances: FloatArray, odd: float) -> FloatArray:
     """Probabilities (…, C) of which a share is left for touches that are unlike all others."""
     return np.asarray((1 - odd) * chances + odd / chances.shape[-1])
+
+
+def _steepness(match: float, certainty: float) -> float:
+    """β of r, where the certainty is this."""
+    return 1 / (1 + (1 / match - 1) * certainty)
 
 
 def match_of(steepness: float, certainty: float) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
-from scroll_tactile.prediction.fusion import SURE, tempered
+from scroll_tactile.prediction.fusion import SURE, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
 from scroll_tactile.readouts.likelihood import LevelArray, levels_of
 from scroll_tactile.readouts.recall import Recall
@@ -82,7 +82,9 @@ def fused(
     moment = said.moment
     familiarity = moment.familiarity(said.distance, own_time)
     logs = (1 - way.trust) * np.log(np.maximum(said.probability, TINY))
-    logits = familiarity * moment.model * logs + _scores(recall, candidates, way) * moment.steepness(way, familiarity)
+    logits = familiarity * moment.model * logs + match_scores(recall, candidates, way) * moment.steepness(
+        way, familiarity
+    )
     chances = np.exp(logits - logits.max())
     chances = tempered(chances / chances.sum(), moment.odd)
     novelty = (1 - way.trust) * said.novelty + way.trust * moment.matched_novelty(way)
@@ -93,12 +95,6 @@ def levels_seen(stream: Stream) -> LevelArray:
     """The levels of a touch, (C, T), MISSING where a reading was."""
     readings = stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
     return levels_of(readings, stream.sensor)
-
-
-def _scores(recall: Recall, candidates: Sequence[str], way: Recollection) -> FloatArray:
-    """What the kept touches say of the candidates, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(recall.materials)}, float(way.scores.min())
-    return np.array([way.scores[places[name]] if name in places else least for name in candidates])
 
 
 def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recollection: Recollection) -> Encoded:

@@ -336,16 +336,18 @@ class Model:
         names: Sequence[str],
     ) -> float:
         """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
-        scales = self.scales(hypothesis, stage)
-        distances = [self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales]
-        return float(self._read_by(hypothesis, moment, stage).novelty(np.array(distances)))
+        distances = self._distances(self.scales(hypothesis, stage), means, names)
+        return float(self._read_by(hypothesis, moment, stage).novelty(distances))
 
     def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch by the windows of a stage alone."""
-        distances = [
-            self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in self.stages[stage]
-        ]
-        return float(self.calibrations[stage].novelty(np.array(distances)))
+        return float(self.calibrations[stage].novelty(self._distances(self.stages[stage], means, names)))
+
+    def _distances(
+        self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]
+    ) -> FloatArray:
+        """The relative Mahalanobis distance at each scale, (S,)."""
+        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales])
 
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:

@@ -124,9 +124,9 @@ class Readout:
         self.statistics = statistics
         matrix = task.scatter
         trace, dimension = float(np.trace(matrix)), len(matrix)
-        self.share = shrinkage(matrix, task.touches, task.times) if trace > 0 else 0.0
-        if like is not None and trace > 0:
-            self.share = like.share
+        self.share = 0.0
+        if trace > 0:
+            self.share = shrinkage(matrix, task.touches, task.times) if like is None else like.share
         all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)
         places = np.concatenate([task.reference, np.setdiff1d(all_places, task.reference)])
         means = _class_means(task.counts[places], task.sums[places], self.origin)

@@ -213,5 +213,5 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
 def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():
     calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, 100.0), np.ones(1))
     numbers = 1.0, 0.5, 0.5, 0.0, 0.0, np.inf, 0.0, 1.0
-    moment = Moment(10, 0, calibration, *numbers, calibration.novelties)
+    moment = Moment(10, 0, calibration, *numbers)
     assert [moment.threshold(share) for share in (0.05, 0.5)] == [calibration.threshold(share) for share in (0.05, 0.5)]

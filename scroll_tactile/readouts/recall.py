@@ -348,7 +348,8 @@ class Recall:
         """
         blocks = self._brought if whole else self._blocks
         if self._gapless and not whole and bool((known.all(axis=1) == known.any(axis=1)).all()):
-            return np.asarray((self._squares @ known[:, 0].astype(np.float32))[:, None] - 2 * _product(blocks, guess.T))
+            square = self._squares[:, known[:, 0]].sum(axis=1)[:, None]  # no BLAS: some report a NaN of few columns
+            return np.asarray(square - 2 * _product(blocks, guess.T))
         columns = np.flatnonzero(known)
         blocks, guess = blocks[:, columns], guess[:, columns]
         square = np.einsum("nd,nd->n", blocks, blocks, dtype=np.float32)[:, None]

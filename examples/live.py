@@ -28,7 +28,7 @@ with learner.live(risk=0.05) as live:
             acted = False
             touch, real = now.touches[0], next(truth)
             right += touch.prediction.material == real.material and touch.decided
-            if not touch.prediction.known:
+            if touch.prediction.known is False:
                 told += 1
                 learner.observe(real.material, touch.stream)  # told afterwards, as people do
     print(f"{live.report.touches} of {len(robot.touches)} touches found, {right} decided and right")

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Self
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["Compacted", "Composition", "Constituent", "Merged", "Observation", "Prediction", "Receipt"]
+__all__ = [
+    "Candidates",
+    "Compacted",
+    "Composition",
+    "Constituent",
+    "Merged",
+    "Observation",
+    "Prediction",
+    "Receipt",
+    "Unusual",
+]
+
+Unusual = Literal["shorter", "longer", "slower", "faster", "noisy", "zero moved", "channels dead"]
+"""What may set a touch apart from those that were learned, whatever material it is of."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +88,21 @@ class Compacted:
     bytes_after: int
 
 
+class Candidates(tuple[str, ...]):
+    """The materials that a touch may be of, likeliest first.
+
+    too_few: those among them that no touch could have excluded, too few touches of them being kept.
+    """
+
+    too_few: tuple[str, ...]
+
+    def __new__(cls, materials: Iterable[str], too_few: Iterable[str] = ()) -> Self:
+        """Make it of materials, likeliest first."""
+        made = super().__new__(cls, materials)
+        made.too_few = tuple(too_few)
+        return made
+
+
 @dataclass(frozen=True)
 class Prediction:
     """What a stream feels like, or several of one thing.
@@ -84,24 +113,32 @@ class Prediction:
     novelty: how unlike the candidates the touch is, in standard deviations above held-out touches of known materials.
         Infinite where nothing was ever observed; 0 where only one material was: there is nothing to compare it with.
     known: whether novelty stays below the threshold of the false-alarm rate. False means "never felt this", and
-        `material` is then only the nearest.
+        `material` is then only the nearest. None: that cannot be told from too few touches, fewer than 1 / rate − 1
+        that could be left out (19 at the usual 0.05), or from one material.
     seconds: how much touch the answer rests on: the stream's length, at most that of the longest touch learned. Of a
         camera's stream only the frames in contact count, and the one at rest. Of several streams it is the sum.
     tuned: whether f*, the fine-tuned model, gave the probabilities, and not f. Novelty is always f's.
     typicality: of each material in the ranking the share of touches of it, this one among them, that are as strange as
-        this one, by the touches that are kept; 1 where nothing is. See `candidates`.
+        this one, by the touches that are kept; 1 where nothing is. See `candidates`. typicality_of_all: of all touches,
+        in place of those of the material. least_typicality: the least that typicality can be of each, and behind them
+        of all.
+    unusual: what sets the touch apart from those that were learned, whatever it is of. The rate of false alarms holds
+        for touches like those that were learned, of which this is empty.
     """
 
     material: str | None
     probability: float
     ranking: tuple[tuple[str, float], ...]
     novelty: float
-    known: bool
+    known: bool | None
     seconds: float
     tuned: bool = False
     typicality: tuple[float, ...] = field(default=(), repr=False)
+    typicality_of_all: tuple[float, ...] = field(default=(), repr=False)
+    least_typicality: tuple[float, ...] = field(default=(), repr=False)
+    unusual: tuple[Unusual, ...] = ()
 
-    def candidates(self, error: float = 0.05) -> tuple[str, ...]:
+    def candidates(self, error: float = 0.05, *, of_all: bool = False) -> Candidates:
         """The materials that it may be, likeliest first: all but those of which it would be an odd touch.
 
         error: of the touches of any one material that was observed, this share or less lack their own (see
@@ -110,19 +147,29 @@ class Prediction:
         an empty set means unknown.
 
         A material of which fewer than 1 / error − 1 touches are kept cannot be excluded: 19 of them at 0.05 unless
-        given. Where the memory keeps none, as of a camera, all are candidates. What holds of touches made as those that
-        were observed does not hold of noise, dead channels or another speed.
+        given; `Candidates.too_few` names it. of_all: this share of the touches of all materials together, which needs
+        so many in all: a material may have more of the errors than another. Where the memory keeps none, as of a
+        camera, all are candidates. What holds of touches made as those that were observed does not hold of those that
+        are `unusual`.
 
         Raises InputError for an error that is no share between 0 and 1.
         """
         if not 0 < error < 1:
             raise InputError(f"expected error as a share between 0 and 1; came {error!r}")
         names = [material for material, _ in self.ranking]
-        typical = self.typicality or (1.0,) * len(names)
-        return tuple(name for name, share in zip(names, typical, strict=True) if share > error)
+        anything = (1.0,) * len(names)
+        typical = (self.typicality_of_all if of_all else self.typicality) or anything
+        least = self.least_typicality or (*anything, 1.0)
+        least = least[-1:] * len(names) if of_all else least[:-1]
+        found = [name for name, share in zip(names, typical, strict=True) if share > error]
+        too_few = {name for name, share in zip(names, least, strict=True) if share > error}
+        return Candidates(found, [name for name in found if name in too_few])
 
     def as_json(self) -> dict[str, str | float | bool | None]:
-        """Material, probability, known and novelty in JSON's types, which have no infinity: None stands for it."""
+        """Material, probability, known and novelty in JSON's types, which have no infinity: None stands for it.
+
+        Of known None stands for what cannot be told.
+        """
         return {
             "material": self.material,
             "probability": self.probability,

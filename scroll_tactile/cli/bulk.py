@@ -249,11 +249,11 @@ def _figures(done: Evaluation) -> dict[str, Any]:
         "touches": len(familiar),
         "learned_before": done.seen,
         "accuracy": done.answers.accuracy if familiar else None,
-        "called_unknown": sum(not each.prediction.known for each in familiar),
+        "called_unknown": sum(each.prediction.known is False for each in familiar),
         "calibration_error": done.calibration_error,
         "confusions": [list(confusion) for confusion in done.answers.confusions()],
         "never_learned": len(strange),
-        "never_learned_called_unknown": sum(not each.prediction.known for each in strange),
+        "never_learned_called_unknown": sum(each.prediction.known is False for each in strange),
         "wrong": wrong,
     }
 

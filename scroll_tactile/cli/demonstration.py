@@ -68,7 +68,7 @@ def _report(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -
     half, middle, answers, short = outcome.half, max(1, len(learned) // 2), outcome.answers, outcome.short
     first, others = learned[:middle], learned[middle:]
     say(f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}")
-    said = "never felt this" if not half.known else f"known, as {half.nearest}"
+    said = "never felt this" if half.known is False else f"known, as {half.nearest}"
     say(
         f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{said}[/] "
         f"(nearest is {half.nearest}, novelty {half.novelty:.1f})"

@@ -184,9 +184,11 @@ def verdict(prediction: Prediction) -> str:
     if prediction.material is None:
         return "never felt anything yet"
     name = shown(prediction.material)
-    if prediction.known:
-        return f"[bold green]{name}[/] with {percent(prediction.probability)} (novelty {prediction.novelty:.1f})"
-    return f"[bold yellow]never felt this[/]; nearest is {name} (novelty {prediction.novelty:.1f})"
+    felt = f" ({', '.join((f'novelty {prediction.novelty:.1f}', *prediction.unusual))})"
+    if prediction.known is False:
+        return f"[bold yellow]never felt this[/]; nearest is {name}{felt}"
+    doubt = "" if prediction.known else ", if it was ever felt: too few touches to tell"
+    return f"[bold green]{name}[/] with {percent(prediction.probability)}{felt}{doubt}"
 
 
 @contextmanager

@@ -58,12 +58,12 @@ class DecisionRule:
     def decided(self, prediction: Prediction, columns: int, *, several: bool = False) -> bool:
         """Whether it is safe to act on the prediction for the first `columns` of a touch, or for all of it.
 
-        On `prediction.material` where it is known, and on its being new where it is not. several: whether the
+        On `prediction.material`, but where it is not known on its being new. several: whether the
         prediction weighs other touches of the same thing with it.
         """
         if columns < self.moments[0]:
             return False
-        if prediction.known:
+        if prediction.known is not False:
             sure, whole = self.together if several else self.sure, columns >= self.moments[-1]
             return prediction.probability >= (min(sure, 1 - self.risk) if whole else sure)
         return prediction.novelty >= self.strange

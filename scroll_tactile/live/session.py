@@ -402,7 +402,7 @@ class LiveSession:
 
 def _says(prediction: Prediction) -> str | None:
     """What is acted on: the material, or that it is none that was felt."""
-    return prediction.material if prediction.known else None
+    return None if prediction.known is False else prediction.material
 
 
 _AT_REST = LiveState()

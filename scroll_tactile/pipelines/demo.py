@@ -31,7 +31,7 @@ class Half:
     material: str
     nearest: str
     novelty: float
-    known: bool
+    known: bool | None
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Demo:
     def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
         right = evaluate(learner, self._held_out(learned)).accuracy
         asked = evaluate(learner, self._held_out(others))
-        unknown = sum(not answer.known for answer in asked.predictions)
+        unknown = sum(answer.known is False for answer in asked.predictions)
         first = asked.predictions[0]
         nearest = str(first.material)
         return Half(right, unknown, len(asked.truth), asked.truth[0], nearest, first.novelty, first.known)

@@ -188,7 +188,7 @@ class Evaluation:
     def wrong(self) -> list[Answered]:
         """Touches taken for another material: the familiar ones, and strange ones that it called known."""
         mistaken = (each for each in self.answered if each.prediction.material != each.touch.material)
-        return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known]
+        return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known is not False]
 
     @property
     def calibration_error(self) -> float | None:

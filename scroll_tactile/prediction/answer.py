@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.judging import judged, levels_seen
 from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.readouts.conformal import Typicality
 from scroll_tactile.results import Prediction
 from scroll_tactile.statistics.moments import one_thread
 
@@ -52,8 +53,11 @@ def answer(
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
+    measured = all(judgement.moment.calibration.measures(false_alarms) for judgement in said)
+    known = False if novelty > threshold else True if measured and len(model.names) > 1 else None
     typical = _typicality(model, names, [touch for touch, _ in own])
-    return Prediction(*ranking[0], ranking, novelty, bool(novelty <= threshold), seconds, tuned, typical)
+    unusual = tuple(sorted({way for judgement in said for way in judgement.unusual}))
+    return Prediction(*ranking[0], ranking, novelty, known, seconds, tuned, *typical, unusual)
 
 
 def _judged(
@@ -68,12 +72,18 @@ def _judged(
     return model.judge(candidates, touch.means, touch.columns, "complete", logits)
 
 
-def _typicality(model: Model, names: Sequence[str], touches: Sequence[Encoded]) -> tuple[float, ...]:
-    """How typical touches are of some materials; see `Prediction`."""
+def _typicality(
+    model: Model, names: Sequence[str], touches: Sequence[Encoded]
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """How typical touches are of some materials, of all touches, and the least that both can be; see `Prediction`."""
+    anything = Typicality(1.0, 1.0, 1.0, 1.0)
     if model.conformal is None:
-        return (1.0,) * len(names)
+        return (1.0,) * len(names), (1.0,) * len(names), (1.0,) * (len(names) + 1)
     found = [model.conformal.p_values(levels_seen(touch.stream)) for touch in touches]
-    shares = np.array([[values.get(name, 1.0) for name in names] for values in found])
-    if len(shares) == 1:
-        return tuple(shares[0].tolist())
-    return tuple(min(1.0, 2 * math.fsum(column) / len(shares)) for column in shares.T)
+    own = np.array([[values.get(name, anything) for name in names] for values in found])
+    if len(own) == 1:
+        shares = own[0].tolist()
+    else:
+        shares = [[min(1.0, 2 * math.fsum(column) / len(own)) for column in of.T] for of in own.transpose(1, 0, 2)]
+    share, least, of_all, least_of_all = zip(*shares, strict=True)
+    return share, of_all, (*least, max(least_of_all))

@@ -39,6 +39,7 @@ FloatArray = npt.NDArray[np.float64]
 Asked = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `left_out`."""
 
+EACH_PACE = 48  # touches that are seen at each pace
 PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
 
 
@@ -203,7 +204,8 @@ class _Fit:
             return complete.held_out, fuse(
                 recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
-        paced = [kept.paced(pace, chosen[i :: len(PACES)], last) for i, pace in enumerate(PACES)]
+        step = -(-len(chosen) // EACH_PACE) or 1
+        paced = [kept.paced(pace, chosen[i % step :: step], last) for i, pace in enumerate(PACES)]
         return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 
 

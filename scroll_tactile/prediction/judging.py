@@ -19,12 +19,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fusion import SURE, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
 from scroll_tactile.readouts.likelihood import LevelArray, levels_of
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
+from scroll_tactile.results import Unusual
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["fused", "judged", "levels_seen"]
@@ -48,7 +49,11 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         and alone.distance <= alone.moment.familiar
         and model.least <= len(encoded.stream) <= model.longest
     ):
-        return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model))
+        return replace(
+            alone,
+            probability=tempered(alone.probability, alone.moment.odd_model),
+            unusual=_of_length(model, encoded) if recall is None else (),
+        )
     levels = levels_seen(encoded.stream)
     ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
     if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
@@ -59,12 +64,18 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     answers = []
     for way, hypothesis, own_time in ways:
         said = alone if filled is encoded and hypothesis == usual else None
-        said = said or model.judge(candidates, filled.means, columns if own_time else len(encoded.stream), hypothesis)
+        means = filled.means
+        if hypothesis == "paced":
+            kept = stream_of(levels_seen(filled.stream), extractor.sensor)
+            means = extractor.means(extractor.image(kept), model.views)
+        said = said or model.judge(candidates, means, columns if own_time else len(encoded.stream), hypothesis)
         answers.append(fused(recall, candidates, said, way, own_time=own_time))
     evidence = np.array([way.evidence for way, *_ in ways])
     weights = np.exp(COUNTED * (evidence - evidence.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
-    return replace(answers[int(weights.argmax())], probability=probability / probability.sum())
+    best = int(weights.argmax())
+    unusual = _unusual(model, encoded, ways[best][0], ways[best][1])
+    return replace(answers[best], probability=probability / probability.sum(), unusual=unusual)
 
 
 def fused(
@@ -89,6 +100,25 @@ def fused(
     chances = tempered(chances / chances.sum(), moment.odd)
     novelty = (1 - way.trust) * said.novelty + way.trust * moment.matched_novelty(way)
     return replace(said, probability=chances, novelty=float(novelty))
+
+
+def _unusual(model: Model, encoded: Encoded, way: Recollection, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
+    """What sets a touch apart from those that were learned, if the kept touches explain it so."""
+    found: list[Unusual] = list(_of_length(model, encoded))
+    if found and hypothesis == "paced":
+        found = ["faster" if found == ["shorter"] else "slower"]
+    marks: tuple[tuple[Unusual, bool], ...] = (
+        ("noisy", way.trust > 0.5),
+        ("zero moved", way.moved),
+        ("channels dead", bool(way.stuck.any())),
+    )
+    return (*found, *(mark for mark, holds in marks if holds))
+
+
+def _of_length(model: Model, encoded: Encoded) -> tuple[Unusual, ...]:
+    if encoded.columns < model.least:
+        return ("shorter",)
+    return ("longer",) if encoded.seconds < encoded.stream.seconds else ()
 
 
 def levels_seen(stream: Stream) -> LevelArray:

@@ -21,6 +21,7 @@ from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.readouts.recall import Recall
+from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
@@ -62,13 +63,14 @@ class Judgement:
 
     probability: of each candidate, shape (C,). novelty: see Prediction. moment: whose threshold the novelty has.
     distance: the least squared distance from a material at any scale that was asked, beside that of a usual touch; 0
-    where none is measured.
+    where none is measured. unusual: see Prediction.
     """
 
     probability: FloatArray
     novelty: float
     moment: Moment
     distance: float = 0.0
+    unusual: tuple[Unusual, ...] = ()
 
 
 @dataclass(eq=False)

@@ -11,7 +11,8 @@ in any order, so the share of these n + 1 that are as strange as x,
     p_y = (#{i kept of y : α(i, y) ≥ α(x, y)} + 1) / (n + 1),    each i compared with all others and with x,
 
 is at most ε in no more than ε of cases: for each material, for every n. It is the full, class-conditional conformal
-predictor. The values compared are whole numbers, and sums of their squares are exact: any order gives the same bits.
+predictor. By the touches of all materials, in place of those of y, it holds of all cases together. The values compared
+are whole numbers, and sums of their squares are exact: any order gives the same bits.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import copy
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +29,7 @@ import numpy.typing as npt
 from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.readouts.recollection import Kept
 
-__all__ = ["Conformal"]
+__all__ = ["Conformal", "Typicality"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,6 +38,19 @@ MOST_VALUES = 1024  # of a touch: sums of the squares of so many steps are below
 STEPS, UNREAD = 63, 255  # of a block's mean, log(1 + level) over all levels; and where nothing was read
 AT_ONCE = 128  # touches: of their distances from a thousand a step takes 1 MB
 APART = 2.0  # times that a touch's being nearer to another material counts
+
+
+class Typicality(NamedTuple):
+    """How typical a touch is of a material.
+
+    share: p, by the touches of the material. least: the least that it can be. of_all: by all touches, each compared as
+    one of its own material. least_of_all: the least that this can be.
+    """
+
+    share: float
+    least: float
+    of_all: float
+    least_of_all: float
 
 
 class Conformal:
@@ -87,12 +102,16 @@ class Conformal:
         """The materials of what is kept, in alphabetical order."""
         return self._materials
 
-    def p_values(self, levels: LevelArray) -> dict[str, float]:
+    def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
         compared, strange, own = self.scores(levels)
         among = compared[strange >= own[compared]]
-        stranger, of_all = (np.bincount(some, minlength=len(own)) + 1 for some in (among, compared))
-        return dict(zip(self._materials, (stranger / of_all).tolist(), strict=True))
+        stranger, count = (np.bincount(some, minlength=len(own)) + 1 for some in (among, compared))
+        below = np.searchsorted(np.sort(strange), own, side="left")
+        of_all = (len(strange) - below + 1) / (len(strange) + 1)
+        columns = (stranger / count, 1 / count, of_all, np.full(len(own), 1 / (len(strange) + 1)))
+        values = (Typicality(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
+        return dict(zip(self._materials, values, strict=True))
 
     def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
         """Of each kept touch that is as long its material's place, (n,), and α, (n,); and α(x, y) of all, (materials,).

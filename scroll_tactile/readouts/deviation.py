@@ -81,4 +81,5 @@ def _measured(recall: Recall) -> Measured:
     natural = float(np.median([coherence for _, coherence in shapes]))
     noise = [independent(energy, coherence, natural) for energy, coherence in shapes]
     most = EVEN**2 * float(np.quantile(noise, USUAL))
-    return Measured(recall.measured.likelihood, natural, max(most, ROUNDING))
+    energy = float(np.quantile([energy for energy, _ in shapes], USUAL))
+    return Measured(recall.measured.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))

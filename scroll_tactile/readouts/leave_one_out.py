@@ -10,6 +10,11 @@ so that all of its scores follow from products with K⁻¹ of its rows and of th
 covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
 matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
 
+From its own material a touch left out is further away than one to come will be: of n touches' mean, where one is new,
+the squared distance is expected to be 1 + 1/n of the scatter's, where one of the n is left out 1 + 1/(n − 1). So it is
+brought to 1 − 1/n² of what it is, n the touches of the material, where calibration would otherwise rest on touches that
+look less like their own than new ones will.
+
 A touch of which the statistics hold more rows than the sample (copies) leaves with as many of its own: one that was
 observed several times leaves with all of them.
 """
@@ -166,11 +171,32 @@ class _Leaving:
         gamma = self.readout.gamma
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
+        gain = self._as_new(white, columns, inner, weights, own)
+        lda[i, :, own] += gain if asked is rows else gain[:, -1:]  # what is asked counts as the complete touch
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
         strange = self._strangeness(rows, asked, weights, own, scores.argmax(axis=2))
         flat = [part.reshape(touches * queries, -1) for part in (scores, centred, distances)]
         return flat[0], flat[1], flat[2], strange.reshape(-1)
+
+    def _as_new(
+        self,
+        white: FloatArray,
+        leaving: FloatArray,
+        inner: npt.NDArray[np.floating],
+        weights: FloatArray,
+        own: npt.NDArray[np.intp],
+    ) -> FloatArray:
+        """What each row's own material gains if it is no further away than from a new touch, in LDA scores, (M, k).
+
+        white: the rows, whitened, (M, k, d). leaving, inner: the columns that leave K, whitened, and E.
+        """
+        counts = self.counts[own]
+        back = (weights / (counts - weights))[:, None] * (white.mean(axis=1) - self.means[own])
+        away = white - (self.means[own] - back)[:, None]
+        onto = away @ leaving.transpose(0, 2, 1)
+        far = np.square(away).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto @ inner)
+        return np.asarray(self.readout.gamma * np.square(weights / counts)[:, None] * far / 2)
 
     def _strangeness(
         self,
@@ -186,7 +212,8 @@ class _Leaving:
         back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
         nearest -= (best == own[:, None])[:, :, None] * back[:, None]
         strangeness: FloatArray = np.square(asked - nearest) @ self.readout.precision
-        return strangeness
+        as_new = 1 - np.square(weights / counts)[:, None]
+        return np.where(best == own[:, None], as_new * strangeness, strangeness)
 
     def _whole(
         self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray

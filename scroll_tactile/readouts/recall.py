@@ -24,7 +24,15 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
-from scroll_tactile.readouts.recollection import Kept, Measured, Recollection, by_chance, shape_of, trust_in
+from scroll_tactile.readouts.recollection import (
+    Kept,
+    Measured,
+    Recollection,
+    by_chance,
+    shape_of,
+    trust_in,
+    without_zero,
+)
 
 __all__ = ["Recall"]
 
@@ -421,13 +429,15 @@ class Recall:
         deviation, both = self._deviation(asked, best, noise)
         usual = table.expected[best.reshape(both.shape)[both]].sum() / max(int(np.count_nonzero(both)), 1)
         got = float(logs.max()) / max(asked.values, 1)
+        energy, coherence = shape_of(deviation, both)
         return Recollection(
             scores=self._scores(asked, rows, beside, logs, noise),
             certainty=table.certainty * asked.share,
             noise=noise,
             stuck=asked.stuck,
             expected=expected,
-            trust=trust_in(*shape_of(deviation, both), measured),
+            trust=trust_in(energy, coherence, measured),
+            moved=energy > measured.most >= without_zero(deviation, both),
             likelihood=got,
             evidence=got - by_chance(asked.levels[asked.seen]),
             surprise=float(usual) - got,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scroll_tactile.readouts.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in"]
+__all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in", "without_zero"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,12 +30,14 @@ class Measured:
 
     likelihood: its tables. coherence: how much larger the deviation of a channel's mean from a kept touch's
     is, squared and times T, than that of a value; 1 for independent noise. energy: of independent
-    noise that is even odds to be natural, in squared levels.
+    noise that is even odds to be natural, in squared levels. most: the energy of a deviation that 19 of 20 stay below,
+    in squared levels; infinite where too few touches are kept to say.
     """
 
     likelihood: Likelihood
     coherence: float
     energy: float
+    most: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Recollection:
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
     trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
+    moved: whether it is further from them than touches are, but for its channels' zeros, which may drift.
     likelihood: its logarithm per value. evidence: that beyond the one of values drawn at random from the touch's own;
     not above 0 where nothing that is kept explains the touch. surprise: what is lacking to the one that a touch of the
     set would have.
@@ -58,6 +61,7 @@ class Recollection:
     stuck: npt.NDArray[np.bool_]
     expected: FloatArray
     trust: float
+    moved: bool
     likelihood: float
     evidence: float
     surprise: float
@@ -78,6 +82,16 @@ def shape_of(deviation: FloatArray, seen: npt.NDArray[np.bool_]) -> tuple[float,
         return 0.0, 1.0
     together = float((np.square(deviation.sum(axis=1)) / np.maximum(counts, 1)).sum()) / np.count_nonzero(counts)
     return energy, together / energy
+
+
+def without_zero(deviation: FloatArray, seen: npt.NDArray[np.bool_]) -> float:
+    """The energy of a deviation (see `shape_of`) but for each channel's mean and its straight way up or down."""
+    counts = np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    time = np.broadcast_to(np.arange(seen.shape[1]), seen.shape)
+    away = (time - (time * seen).sum(axis=1, keepdims=True) / counts) * seen
+    slope = (deviation * away).sum(axis=1) / np.maximum(np.square(away).sum(axis=1), 1)
+    rest = (deviation - deviation.sum(axis=1, keepdims=True) / counts - slope[:, None] * away) * seen
+    return float(np.square(rest).sum()) / max(int(seen.sum()), 1)
 
 
 def independent(energy: float, coherence: float, natural: float) -> float:

@@ -155,7 +155,9 @@ def _grown(touch: Growing) -> str:
     lines = {name: [of[name] for of in chances] for name in names}
     end = touch.predictions[-1]
     verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
-    caption = f"A touch of {touch.material}. At its end: {verdict}{'' if end.known else ', and called unknown'}."
+    caption = (
+        f"A touch of {touch.material}. At its end: {verdict}{', and called unknown' if end.known is False else ''}."
+    )
     return figure(answers(touch.seconds, lines, touch.material, _moment(touch)), caption)
 
 
@@ -163,5 +165,5 @@ def _moment(touch: Growing) -> tuple[float, str] | None:
     if touch.decided is None:
         return None
     prediction, seconds = touch.predictions[touch.decided], touch.seconds[touch.decided]
-    how = "unknown" if not prediction.known else "right" if prediction.material == touch.material else "wrong"
+    how = "unknown" if prediction.known is False else "right" if prediction.material == touch.material else "wrong"
     return seconds, f"decided after {seconds:.2g} s: {how}"

@@ -197,7 +197,7 @@ class SlideTransfer:
                 name: float(np.mean([hit for hit, answer in zip(right, truth, strict=True) if answer == name]))
                 for name in sorted(set(truth))
             },
-            "unknown": float(np.mean([not answer.known for answer in predicted])),
+            "unknown": float(np.mean([answer.known is False for answer in predicted])),
             "digest": learner.digest(),
             "seconds": time.perf_counter() - begun,
         }

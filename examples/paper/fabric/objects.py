@@ -162,7 +162,7 @@ class Objects:
                 np.mean([answer == name for name, answers in zip(truth, of_frames, strict=True) for answer in answers])
             ),
             "vote": accuracy(truth, votes),
-            "called unknown": float(np.mean([not answer.known for answer in predicted])),
+            "called unknown": float(np.mean([answer.known is False for answer in predicted])),
             "digest": learner.digest(),
         }
         if self.trees and by == "counts":  # they read nothing else

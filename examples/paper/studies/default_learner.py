@@ -72,7 +72,7 @@ def _answer(learner: TactileLearner, readings: Readings) -> tuple[str | None, fl
         answer = learner.predict(readings)
     except StreamTooShortError:
         return None, 0.0, False, math.inf
-    return answer.material, float(answer.probability), bool(answer.known), float(answer.novelty)
+    return answer.material, float(answer.probability), answer.known is not False, float(answer.novelty)
 
 
 class Checkout:

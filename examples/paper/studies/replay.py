@@ -142,8 +142,10 @@ class _ReplayFold:
             "first": first.accuracy,
             "half": half.accuracy,
             "calibration_error": _calibration_error(whole),
-            "false_alarms": float(np.mean([not prediction.known for prediction in whole.predictions])),
-            "wrong_known": float(np.mean([given.known and given.material != name for name, given in answers])),
+            "false_alarms": float(np.mean([prediction.known is False for prediction in whole.predictions])),
+            "wrong_known": float(
+                np.mean([said.known is not False and said.material != name for name, said in answers])
+            ),
             "confusions": whole.confusions(),
         }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import stat
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -322,12 +323,21 @@ def require_unshared(folder: Path) -> None:
     """Raise DamageError where a file that is written in place has another name: writing would change that too."""
     with reported(folder, "looking for what may be written"):
         for path, is_ours in _named_as_ours(folder) if folder.is_dir() else ():
-            if is_ours and path.parent == folder and path.is_file() and path.lstat().st_nlink > 1:
+            if is_ours and path.parent == folder and _names(path) > 1:
                 raise DamageError(
                     f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
                     'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
                     path=path,
                 )
+
+
+def _names(path: Path) -> int:
+    """How many names a file has; 0 where it is none, or is gone: another process may have written it and moved it."""
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return 0
+    return status.st_nlink if stat.S_ISREG(status.st_mode) else 0
 
 
 def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:

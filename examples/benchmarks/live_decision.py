@@ -120,7 +120,7 @@ def _fold(recordings: Recordings, fold: int, every: int, progress: Progress) -> 
         "sure": [rule.sure for rule in rules],
         "probability": [[now.probability for now in of] for of in said],
         "right": [[now.material == own for now in of] for of, own in zip(said, truth, strict=True)],
-        "known": [[now.known for now in of] for of in said],
+        "known": [[now.known is not False for now in of] for of in said],
         "decided": decided,
         "covered": [own in found for own, found in zip(truth, sets, strict=True)],
         "sizes": [len(found) for found in sets],

@@ -39,8 +39,8 @@ FloatArray = npt.NDArray[np.float64]
 Asked = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `left_out`."""
 
-EACH_PACE = 48  # touches that are seen at each pace
 PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
+EACH_PACE = 48  # touches at most that are seen at a pace: of 24, a tenth of which are wrong, none may be
 
 
 @dataclass(frozen=True)

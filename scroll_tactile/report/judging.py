@@ -155,9 +155,8 @@ def _grown(touch: Growing) -> str:
     lines = {name: [of[name] for of in chances] for name in names}
     end = touch.predictions[-1]
     verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
-    caption = (
-        f"A touch of {touch.material}. At its end: {verdict}{', and called unknown' if end.known is False else ''}."
-    )
+    unknown = ", and called unknown" if end.known is False else ""
+    caption = f"A touch of {touch.material}. At its end: {verdict}{unknown}."
     return figure(answers(touch.seconds, lines, touch.material, _moment(touch)), caption)
 
 

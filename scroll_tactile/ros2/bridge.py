@@ -48,9 +48,9 @@ class Bridge:
 
     An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
     stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
-    probability, known, novelty (None where nothing was ever observed), candidates and ranking (the five likeliest);
-    "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but event, stamp and
-    contact may be missing where nothing was predicted yet.
+    probability, known, novelty (None where nothing was ever observed), unusual, candidates and ranking (the five
+    likeliest); "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but
+    event, stamp and contact may be missing where nothing was predicted yet.
 
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
@@ -209,6 +209,7 @@ class Bridge:
 
 def _said(prediction: Prediction) -> dict[str, Any]:
     return prediction.as_json() | {
+        "unusual": prediction.unusual,
         "candidates": prediction.candidates(),
         "ranking": prediction.ranking[:RANKED],
     }

@@ -182,6 +182,22 @@ def test_a_store_is_reached_through_a_link(tmp_path):
     assert check_store(tmp_path / "link") == []
 
 
+def test_a_file_that_another_process_moves_away_meanwhile_is_not_missed(tmp_path, monkeypatch):
+    """Found by `tests/faults/processes.py`: the note of who holds a store, written beside and moved into its place."""
+    path = build(tmp_path / "s")
+    (path / "holder.json.new").touch()
+    lstat = Path.lstat
+
+    def moved_away(self):
+        if self.name == "holder.json.new":
+            self.unlink(missing_ok=True)
+        return lstat(self)
+
+    monkeypatch.setattr(Path, "lstat", moved_away)
+    with Store.open(path) as writer:
+        assert add(writer, LAST + 1).sequence == LAST + 1
+
+
 @pytest.mark.parametrize("name", [LOG, "CURRENT", "lock", "log-00000009"])
 def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
     path, outside = build(tmp_path / "s"), tmp_path / "outside"

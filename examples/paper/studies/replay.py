@@ -143,9 +143,7 @@ class _ReplayFold:
             "half": half.accuracy,
             "calibration_error": _calibration_error(whole),
             "false_alarms": float(np.mean([prediction.known is False for prediction in whole.predictions])),
-            "wrong_known": float(
-                np.mean([said.known is not False and said.material != name for name, said in answers])
-            ),
+            "wrong_known": float(np.mean([one.known is not False and one.material != name for name, one in answers])),
             "confusions": whole.confusions(),
         }
 

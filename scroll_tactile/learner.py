@@ -40,6 +40,7 @@ from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readin
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
+from scroll_tactile.prediction.stored import NAME
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_source, require_text
@@ -752,12 +753,15 @@ class TactileLearner:
     def close(self) -> None:
         """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
 
+        Where a prediction or `settle` has fitted a model that is kept, too, and the first prediction after opening
+        fits nothing.
+
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
         with self._locked() as ledger:
+            ledger.close(NAME, lambda: self._current.kept(ledger))
             self._current.close()
-            ledger.close()
 
     def __enter__(self) -> Self:
         return self

@@ -118,6 +118,7 @@ class TactileLearner:
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
+        self._verified_to_read: Embedding | None = None
         self._snapshot_of: str | None = None
         self._range_said = False
         self._current = CurrentModel(self._settings, self._extractor)
@@ -568,10 +569,12 @@ class TactileLearner:
 
         begin: reads what it needs of the memory beside its model, and gives what reads the touch and answers.
         """
-        with self._verifying(), enough_memory():
+        with self._locked() as ledger:
+            reading = self._current.reading(ledger)
+        with self._verifying(reading.embedding), enough_memory():
             with self._locked() as ledger:
                 frozen = self._current.frozen(ledger)
-                answer = begin(frozen.model, self._extractor)
+                answer = begin(frozen.model, reading)
                 if frozen.model.reads_memory:
                     return answer()
             return answer()
@@ -618,20 +621,22 @@ class TactileLearner:
         return self._of_one_state(begin)
 
     @contextmanager
-    def _verifying(self) -> Iterator[None]:
+    def _verifying(self, embedding: Embedding) -> Iterator[None]:
         """Compare the fingerprint of an embedding that was made again, beside what the block does: it embeds, too."""
         unverified = self._unverified
-        if unverified is None:
+        if unverified is None or embedding is self._verified_to_read:
             yield
             return
         identity, path = unverified
         with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
-            compared = beside.submit(identity.require_embedding, path, self._embedding)
+            compared = beside.submit(identity.require_embedding, path, embedding)
             try:
                 yield
             finally:
                 compared.result()  # of another embedding nothing else that the block raised means anything
-        self._unverified = None
+        self._verified_to_read = embedding
+        if embedding is self._embedding:
+            self._unverified = None
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""

@@ -33,7 +33,7 @@ from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.stored import NAME, model_from, model_to_arrays
+from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
 from scroll_tactile.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class CurrentModel:
     """The model of one memory. Whoever calls holds the ledger's lock."""
 
     def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
-        self._kind, self._extractor = settings.readout, extractor
+        self._kind, self._extractor, self._reading = settings.readout, extractor, extractor
         self._version = -1
         self._model: Model | None = None
         self._stored: Model | None = None  # the model as it was read
@@ -123,6 +123,12 @@ class CurrentModel:
         self._model, self._behind = present, []
         return present
 
+    def reading(self, ledger: Ledger) -> FeatureExtractor:
+        """The extractor that reads the touches that predictions are asked for: it may have its banks from the disk."""
+        self._look(ledger)
+        self.take_in(ledger)
+        return self._reading
+
     def _look(self, ledger: Ledger) -> None:
         """Begin with the model that was kept of the memory, where there is one."""
         if self._looked or self._model is not None:
@@ -131,7 +137,10 @@ class CurrentModel:
         if ledger.added is None or (kept := ledger.derived(NAME)) is None:
             return
         try:
+            embedding = with_banks(self._extractor.embedding, kept.arrays)
             self._model = self._stored = model_from(kept, memory, self._kind)
+            if embedding is not self._extractor.embedding:
+                self._reading = self._extractor.with_embedding(embedding)
         except (Unexpected, *WRONG) as error:
             logger.info("the model kept of checkpoint %d is not used: %s", kept.number, error)
         else:
@@ -149,7 +158,9 @@ class CurrentModel:
             return None
         if self._behind != [] and model.fitted_to <= FEW:
             return None
-        return model_to_arrays(self._present(ledger))
+        if (made := model_to_arrays(self._present(ledger))) is None:
+            return None
+        return made[0] | banks_to_arrays(self._reading.embedding), made[1]
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin to make the next model where enough has come since the last. Raises nothing: an observation is kept."""

@@ -1,6 +1,6 @@
 """The fitted model as arrays, beside the checkpoint that it is of: whoever opens the memory next fits nothing.
 
-It holds what predictions read, and not K, the sample or the held-out touches: a model that was read follows nothing,
+It holds what predictions read, with the banks of kernels, and not K, the sample or the held-out touches: a model that was read follows nothing,
 and is renewed where touches come or go (see `prediction.current`). The levels of kept touches are the memory's.
 
 A file may come from elsewhere. Each array has the type and shape that the memory and the file itself ask for, and
@@ -17,6 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import __version__
+from scroll_tactile.embeddings.banks import MOST_CHANNELS, ROUND, THRESHOLDS, Bank, bank_size
+from scroll_tactile.embeddings.kernels import Kernels
+from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
@@ -32,13 +35,14 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
 from store import Checkpoint
 
-__all__ = ["NAME", "model_from", "model_to_arrays"]
+__all__ = ["NAME", "banks_to_arrays", "model_from", "model_to_arrays", "with_banks"]
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
 MADE_BY = f"{__version__}, 1"  # the release, and how it is written: the judge may differ in another
+MOST_BANKS = 64
 OF_MOMENT = ("columns", "stage", "model", "match", "alone", "odd", "odd_model", "familiar", "surprise", "spread")
 OF_CALIBRATION = ("weights", "scale_novelty", "usual", "novelties")
 
@@ -77,6 +81,40 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "fitted_to": model.fitted_to,
     }
     return {name: np.ascontiguousarray(part) for name, part in arrays.items()}, attributes
+
+
+def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
+    """The banks that an embedding of kernels has used; nothing of another."""
+    if not isinstance(embedding, Kernels):
+        return {}
+    found = embedding.banks()
+    arrays = {"banks": np.array(list(found), dtype=np.int64).reshape(-1, 2)}
+    for i, each in enumerate(found.values()):
+        arrays |= {f"bank-{name}-{i}": getattr(each, name) for name in ("channels", "rows", "thresholds")}
+    return arrays
+
+
+def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
+    """An embedding that gives the same features and makes no banks, to predict with; Unexpected for what are none.
+
+    What is learned is never embedded with it: a forged bank misleads predictions, and no memory.
+    """
+    if not isinstance(embedding, Kernels) or "banks" not in arrays:
+        return embedding
+    kinds = counts("banks", array(arrays, "banks", ("int64",), (None, 2)), 1, 2**12).tolist()
+    expect(len(kinds) <= MOST_BANKS, "banks", f"{MOST_BANKS} or fewer", len(kinds))
+    banks = {}
+    for i, (channels, dilation) in enumerate(kinds):
+        size = bank_size(channels, dilation)
+        rounds = -(-size // ROUND) * ROUND
+        summed = array(arrays, f"bank-channels-{i}", ("float32",), (rounds, channels))
+        expect(bool(((summed == 0) | (summed == 1)).all()), f"bank-channels-{i}", "0 and 1", "others")
+        expect(bool((summed.sum(axis=1) <= MOST_CHANNELS).all()), f"bank-channels-{i}", "fewer channels", "others")
+        rows = counts(f"bank-rows-{i}", array(arrays, f"bank-rows-{i}", ("int64",), (size,)), 0, rounds - 1)
+        thresholds = array(arrays, f"bank-thresholds-{i}", ("float32",), (THRESHOLDS, size))
+        expect(bool(np.isfinite(thresholds).all()), f"bank-thresholds-{i}", "finite numbers", "others")
+        banks[channels, dilation] = Bank(dilation, summed, rows.astype(np.intp, copy=False), thresholds)
+    return embedding.with_banks(banks)
 
 
 def _kept_to_arrays(recall: Recall, conformal: Conformal, places: Mapping[str, int]) -> dict[str, npt.NDArray[Any]]:

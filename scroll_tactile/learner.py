@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
-from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
+from scroll_tactile.errors import DescriptionError, EmbeddingMismatchError, InputError, RangeWarning
 from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
@@ -571,13 +571,20 @@ class TactileLearner:
         """
         with self._locked() as ledger:
             reading = self._current.reading(ledger)
-        with self._verifying(reading.embedding), enough_memory():
-            with self._locked() as ledger:
-                frozen = self._current.frozen(ledger)
-                answer = begin(frozen.model, reading)
-                if frozen.model.reads_memory:
-                    return answer()
-            return answer()
+        try:
+            with self._verifying(reading.embedding), enough_memory():
+                with self._locked() as ledger:
+                    frozen = self._current.frozen(ledger)
+                    answer = begin(frozen.model, reading)
+                    if frozen.model.reads_memory:
+                        return answer()
+                return answer()
+        except EmbeddingMismatchError:
+            if reading is self._extractor:
+                raise
+            with self._locked():
+                self._current.disbelieve()
+            return self._of_one_state(begin)
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5

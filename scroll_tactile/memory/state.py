@@ -506,7 +506,8 @@ class Memory:
         seconds = {name: each.read for name, each in reads.items()}
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names, seconds)
         if LATE_ROWS in reads:
-            self._sample = partial(_sample_of, reads[LATE_ROWS], arrays, attributes)
+            small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
+            self._sample = partial(_sample_of, reads[LATE_ROWS], small, attributes["sample"], attributes["copies"])
         else:
             self.sample = TouchSample.from_arrays(arrays, attributes["sample"], attributes["copies"])
         if self.kept is not None:
@@ -528,9 +529,8 @@ class Memory:
                 self.tuned = tuned
 
 
-def _sample_of(rows: LateArray, arrays: Arrays, attributes: Any) -> TouchSample:
-    small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
-    return TouchSample.from_arrays(small | {LATE_ROWS: rows.read()}, attributes["sample"], attributes["copies"])
+def _sample_of(rows: LateArray, arrays: Arrays, materials: Sequence[str], copies: Sequence[int]) -> TouchSample:
+    return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, materials, copies)
 
 
 def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:

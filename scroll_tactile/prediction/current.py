@@ -28,7 +28,7 @@ from scroll_tactile.memory.expected import Unexpected
 from scroll_tactile.memory.gate import WRONG
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
@@ -129,6 +129,10 @@ class CurrentModel:
         self.take_in(ledger)
         return self._reading
 
+    def disbelieve(self) -> None:
+        """Let go what was read: its banks give other features than the memory was made with."""
+        self._reading, self._model, self._stored = self._extractor, None, None
+
     def _look(self, ledger: Ledger) -> None:
         """Begin with the model that was kept of the memory, where there is one."""
         if self._looked or self._model is not None:
@@ -145,6 +149,7 @@ class CurrentModel:
             logger.info("the model kept of checkpoint %d is not used: %s", kept.number, error)
         else:
             self._behind = [] if kept.upto == memory.sequence else None
+        give_back_scratch()
 
     def kept(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
         """What `prediction.stored` writes of the model that would answer now; None where nobody asked for one.

@@ -1,7 +1,8 @@
 """The fitted model as arrays, beside the checkpoint that it is of: whoever opens the memory next fits nothing.
 
-It holds what predictions read, with the banks of kernels, and not K, the sample or the held-out touches: a model that was read follows nothing,
-and is renewed where touches come or go (see `prediction.current`). The levels of kept touches are the memory's.
+It holds what predictions read, with the banks of kernels, and not K, the sample or the held-out touches: a model that
+was read follows nothing, and is renewed where touches come or go (see `prediction.current`). The levels of kept touches
+are the memory's.
 
 A file may come from elsewhere. Each array has the type and shape that the memory and the file itself ask for, and
 numbers stay within bounds, so that no prediction fails or takes more memory for it; whether they are those that were

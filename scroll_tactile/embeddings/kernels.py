@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -87,8 +88,9 @@ class Kernels:
 
     def with_banks(self, banks: Mapping[tuple[int, int], Bank]) -> Kernels:
         """The same embedding with some banks that need not be made: a fifth of a second before the first touch."""
-        other = type(self)(seed=self.seed, dimension=self.dimension)
-        other._given = dict(banks)
+        other = copy.copy(self)
+        other._given, other._used = dict(banks), set()
+        other.__dict__.pop("fingerprint", None)  # it shows what these banks give
         return other
 
     def _bank(self, channels: int, dilation: int) -> Bank:

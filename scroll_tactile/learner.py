@@ -535,9 +535,9 @@ class TactileLearner:
         """
         from scroll_tactile.live.session import LiveSession, Memory
 
-        self._verified()
+        extractor = self._verified_to_predict()
         with self._locked() as ledger:
-            current, extractor, embedding = self._current, self._extractor, self._embedding
+            current, embedding = self._current, extractor.embedding
 
         def frozen() -> FrozenModel:
             with ledger.lock, enough_memory():
@@ -579,11 +579,8 @@ class TactileLearner:
                     if frozen.model.reads_memory:
                         return answer()
                 return answer()
-        except EmbeddingMismatchError:
-            if reading is self._extractor:
-                raise
-            with self._locked():
-                self._current.disbelieve()
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
             return self._of_one_state(begin)
 
     def compose(
@@ -644,6 +641,24 @@ class TactileLearner:
         self._verified_to_read = embedding
         if embedding is self._embedding:
             self._unverified = None
+
+    def _verified_to_predict(self) -> FeatureExtractor:
+        """The extractor that reads the touches that predictions are asked for, after its fingerprint was compared."""
+        with self._locked() as ledger:
+            reading = self._current.reading(ledger)
+        try:
+            with self._verifying(reading.embedding):
+                return reading
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
+            return self._verified()
+
+    def _disbelieve(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
+        """Let go what was read from the disk; raise the error where nothing was."""
+        if reading is self._extractor:
+            raise error
+        with self._locked():
+            self._current.disbelieve()
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""

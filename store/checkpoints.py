@@ -12,7 +12,7 @@ from pathlib import Path
 
 from store.archive import Files
 from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
-from store.derived import read_derived, write_derived
+from store.derived import read_derived, remove_derived, write_derived
 from store.exceptions import DamageError, StoreError, reported
 from store.files import remove_tree
 from store.journal import Journal
@@ -120,6 +120,7 @@ class Checkpoints:
                 # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
                 # be on the disk all the same, and count after a crash.
                 self._journal.commit(replace(current, newest=named, last=self._journal.last()))
+                remove_derived(self._folder)
             self.remove_unnamed()
             self._journal.keep_index()
             return named.number
@@ -154,6 +155,7 @@ class Checkpoints:
                     raise
                 with reported(self._folder, "committing"):
                     write_current(self._folder, Current(number, identity, named[-1], named[0], self._journal.last()))
+            remove_derived(self._folder)
             self.remove_unnamed()
 
     def commit_later(self, draft: Draft) -> None:

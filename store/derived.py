@@ -16,17 +16,18 @@ import numpy as np
 
 from store.encoding import decode_payload, encode_payload
 from store.exceptions import DamageError, VersionError
-from store.files import new_file, read_regular
+from store.files import is_real_folder, new_file, read_regular, remove_tree
 from store.layout import DERIVED, NEW
 from store.records import JSON, from_json, payload_digest
 
-__all__ = ["read_derived", "write_derived"]
+__all__ = ["read_derived", "remove_derived", "write_derived"]
 
 logger = logging.getLogger(__name__)
 
 MARK = b"\x89ARDER\x01\n"
 HEADER = struct.Struct("<8s32sQ")
 DIGEST_BYTES = 16
+ROWS = "rows-"  # files of the index, which are of the log: see `store.rows`
 LARGEST_FILE = 2**29  # bytes: a payload has at most half of it
 
 
@@ -45,6 +46,14 @@ def write_derived(folder: Path, name: str, follows: str, attributes: str, arrays
         file.write(data)
         file.write(payload_digest(data))
     draft.replace(path)
+
+
+def remove_derived(folder: Path) -> None:
+    """Remove the files of a checkpoint that no longer counts: they may say what was retracted and compacted since."""
+    if is_real_folder(folder / DERIVED):
+        for entry in (folder / DERIVED).iterdir():
+            if not entry.name.startswith(ROWS):
+                remove_tree(entry)
 
 
 def read_derived(folder: Path, name: str, follows: str) -> tuple[Mapping[str, JSON], Mapping[str, np.ndarray]] | None:

@@ -83,8 +83,8 @@ class Kernels:
         self._used: set[tuple[int, int]] = set()
 
     def banks(self) -> dict[tuple[int, int], Bank]:
-        """The banks that were used, by channels and dilation."""
-        return {key: self._bank(*key) for key in sorted(self._used)}
+        """The banks that were used or given, by channels and dilation."""
+        return {key: self._bank(*key) for key in sorted({*self._used.copy(), *(self._given or ())})}
 
     def with_banks(self, banks: Mapping[tuple[int, int], Bank]) -> Kernels:
         """The same embedding with some banks that need not be made: a fifth of a second before the first touch."""

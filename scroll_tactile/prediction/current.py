@@ -24,7 +24,6 @@ from weakref import ReferenceType, ref
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.expected import Unexpected
 from scroll_tactile.memory.gate import WRONG
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
@@ -35,6 +34,7 @@ from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
 from scroll_tactile.settings import Settings
+from store import StoreError
 
 logger = logging.getLogger(__name__)
 
@@ -138,15 +138,17 @@ class CurrentModel:
         if self._looked or self._model is not None:
             return
         self._looked, memory = True, ledger.memory
-        if ledger.added is None or (kept := ledger.derived(NAME)) is None:
+        if ledger.added is None:
             return
         try:
+            if (kept := ledger.derived(NAME)) is None:
+                return
             embedding = with_banks(self._extractor.embedding, kept.arrays)
             self._model = self._stored = model_from(kept, memory, self._kind)
             if embedding is not self._extractor.embedding:
                 self._reading = self._extractor.with_embedding(embedding)
-        except (Unexpected, *WRONG) as error:
-            logger.info("the model kept of checkpoint %d is not used: %s", kept.number, error)
+        except (StoreError, *WRONG) as error:
+            logger.info("the model that was kept is not used: %s", error)
         else:
             self._behind = [] if kept.upto == memory.sequence else None
         give_back_scratch()
@@ -177,7 +179,7 @@ class CurrentModel:
         # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
         with suppress(MemoryError, InputError, RuntimeError):
             if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
-                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._extractor))
+                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._reading))
             if self._renewal is None and self._behind and model.crowded(self._behind) and _has_all_of(memory, model):
                 self._renewal = _Job(self._worker("renewal").submit(Renewal.of(model, memory).solve))
 
@@ -192,6 +194,7 @@ class CurrentModel:
         self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
             self._model, self._fit, self._renewal = None, None, None
+            self._reading = self._extractor  # nothing of it rests on what was read
             self._model, self._behind = self._fitted(memory), []
         return self._model
 
@@ -258,7 +261,7 @@ class CurrentModel:
         return model if model.follow(memory, []) else self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit(self._extractor)
+        model = Draft.of(memory, self._kind).fit(self._reading)
         self._exact = True
         return model
 

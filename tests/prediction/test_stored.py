@@ -344,3 +344,26 @@ def test_sums_that_are_damaged_after_opening_are_named_and_the_memory_can_be_rep
     repair_store(path)
     with opened(path) as reader:
         assert reader.digest() == fed(OBSERVED).digest()
+
+
+def test_a_closed_reader_still_fits(path, fits):
+    shutil.rmtree(path / "derived")
+    reader = opened(path)
+    reader.close()
+    assert bits(reader) == bits(fed(OBSERVED))
+
+
+def test_compacting_leaves_nothing_of_what_was_forgotten(path):
+    with opened(path, "write") as learner:
+        learner.forget("b")
+        learner.compact()
+        assert not kept(path).exists()
+
+
+def test_a_live_session_reads_it_too(path, fits):
+    with opened(path) as learner:
+        session = learner.live(contact="manual")
+        session.begin()
+        answers = [session.push(row) for row in stream("a", 50)]
+        assert session.end() is not None or answers
+    assert fits == []

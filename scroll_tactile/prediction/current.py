@@ -132,6 +132,7 @@ class CurrentModel:
     def disbelieve(self) -> None:
         """Let go what was read: its banks give other features than the memory was made with."""
         self._reading, self._model, self._stored = self._extractor, None, None
+        self._fit = self._renewal = None
 
     def _look(self, ledger: Ledger) -> None:
         """Begin with the model that was kept of the memory, where there is one."""

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
-from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
+from scroll_tactile.errors import DescriptionError, EmbeddingMismatchError, InputError, RangeWarning
 from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
@@ -40,6 +40,7 @@ from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readin
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
+from scroll_tactile.prediction.stored import NAME
 from scroll_tactile.results import Compacted, Composition, Constituent, Merged, Observation, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, candidates_of, names_of, require_name, require_source, require_text
@@ -117,6 +118,7 @@ class TactileLearner:
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
+        self._verified_to_read: Embedding | None = None
         self._snapshot_of: str | None = None
         self._range_said = False
         self._current = CurrentModel(self._settings, self._extractor)
@@ -533,9 +535,9 @@ class TactileLearner:
         """
         from scroll_tactile.live.session import LiveSession, Memory
 
-        self._verified()
+        extractor = self._verified_to_predict()
         with self._locked() as ledger:
-            current, extractor, embedding = self._current, self._extractor, self._embedding
+            current, embedding = self._current, extractor.embedding
 
         def frozen() -> FrozenModel:
             with ledger.lock, enough_memory():
@@ -567,13 +569,19 @@ class TactileLearner:
 
         begin: reads what it needs of the memory beside its model, and gives what reads the touch and answers.
         """
-        with self._verifying(), enough_memory():
-            with self._locked() as ledger:
-                frozen = self._current.frozen(ledger)
-                answer = begin(frozen.model, self._extractor)
-                if frozen.model.reads_memory:
-                    return answer()
-            return answer()
+        with self._locked() as ledger:
+            reading = self._current.reading(ledger)
+        try:
+            with self._verifying(reading.embedding), enough_memory():
+                with self._locked() as ledger:
+                    frozen = self._current.frozen(ledger)
+                    answer = begin(frozen.model, reading)
+                    if frozen.model.reads_memory:
+                        return answer()
+                return answer()
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
+            return self._of_one_state(begin)
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5
@@ -617,20 +625,40 @@ class TactileLearner:
         return self._of_one_state(begin)
 
     @contextmanager
-    def _verifying(self) -> Iterator[None]:
+    def _verifying(self, embedding: Embedding) -> Iterator[None]:
         """Compare the fingerprint of an embedding that was made again, beside what the block does: it embeds, too."""
         unverified = self._unverified
-        if unverified is None:
+        if unverified is None or embedding is self._verified_to_read:
             yield
             return
         identity, path = unverified
         with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
-            compared = beside.submit(identity.require_embedding, path, self._embedding)
+            compared = beside.submit(identity.require_embedding, path, embedding)
             try:
                 yield
             finally:
                 compared.result()  # of another embedding nothing else that the block raised means anything
-        self._unverified = None
+        self._verified_to_read = embedding
+        if embedding is self._embedding:
+            self._unverified = None
+
+    def _verified_to_predict(self) -> FeatureExtractor:
+        """The extractor that reads the touches that predictions are asked for, after its fingerprint was compared."""
+        with self._locked() as ledger:
+            reading = self._current.reading(ledger)
+        try:
+            with self._verifying(reading.embedding):
+                return reading
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
+            return self._verified()
+
+    def _disbelieve(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
+        """Let go what was read from the disk; raise the error where nothing was."""
+        if reading is self._extractor:
+            raise error
+        with self._locked():
+            self._current.disbelieve()
 
     def _verified(self) -> FeatureExtractor:
         """The extractor of features, after the fingerprint of an embedding that was made again has been compared."""
@@ -752,12 +780,15 @@ class TactileLearner:
     def close(self) -> None:
         """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
 
+        Where a prediction or `settle` has fitted a model that is kept, too, and the first prediction after opening
+        fits nothing.
+
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
         with self._locked() as ledger:
+            ledger.close(NAME, lambda: self._current.kept(ledger))
             self._current.close()
-            ledger.close()
 
     def __enter__(self) -> Self:
         return self

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from store.archive import Files
-from store.chunks import ArrayFiles, file_digests, most_bytes
+from store.chunks import LARGEST_DESCRIPTION, ArrayFiles, file_digests, most_bytes
 from store.content import GROUP_VERSION, ArrayContent, read_content
 from store.encoding import array_digest
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import remove_tree, replacing, sync_folder
+from store.late import HeldFiles, LateArray
 from store.layout import PARTIAL, checkpoint_path
 from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
 
@@ -149,10 +151,26 @@ class CheckpointReader:
                 path=path,
             )
 
-    def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-        """Return those of these arrays that it has, or all, verified, writable and the caller's own."""
+    def arrays(self, names: Collection[str] | None = None, but: Collection[str] = ()) -> dict[str, np.ndarray]:
+        """Return those of these arrays that it has, or all but some, verified, writable and the caller's own."""
         chosen = self._described if names is None else [name for name in self._described if name in names]
-        return {name: self._array(name) for name in chosen}
+        return {name: self._array(name) for name in chosen if name not in but}
+
+    def late(self, names: Collection[str]) -> dict[str, LateArray]:
+        """Return those of these arrays that it has; their files are verified, and stay open until they are read."""
+        return {name: self._late(name) for name in self._described if name in names}
+
+    def _late(self, name: str) -> LateArray:
+        content, held = self._described[name], HeldFiles()
+        with self._naming(name):
+            for _, path, _ in ArrayFiles(self._path, name, content, self._files.read).verified():
+                held.hold(path, self._files.open_log(path))
+            text = self._files.read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
+
+        def read(path: Path, limit: int) -> bytes:
+            return text if path.name == "zarr.json" else held.read(path, limit)
+
+        return LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
 
     def damage(self) -> Iterator[DamageError]:
         """Yield what is wrong with the arrays, array by array; nothing where all verifies."""
@@ -162,17 +180,26 @@ class CheckpointReader:
             except DamageError as damage:
                 yield damage
 
-    def _array(self, name: str, *, thorough: bool = False) -> np.ndarray:
-        folder, content = self._path / name, self._described[name]
-        what = f"array {name!r} of checkpoint {self.number} in {folder}"
-        try:
-            array = ArrayFiles(self._path, name, content, self._files.read).read()
-        except Exception as error:
-            raise _unreadable(error, what, folder) from error
+    def _array(
+        self, name: str, *, thorough: bool = False, read: Callable[[Path, int], bytes] | None = None
+    ) -> np.ndarray:
+        content = self._described[name]
+        with self._naming(name) as (what, folder):
+            array = ArrayFiles(self._path, name, content, read or self._files.read).read()
         # Its files were verified; what they stand for is looked at where damage is looked for.
         if thorough and array_digest(array) != content.sha256:
             raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
         return array
+
+    @contextmanager
+    def _naming(self, name: str) -> Iterator[tuple[str, Path]]:
+        """Name the array in what is raised."""
+        folder = self._path / name
+        what = f"array {name!r} of checkpoint {self.number} in {folder}"
+        try:
+            yield what, folder
+        except Exception as error:
+            raise _unreadable(error, what, folder) from error
 
 
 def _read_attributes(header: Path, files: Files) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from store.archive import Files
 from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
+from store.derived import read_derived, remove_derived, write_derived
 from store.exceptions import DamageError, StoreError, reported
 from store.files import remove_tree
 from store.journal import Journal
@@ -49,13 +50,16 @@ class Checkpoints:
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
 
-    def latest(self, only: Collection[str] | None = None) -> Checkpoint | None:
-        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all."""
+    def latest(self, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
+        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all.
+
+        late: those that are read when they are needed.
+        """
         passed: set[int] = set()
         while left := [named for named in self._journal.current().checkpoints if named.number not in passed]:
             passed.add(left[0].number)
             try:
-                return self._load(left[0], only)
+                return self._load(left[0], only, late)
             except DamageError as damage:
                 if self._is_named(left[0]):
                     logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
@@ -75,9 +79,27 @@ class Checkpoints:
         """Whether it still counts: a writer replaces checkpoints and removes them."""
         return named in self._journal.current().checkpoints
 
-    def _load(self, named: NamedCheckpoint, only: Collection[str] | None = None) -> Checkpoint:
+    def _load(
+        self, named: NamedCheckpoint, only: Collection[str] | None = None, late: Collection[str] = ()
+    ) -> Checkpoint:
         reader = self._verified(named)
-        return Checkpoint(named.number, named.upto, reader.attributes, reader.arrays(only))
+        arrays = reader.arrays(only, but=late)
+        return Checkpoint(named.number, named.upto, reader.attributes, arrays, reader.late(late))
+
+    def derived(self, name: str) -> Checkpoint | None:
+        """Return what was kept of the newest checkpoint under a name; None where there is nothing of it."""
+        newest = self._journal.current().newest
+        if newest is None or self._files.is_packed:
+            return None
+        found = read_derived(self._folder, name, newest.sha256)
+        return None if found is None else Checkpoint(newest.number, newest.upto, *found)
+
+    def keep_derived(self, name: str, draft: Draft) -> None:
+        """Keep what follows from the newest checkpoint, which is up to the same row, under a name."""
+        with self._committing, reported(self._folder, f"keeping {name!r}"):
+            newest = self._journal.current().newest
+            if newest is not None and newest.upto == draft.upto:
+                write_derived(self._folder, name, newest.sha256, draft.attributes, draft.arrays)
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)
@@ -98,6 +120,7 @@ class Checkpoints:
                 # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
                 # be on the disk all the same, and count after a crash.
                 self._journal.commit(replace(current, newest=named, last=self._journal.last()))
+                remove_derived(self._folder)
             self.remove_unnamed()
             self._journal.keep_index()
             return named.number
@@ -132,6 +155,7 @@ class Checkpoints:
                     raise
                 with reported(self._folder, "committing"):
                     write_current(self._folder, Current(number, identity, named[-1], named[0], self._journal.last()))
+            remove_derived(self._folder)
             self.remove_unnamed()
 
     def commit_later(self, draft: Draft) -> None:

@@ -20,7 +20,7 @@ from store.exceptions import DamageError
 from store.frames import decompress_zstd
 from store.records import from_json
 
-__all__ = ["ArrayFiles", "file_digests", "most_bytes"]
+__all__ = ["LARGEST_DESCRIPTION", "ArrayFiles", "file_digests", "most_bytes"]
 
 LARGEST_DESCRIPTION = 2**16  # bytes of an array's zarr.json, which has a few hundred
 
@@ -60,16 +60,21 @@ class ArrayFiles:
         """Return the array, each file verified before it is decompressed; its own sha256 is the caller's to verify."""
         content = self._content
         plain = np.empty(content.plain_shape, content.plain)
-        most = prod(self._chunk) * plain.itemsize
-        most += most // 64 + 1024 + CHUNK_MORE
-        for i, (place, path) in enumerate(self._files()):
-            data = self._read(path, most)
-            if hashlib.sha256(data).hexdigest() != content.files[i]:
-                raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
+        for place, _, data in self.verified():
             self._fill(plain, place, data)
         array = content.from_plain(plain)
         require_values(array)
         return array
+
+    def verified(self) -> Iterator[tuple[tuple[int, ...], Path, bytes]]:
+        """Yield the place of each chunk, its file, and the bytes of that, which are those that were written."""
+        most = prod(self._chunk) * self._content.plain.itemsize
+        most += most // 64 + 1024 + CHUNK_MORE
+        for i, (place, path) in enumerate(self._files()):
+            data = self._read(path, most)
+            if hashlib.sha256(data).hexdigest() != self._content.files[i]:
+                raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
+            yield place, path, data
 
     def _region(self, place: tuple[int, ...]) -> tuple[Any, ...]:
         # With … it is a view also of an array without axes.

@@ -150,8 +150,8 @@ def array_digest(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return checked arrays as the bytes of a journal row's payload.
+def encode_payload(arrays: Mapping[str, np.ndarray], *, plain: bool = False) -> bytes:
+    """Return checked arrays as the bytes of a journal row's payload; plain: not compressed, to be read at once.
 
     Raises RecordError when they hold more than 256 MiB together.
     """
@@ -162,7 +162,7 @@ def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")
-    payload = _packed(arrays, _compressed)
+    payload = _packed(arrays, _plain if plain else _compressed)
     return payload if size <= SPARE + RATIO * len(payload) else _packed(arrays, _plain)
 
 

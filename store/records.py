@@ -6,12 +6,15 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
 from store.exceptions import RecordError
+
+if TYPE_CHECKING:
+    from store.late import LateArray
 
 __all__ = [
     "JSON",
@@ -65,12 +68,16 @@ class Record(Head):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Committed arrays: it contains the journal's rows up to and including sequence `upto`."""
+    """Committed arrays: it contains the journal's rows up to and including sequence `upto`.
+
+    late: those that are read when they are needed.
+    """
 
     number: int
     upto: int
     attributes: Mapping[str, JSON]
     arrays: Mapping[str, np.ndarray]
+    late: Mapping[str, LateArray] = field(default_factory=dict)
 
 
 def check_text(what: str, text: str) -> str:

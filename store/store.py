@@ -215,16 +215,41 @@ class Store:
         self._check_open()
         return self._journal.with_key(check_key(key))
 
-    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
+    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
         """Return the newest checkpoint that verifies, None when there is none.
 
         only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
-        over. With none it is the checkpoint's attributes, in well below a millisecond.
+        over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
+        the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
         A logged warning names the file and the array of each checkpoint that it passes over.
         Raises VersionError for a checkpoint of a newer format.
         """
         self._check_open()
-        return self._checkpoints.latest(only)
+        return self._checkpoints.latest(only, late)
+
+    def derived(self, name: str) -> Checkpoint | None:
+        """Return what `keep_derived` kept of the newest checkpoint, None where there is nothing of it.
+
+        Its number and `upto` are that checkpoint's. Wrong, damaged or of another checkpoint it counts as missing; a
+        digest that is right says nothing of who wrote it.
+        """
+        self._check_open()
+        return self._checkpoints.derived(name)
+
+    def keep_derived(
+        self,
+        name: str,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        upto: int,
+        attributes: Mapping[str, JSON] | None = None,
+    ) -> None:
+        """Keep under a name what follows from the newest checkpoint; nothing where that is not up to the same row.
+
+        It takes the place of what was kept before, is not made durable, and is not part of copies. Raises
+        StoreFullError, ReadOnlyError or another StoreError.
+        """
+        self._checkpoints.keep_derived(name, self._draft(arrays, upto, attributes))
 
     @property
     def newest(self) -> int | None:

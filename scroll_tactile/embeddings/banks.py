@@ -27,9 +27,11 @@ import numpy.typing as npt
 
 __all__ = [
     "LEVELS",
+    "MOST_CHANNELS",
     "PERIOD",
     "ROUND",
     "TAPS",
+    "THRESHOLDS",
     "Bank",
     "TriangleFeatures",
     "bank",
@@ -124,7 +126,7 @@ class Workspace(threading.local):
 workspace = Workspace()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bank:
     """The kernels of one dilation.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -78,6 +79,24 @@ class Kernels:
             raise InputError(f"seed must not be negative; came {seed}")
         self.seed = seed
         self.dimension = dimension
+        self._given: Mapping[tuple[int, int], Bank] | None = None
+        self._used: set[tuple[int, int]] = set()
+
+    def banks(self) -> dict[tuple[int, int], Bank]:
+        """The banks that were used or given, by channels and dilation."""
+        return {key: self._bank(*key) for key in sorted({*self._used.copy(), *(self._given or ())})}
+
+    def with_banks(self, banks: Mapping[tuple[int, int], Bank]) -> Kernels:
+        """The same embedding with some banks that need not be made: a fifth of a second before the first touch."""
+        other = copy.copy(self)
+        other._given, other._used = dict(banks), set()
+        other.__dict__.pop("fingerprint", None)  # it shows what these banks give
+        return other
+
+    def _bank(self, channels: int, dilation: int) -> Bank:
+        self._used.add((channels, dilation))
+        given = None if self._given is None else self._given.get((channels, dilation))
+        return bank(self.seed, channels, dilation) if given is None else given
 
     def __repr__(self) -> str:
         return f"Kernels(seed={self.seed}, dimension={self.dimension})"
@@ -144,11 +163,12 @@ class Kernels:
         }
         counts = tuple((dilation, max(of.values())) for dilation, of in uses.items())
         with one_thread():
-            banks = _banks(self.seed, channels, counts)
+            every = tuple(self._bank(channels, dilation) for dilation, _ in counts)
+            banks = _banks(every, tuple(count for _, count in counts))
             np.matmul(banks.channels, levels, out=workspace.array("sums", len(banks.channels), readings))
-            for (dilation, count), of, rows in zip(counts, uses.values(), banks.rows, strict=True):
+            for own, (dilation, count), of, rows in zip(every, counts, uses.values(), banks.rows, strict=True):
                 where = tuple((min(width, readings), windows[width]) for width in of)
-                found = _counts(bank(self.seed, channels, dilation), rows, readings, count, where)
+                found = _counts(own, rows, readings, count, where)
                 first = 0
                 for width, features in of.items():
                     last = first + len(windows[width])
@@ -207,11 +227,10 @@ class Banks:
 
 
 @lru_cache(maxsize=16)  # of at most 0.3 MB each
-def _banks(seed: int, channels: int, counts: tuple[tuple[int, int], ...]) -> Banks:
+def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> Banks:
     """Of each dilation's bank the rounds that so many features need."""
     parts, rows, last = [], [], 0
-    for dilation, count in counts:
-        part = bank(seed, channels, dilation)
+    for part, count in zip(banks, counts, strict=True):
         parts.append(part.channels[: -(-min(count, len(part)) // ROUND) * ROUND])
         first, last = last, last + len(parts[-1])
         rows.append(slice(first, last))

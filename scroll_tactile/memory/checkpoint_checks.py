@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.memory.expected import (
     MOST_COLUMNS,
     array,
+    check_values,
     codes,
     counts,
     expect,
@@ -30,6 +32,7 @@ __all__ = ["CheckpointChecks"]
 
 MOST_STAGES = 2**10  # and scales that judge at one
 MODES = ("head", "adapters", "network")
+NO_MOMENT = "a second moment of rows with these sums", "one that no rows have"
 JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
 IntArray = npt.NDArray[np.int64]
 
@@ -46,7 +49,8 @@ class CheckpointChecks:
     def check(self, arrays: Arrays, attributes: Mapping[str, Any], upto: int | None, *, thorough: bool) -> None:
         """Check all that a memory takes from a checkpoint.
 
-        upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some.
+        upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some; none is
+        read later then.
         """
         whole("dimension", attributes.get("dimension"), self._dimension, self._dimension)
         own, scales = list(map(int, self._plan.scales)), attributes.get("scales")
@@ -72,7 +76,7 @@ class CheckpointChecks:
             self._check_exemplars(arrays, attributes["exemplars"], rows, upto)
         for field in ("retracted", "excluded"):
             sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, upto or 2**63 - 1)
-            expect(len(np.unique(sequences)) == len(sequences), field, "different rows", sequences)
+            expect(len(set(sequences.tolist())) == len(sequences), field, "different rows", sequences)
         if upto is not None or "descriptions" in attributes:  # to a merge they are rows of their own
             _check_descriptions(attributes.get("descriptions"))
         if upto is not None or "tuned" in attributes:  # a merge leaves the tuned model where it is
@@ -86,7 +90,7 @@ class CheckpointChecks:
         lengths = array(arrays, "lengths", ("int64",), (None, 2))
         counts("lengths", lengths[:, 0], 1, MOST_COLUMNS)
         counts("lengths", lengths[:, 1], 1, MOST_ROWS)
-        expect(len(np.unique(lengths[:, 0])) == len(lengths), "lengths", "different lengths", lengths[:, 0])
+        expect(len(set(lengths[:, 0].tolist())) == len(lengths), "lengths", "different lengths", lengths[:, 0])
         total = int(lengths[:, 1].sum())
         expect(total == sum(touches), "lengths", f"{sum(touches)} touches, those of observations", total)
         return touches
@@ -101,30 +105,35 @@ class CheckpointChecks:
         codes(field, sums, rows[:, None])
         field = f"second-{scale}"
         if total:
-            size, most = self._dimension * (self._dimension + 1) // 2, total << 2 * BITS
-            packed = counts(field, array(arrays, field, ("int64",), (size,)), -most, most)
-            self._check_moment(field, packed, rows, sums, thorough)
+            packed = array(arrays, field, ("int64",), (self._dimension * (self._dimension + 1) // 2,))
+            known = rows > 0
+            between = (sums[known].astype(np.float64) ** 2 / rows[known, None]).sum(axis=0)
+            check_values(packed, partial(self._check_moment, field, total, between))
+            if thorough and known.any():
+                self._check_scatter(field, packed, rows[known], sums[known])
         return rows
 
-    def _check_moment(self, field: str, packed: IntArray, rows: IntArray, sums: IntArray, thorough: bool) -> None:
-        """Raise Unexpected where a variance within the materials is negative; thorough: where any is, in any direction.
+    def _check_moment(self, field: str, total: int, between: npt.NDArray[np.float64], packed: IntArray) -> None:
+        """Raise Unexpected where a variance within the materials is negative: a readout of it has no answer.
 
-        A readout of such a moment has no answer.
+        total: the rows. between: the sum over materials of the squares of their sums over their rows, (d,).
         """
-        known = rows > 0
+        most = total << 2 * BITS
+        counts(field, packed, -most, most)
         places = np.cumsum(np.arange(1, self._dimension + 1)) - 1  # of the diagonal
         diagonal = packed[places].astype(np.float64)
-        between = (sums[known].astype(np.float64) ** 2 / rows[known, None]).sum(axis=0)
         sound = bool((diagonal + 1e-9 * diagonal.max(initial=0) + 1 >= between).all())
-        if sound and thorough and known.any():
-            scatter = within_scatter(packed, rows[known], sums[known])
-            scatter[np.diag_indices(self._dimension)] += JITTER * float(np.trace(scatter)) / self._dimension + 1
-            try:
-                with one_thread():
-                    np.linalg.cholesky(scatter)
-            except np.linalg.LinAlgError:
-                sound = False
-        expect(sound, field, "a second moment of rows with these sums", "one that no rows have")
+        expect(sound, field, *NO_MOMENT)
+
+    def _check_scatter(self, field: str, packed: IntArray, rows: IntArray, sums: IntArray) -> None:
+        """Raise Unexpected where a variance within the materials, which all have rows, is negative in any direction."""
+        scatter = within_scatter(packed, rows, sums)
+        scatter[np.diag_indices(self._dimension)] += JITTER * float(np.trace(scatter)) / self._dimension + 1
+        try:
+            with one_thread():
+                np.linalg.cholesky(scatter)
+        except np.linalg.LinAlgError:
+            expect(False, field, *NO_MOMENT)
 
     def _check_sample(self, arrays: Arrays, materials: list[str]) -> None:
         keys(arrays, "sample-keys", materials)
@@ -137,7 +146,7 @@ class CheckpointChecks:
         order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
         expect(bool((order > 0).all()), "sample-pairs", "stages and scales in order", pairs)
         rows = array(arrays, "sample-rows", ("int32",), (len(pairs), self._dimension if len(pairs) else None))
-        codes("sample-rows", rows)
+        check_values(rows, partial(codes, "sample-rows"))
 
     def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:
         keys(arrays, "kept-keys", materials)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from reprlib import repr as shortened
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,12 +12,14 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.settings import require_name, require_source
 from scroll_tactile.statistics.grid import BITS
+from store.late import LateArray
 
 __all__ = [
     "KEY_BYTES",
     "MOST_COLUMNS",
     "Unexpected",
     "array",
+    "check_values",
     "codes",
     "counts",
     "expect",
@@ -65,16 +67,13 @@ def _text(field: str, value: Any, rule: Callable[[str], str]) -> str:
 
 
 def array(
-    arrays: Mapping[str, npt.NDArray[Any]],
-    field: str,
-    kinds: Collection[str],
-    shape: tuple[int | None, ...],
+    arrays: Mapping[str, Any], field: str, kinds: Collection[str], shape: tuple[int | None, ...]
 ) -> npt.NDArray[Any]:
     """The array of that name; Unexpected where there is none, or it is of another type or shape.
 
     kinds: dtypes as NumPy writes them, such as "int64". shape: None for an axis of any length.
     """
-    found = arrays.get(field)
+    found: Any = arrays.get(field)
     expected = f"{' or '.join(kinds)} of shape {shape}".replace("None", "any")
     if found is None:
         raise Unexpected(f"{field}: expected {expected}; there is none")
@@ -82,7 +81,15 @@ def array(
         own in (None, axis) for own, axis in zip(shape, found.shape, strict=True)
     )
     expect(found.dtype.name in kinds and fits, field, expected, f"{found.dtype} {found.shape}")
-    return found
+    return cast("npt.NDArray[Any]", found)
+
+
+def check_values(values: npt.NDArray[Any] | LateArray, check: Callable[[npt.NDArray[Any]], None]) -> None:
+    """Check values; those that are read later, then."""
+    if isinstance(values, LateArray):
+        values.check = check
+    else:
+        check(values)
 
 
 def codes(field: str, values: npt.NDArray[Any], most: int | npt.NDArray[np.int64] = 1) -> None:

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
+
+import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.embeddings.registry import require_configuration
@@ -31,7 +34,7 @@ from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
 from store.files import file_size
 from store.layout import log_numbers, log_path
 
-__all__ = ["Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
+__all__ = ["WRONG", "Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
 
 SMALLEST_ROW = 128  # bytes of the log: a frame and a row without texts
 # What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
@@ -45,7 +48,7 @@ class Gate:
     """
 
     def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
-        self._path, self._thorough = path, thorough
+        self._path, self.thorough = path, thorough
         copies = identity.augmentation.copies if identity.augmentation else 0
         made_with = identity.sensor, identity.embedding.dimension, plan
         self._rows = RowChecks(*made_with, copies)
@@ -64,15 +67,24 @@ class Gate:
             if record.kind == OBSERVE:
                 self._rows.check_observed(record)
             elif record.kind == MERGE:
-                self._checkpoints.check(record.arrays, record.attributes, None, thorough=self._thorough)
+                self._checkpoints.check(record.arrays, record.attributes, None, thorough=self.thorough)
         return record
 
     def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
         """This checkpoint. Raises DamageError."""
         with self._refusing(f"checkpoint {checkpoint.number}"):
             arrays, attributes, upto = checkpoint.arrays, checkpoint.attributes, checkpoint.upto
-            self._checkpoints.check(arrays, attributes, upto, thorough=self._thorough)
+            every: dict[str, Any] = {**arrays, **checkpoint.late}
+            self._checkpoints.check(every, attributes, upto, thorough=self.thorough)
+        for late in checkpoint.late.values():
+            late.check = partial(self._late, f"checkpoint {checkpoint.number}", late.check)
         return checkpoint
+
+    def _late(self, what: str, check: Callable[[npt.NDArray[Any]], None] | None, values: npt.NDArray[Any]) -> None:
+        """Check an array of a checkpoint that was read later than the others."""
+        with self._refusing(what):
+            if check is not None:
+                check(values)
 
     @contextmanager
     def _refusing(self, what: str, sequence: int | None = None) -> Iterator[None]:
@@ -139,11 +151,11 @@ class MemoryStore(Store):
         """As `Store.records`."""
         return map(self.gate.record, super().records(after))
 
-    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
+    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
         """As `Store.latest`; what has not all of its arrays is not looked at."""
         if only is not None:
-            return super().latest(only=only)
-        newest = super().latest()
+            return super().latest(only=only, late=late)
+        newest = super().latest(late=() if self.gate.thorough else late)
         return None if newest is None else self.gate.checkpoint(newest)
 
     def base(self) -> Checkpoint | None:

@@ -39,7 +39,12 @@ class Keeping:
 
     def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
         """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most twice the usual length."""
-        return levels_of(readings[: max(2, round(LONGEST * self.sensor.readings))], self.sensor)
+        return levels_of(readings[: self.most_columns], self.sensor)
+
+    @property
+    def most_columns(self) -> int:
+        """T' at most."""
+        return max(2, round(LONGEST * self.sensor.readings))
 
 
 class KeptTouches(Sample[LevelArray]):

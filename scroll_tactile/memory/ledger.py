@@ -11,9 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import FineTuneError, InputError
+from scroll_tactile.errors import FineTuneError, InputError, ScrollTactileError
 from scroll_tactile.memory.buffer import candidates_of, ranked_exemplars
 from scroll_tactile.memory.changes import apply_appended, relabel
 from scroll_tactile.memory.contents import Contents, StoredContents
@@ -40,11 +41,24 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
-from store import CompactedError, DamageError, Head, ReadOnlyError, Record, Store, StoreClosedError, StoreError
+from store import (
+    Checkpoint,
+    CompactedError,
+    DamageError,
+    Head,
+    ReadOnlyError,
+    Record,
+    Store,
+    StoreClosedError,
+    StoreError,
+)
 
 __all__ = ["Ledger"]
 
 logger = logging.getLogger(__name__)
+
+Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
+"""Arrays and attributes."""
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
 SNAPSHOT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
@@ -515,8 +529,19 @@ class Ledger:
             self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
             self.store.commit(arrays, upto=self._saved, attributes=attributes)
 
-    def close(self) -> None:
-        """As `TactileLearner.close`."""
+    def derived(self, name: str) -> Checkpoint | None:
+        """What was kept under a name of the checkpoint that the memory was loaded from; None where there is nothing."""
+        if self.store is None or self._closed:
+            return None
+        found = self.store.derived(name)
+        return found if found is not None and found.number == self.memory.checkpoint else None
+
+    def saved_since(self, memory: Memory) -> bool:
+        """Whether the store has another newest checkpoint than the one that the memory was loaded from."""
+        return self.store is not None and self.store.newest != memory.checkpoint
+
+    def close(self, name: str, derived: Callable[[], Derived | None]) -> None:
+        """As `TactileLearner.close`. derived: makes what is kept under a name beside the checkpoint."""
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -528,9 +553,19 @@ class Ledger:
                 if store.mode == "write" and self.saves and self._whole and self._memory.sequence > self._saved:
                     self._pass_over_failures(store)
                     self._snapshot()
+                if store.mode == "write" and self.saves and self._whole:
+                    self._keep(store, name, derived)
             finally:
                 store.close()
                 give_back_scratch()
+
+    def _keep(self, store: Store, name: str, derived: Callable[[], Derived | None]) -> None:
+        """Keep what follows from the memory; where that fails it will be made again."""
+        try:
+            if (made := derived()) is not None:
+                store.keep_derived(name, made[0], upto=self._memory.sequence, attributes=made[1])
+        except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
+            logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)
 
 
 def _nothing() -> None:

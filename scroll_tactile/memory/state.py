@@ -6,8 +6,9 @@ import ctypes
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import takewhile
 from typing import Any, Protocol, cast
 
@@ -41,11 +42,13 @@ from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import Checkpoint, CompactedError, DamageError, Head, Record, Store
+from store.late import LateArray
 
 __all__ = ["Memory", "apply_description", "give_back_scratch"]
 
 logger = logging.getLogger(__name__)
 
+LATE_ROWS, LATE_SECOND = "sample-rows", "second-"  # arrays, most of a checkpoint, that no prediction reads
 ATTEMPTS = 20  # of a reader, while a writer changes the store
 
 
@@ -97,7 +100,7 @@ class Memory:
         self.capacity = exemplars
         self.encode = encode
         self.statistics = Statistics(dimension, plan.scales)
-        self.sample = TouchSample()
+        self._sample: TouchSample | Callable[[], TouchSample] = TouchSample()
         self.kept = KeptTouches(keeping) if keeping is not None and keeping.capacity else None
         self.exemplars = ExemplarSample(exemplars) if exemplars else None
         self.tuned: Tuned | None = None
@@ -111,6 +114,17 @@ class Memory:
         self.retractions = 0
         self.descriptions: dict[str, Description] = {}
         self._stale = False
+
+    @property
+    def sample(self) -> TouchSample:
+        """The touches that readouts are calibrated on. Raises DamageError where they are read only now."""
+        if not isinstance(self._sample, TouchSample):
+            self._sample = self._sample()
+        return self._sample
+
+    @sample.setter
+    def sample(self, sample: TouchSample) -> None:
+        self._sample = sample
 
     def add(
         self,
@@ -452,10 +466,10 @@ class Memory:
     def _loaded(self, store: Store) -> Memory:
         self.base = store.compacted
         # Without a sound checkpoint the base raises what is lost; without a base the journal has every row.
-        newest = store.latest()
+        newest = store.latest(late=[LATE_ROWS, *(f"{LATE_SECOND}{scale}" for scale in self.plan.scales)])
         start = store.base() if newest is None else newest
         if start is not None:
-            self._take(start.arrays, start.attributes, 0)
+            self._take(start.arrays, start.attributes, 0, start.late)
             self.sequence = start.upto
         self.checkpoint = None if newest is None else newest.number
         self.saved = self.sequence
@@ -484,10 +498,18 @@ class Memory:
         self.sequence = sequence
         return self
 
-    def _take(self, arrays: Arrays, attributes: Any, source: int | None) -> None:
-        names, scales = attributes["materials"], self.plan.scales
-        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        self.sample = TouchSample.from_arrays(arrays, attributes["sample"], attributes["copies"])
+    def _take(
+        self, arrays: Arrays, attributes: Any, source: int | None, late: Mapping[str, LateArray] | None = None
+    ) -> None:
+        """Take what `to_arrays` gave. late: arrays that predictions do not need, to be read when something does."""
+        names, scales, reads = attributes["materials"], self.plan.scales, dict(late or {})
+        seconds = {name: each.read for name, each in reads.items()}
+        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names, seconds)
+        if LATE_ROWS in reads:
+            small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
+            self._sample = partial(_sample_of, reads[LATE_ROWS], small, attributes["sample"], attributes["copies"])
+        else:
+            self.sample = TouchSample.from_arrays(arrays, attributes["sample"], attributes["copies"])
         if self.kept is not None:
             self.kept.fill(arrays, attributes["kept"])
         if self.exemplars is not None and "exemplars" in attributes:
@@ -505,6 +527,10 @@ class Memory:
             tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
             if self.tuned is None or self.tuned.digest() != tuned.digest():
                 self.tuned = tuned
+
+
+def _sample_of(rows: LateArray, arrays: Arrays, materials: Sequence[str], copies: Sequence[int]) -> TouchSample:
+    return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, materials, copies)
 
 
 def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:

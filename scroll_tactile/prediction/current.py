@@ -5,26 +5,38 @@ many touches; before that many have come a thread solves them again, from the in
 shrinkage and the table, follows when the memory has grown by three sixteenths: a sixteenth before, another thread
 begins to fit it. No call waits for that one, but in the smallest of memories, where each touch counts: touches that
 come faster than it fits have an earlier calibration a little longer.
+
+A writer keeps the model beside its last checkpoint, and who opens the memory then reads it. It cannot follow (see
+`prediction.stored`): when touches come or go its readouts are solved again.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 from weakref import ReferenceType, ref
 
+import numpy.typing as npt
+
 from scroll_tactile.errors import InputError
+from scroll_tactile.memory.gate import WRONG
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
 from scroll_tactile.settings import Settings
+from store import StoreError
+
+logger = logging.getLogger(__name__)
 
 __all__ = ["CurrentModel", "FrozenModel"]
 
@@ -58,10 +70,12 @@ class CurrentModel:
     """The model of one memory. Whoever calls holds the ledger's lock."""
 
     def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
-        self._kind, self._extractor = settings.readout, extractor
+        self._kind, self._extractor, self._reading = settings.readout, extractor, extractor
         self._version = -1
         self._model: Model | None = None
-        self._exact = False  # whether the model was fitted to the memory as it is, and not followed
+        self._stored: Model | None = None  # the model as it was read
+        self._looked = False  # whether there is any
+        self._exact = False  # whether the model was fitted to the memory as it is, here, and not followed
         self._behind: list[Added] | None = []  # what came since the model; None where it cannot be followed
         self._fit: _Job | None = None
         self._renewal: _Job | None = None
@@ -86,7 +100,13 @@ class CurrentModel:
 
     def present(self, ledger: Ledger) -> Model:
         """The model that predictions are made with."""
+        present = self._present(ledger)
+        self.prepare(ledger)
+        return present
+
+    def _present(self, ledger: Ledger) -> Model:
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
+        self._look(ledger)
         self.take_in(ledger)
         # Until the model is whole again: following that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
@@ -101,8 +121,54 @@ class CurrentModel:
                 model = None
         present = self._next(memory, before) if model is None else model
         self._model, self._behind = present, []
-        self.prepare(ledger)
         return present
+
+    def reading(self, ledger: Ledger) -> FeatureExtractor:
+        """The extractor that reads the touches that predictions are asked for: it may have its banks from the disk."""
+        self._look(ledger)
+        self.take_in(ledger)
+        return self._reading
+
+    def disbelieve(self) -> None:
+        """Let go what was read: its banks give other features than the memory was made with."""
+        self._reading, self._model, self._stored = self._extractor, None, None
+        self._fit = self._renewal = None
+
+    def _look(self, ledger: Ledger) -> None:
+        """Begin with the model that was kept of the memory, where there is one."""
+        if self._looked or self._model is not None:
+            return
+        self._looked, memory = True, ledger.memory
+        if ledger.added is None:
+            return
+        try:
+            if (kept := ledger.derived(NAME)) is None:
+                return
+            embedding = with_banks(self._extractor.embedding, kept.arrays)
+            self._model = self._stored = model_from(kept, memory, self._kind)
+            if embedding is not self._extractor.embedding:
+                self._reading = self._extractor.with_embedding(embedding)
+        except (StoreError, *WRONG) as error:
+            logger.info("the model that was kept is not used: %s", error)
+        else:
+            self._behind = [] if kept.upto == memory.sequence else None
+        give_back_scratch()
+
+    def kept(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
+        """What `prediction.stored` writes of the model that would answer now; None where nobody asked for one.
+
+        None, too, where one was read and nothing has changed since, and of a small memory that has no present one.
+        """
+        memory, model = ledger.memory, self._model
+        self.close()  # what the threads make is there then
+        self.take_in(ledger)
+        if model is None or (model is self._stored and self._behind == [] and not ledger.saved_since(memory)):
+            return None
+        if self._behind != [] and model.fitted_to <= FEW:
+            return None
+        if (made := model_to_arrays(self._present(ledger))) is None:
+            return None
+        return made[0] | banks_to_arrays(self._reading.embedding), made[1]
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin to make the next model where enough has come since the last. Raises nothing: an observation is kept."""
@@ -114,7 +180,7 @@ class CurrentModel:
         # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
         with suppress(MemoryError, InputError, RuntimeError):
             if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
-                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._extractor))
+                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._reading))
             if self._renewal is None and self._behind and model.crowded(self._behind) and _has_all_of(memory, model):
                 self._renewal = _Job(self._worker("renewal").submit(Renewal.of(model, memory).solve))
 
@@ -129,6 +195,7 @@ class CurrentModel:
         self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
             self._model, self._fit, self._renewal = None, None, None
+            self._reading = self._extractor  # nothing of it rests on what was read
             self._model, self._behind = self._fitted(memory), []
         return self._model
 
@@ -195,12 +262,14 @@ class CurrentModel:
         return model if model.follow(memory, []) else self._fitted(memory)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit(self._extractor)
+        model = Draft.of(memory, self._kind).fit(self._reading)
         self._exact = True
         return model
 
     def composer(self, ledger: Ledger, model: Model) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""
+        if model.fusion is not None and not model.apart:  # it was read, and heads rest on touches held out
+            model = self.settle(ledger)
         state = model, ledger.version, ledger.described
         if self._composer is None or self._composer[:3] != state:
             self._composer = *state, Composer.of(model, ledger.memory)

@@ -107,6 +107,15 @@ class FeatureExtractor:
         """Whose touches it reads."""
         return self._sensor
 
+    @property
+    def embedding(self) -> Embedding:
+        """What makes the features."""
+        return self._embedding
+
+    def with_embedding(self, embedding: Embedding) -> FeatureExtractor:
+        """The same with an embedding that gives the same features."""
+        return FeatureExtractor(self._sensor, embedding, self._plan, self._augmentation)
+
     def stream(self, readings: Readings) -> Stream:
         """The sound stream of some readings; of a camera's, the frames in contact.
 

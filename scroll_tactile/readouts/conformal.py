@@ -18,10 +18,10 @@ are whole numbers, and sums of their squares are exact: any order gives the same
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -61,15 +61,48 @@ class Conformal:
     """
 
     def __init__(self, touches: Sequence[Kept]) -> None:
-        self._channels = len(touches[0].levels)
-        self._longest = max(touch.levels.shape[1] for touch in touches)
-        blocks = max(1, min(BLOCKS, MOST_VALUES // self._channels))
-        self._edges = np.unique(np.rint(self._longest * (np.arange(blocks + 1) / blocks) ** EARLIER).astype(np.intp))
-        self._touches: list[tuple[str, bytes]] = []
-        self._steps = np.empty((0, self._channels * (len(self._edges) - 1)), np.uint8)
-        self._lengths = np.empty(0, np.intp)
-        self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
+        longest = max(touch.levels.shape[1] for touch in touches)
+        self._set_up(len(touches[0].levels), longest, [], np.empty(0, np.intp))
         self.follow(touches, set())
+
+    def _set_up(
+        self, channels: int, longest: int, touches: list[tuple[str, bytes]], lengths: npt.NDArray[np.intp]
+    ) -> None:
+        self._channels, self._longest, self._touches, self._lengths = channels, longest, touches, lengths
+        self._edges = _edges(longest, channels)
+        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.uint8)
+        self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """What is made of the kept touches in the order of `touches`, and of complete ones of them.
+
+        steps: (n, blocks · C). own, other: d of each from the others, by all blocks, (n,).
+        """
+        own, other = self._near_by(len(self._edges) - 1)
+        return {"steps": self._steps, "own": own, "other": other}
+
+    @classmethod
+    def from_arrays(cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int) -> Conformal:
+        """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
+        conformal = cls.__new__(cls)
+        lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
+        own = [(touch.material, touch.key) for touch in touches]
+        conformal._set_up(len(touches[0].levels), longest, own, lengths)
+        conformal._steps = arrays["steps"]
+        conformal._near = {len(conformal._edges) - 1: (arrays["own"], arrays["other"])}
+        conformal._named()
+        return conformal
+
+    @staticmethod
+    def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Name → dtype and shape of what `to_arrays` gives of so many touches."""
+        steps = channels * (len(_edges(longest, channels)) - 1)
+        return {"steps": ("uint8", (count, steps)), "own": ("float64", (count,)), "other": ("float64", (count,))}
+
+    @property
+    def touches(self) -> list[tuple[str, bytes]]:
+        """What is kept, by material and key, in its order."""
+        return self._touches
 
     def follow(self, added: Sequence[Kept], removed: AbstractSet[tuple[str, bytes]]) -> None:
         """Take in touches no longer than the longest that were kept, and let others go, by material and key."""
@@ -85,11 +118,14 @@ class Conformal:
         ]
         self._steps = np.concatenate([self._steps, *steps])
         self._lengths = np.append(self._lengths, [touch.levels.shape[1] for touch in added]).astype(np.intp)
+        self._named()
+        for reach in list(self._near):
+            self._near[reach] = self._nearer(reach, *self._near[reach], first)
+
+    def _named(self) -> None:
         self._materials = sorted({material for material, _ in self._touches})
         place = {material: i for i, material in enumerate(self._materials)}
         self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
-        for reach in list(self._near):
-            self._near[reach] = self._nearer(reach, *self._near[reach], first)
 
     def copy(self) -> Conformal:
         """Another of the same touches: what comes to it does not come to this one."""
@@ -121,10 +157,7 @@ class Conformal:
         reach = int(np.searchsorted(self._edges[1:], levels.shape[1], side="right"))
         if not reach:
             return np.empty(0, np.intp), np.empty(0), np.zeros(len(self._materials))
-        if reach not in self._near:
-            nothing = np.empty(0)
-            self._near[reach] = self._nearer(reach, nothing, nothing, 0)
-        own, other = self._near[reach]
+        own, other = self._near_by(reach)
         far = self._distances(self._steps_of([levels]), reach)[0]
         nearest = _least(far, self._places, len(self._materials))
         as_long = self._lengths >= self._edges[reach]
@@ -163,6 +196,13 @@ class Conformal:
         both = (seen @ known.T).astype(np.float64)
         return np.where(both > 0, far * (mine.shape[1] / np.maximum(both, 1)), np.inf)
 
+    def _near_by(self, reach: int) -> tuple[FloatArray, FloatArray]:
+        """d_own and d_other of all that are kept, by so many blocks."""
+        if reach not in self._near:
+            nothing = np.empty(0)
+            self._near[reach] = self._nearer(reach, nothing, nothing, 0)
+        return self._near[reach]
+
     def _nearer(self, reach: int, own: FloatArray, other: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
         """d_own and d_other of all that are kept, where those before the row `first` have them of each other."""
         owns, others = [own], [other]
@@ -179,6 +219,13 @@ class Conformal:
                 owns[0] = np.minimum(owns[0], with_same[:, :first].min(axis=0))
                 others[0] = np.minimum(others[0], with_other[:, :first].min(axis=0))
         return np.concatenate(owns), np.concatenate(others)
+
+
+def _edges(longest: int, channels: int) -> npt.NDArray[np.intp]:
+    """The edges of the blocks of touches of so many columns at most."""
+    blocks = max(1, min(BLOCKS, MOST_VALUES // channels))
+    edges = np.rint(longest * (np.arange(blocks + 1) / blocks) ** EARLIER).astype(np.intp)
+    return np.array(sorted(set(edges.tolist())), dtype=np.intp)
 
 
 def _least(far: FloatArray, places: npt.NDArray[np.intp], count: int) -> FloatArray:

@@ -109,6 +109,13 @@ class Likelihood:
         self._tables: OrderedDict[Noise, Table] = OrderedDict()
         self._lock = threading.Lock()  # of the order of the tables; never held while one is made
 
+    @classmethod
+    def of(cls, spread: FloatArray, weights: FloatArray) -> Likelihood:
+        """The tables of a spread and of weights as another one has them, to the bit."""
+        likelihood = cls(spread, weights)
+        likelihood.weights = weights
+        return likelihood
+
     def table(self, noise: Noise) -> Table:
         """The table of a kind of noise; the latest are kept."""
         with self._lock:

@@ -25,7 +25,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -145,6 +145,40 @@ class Readout:
         with one_thread():
             self.system = System(matrix)
             self._hold(places, means)
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """What the answers for the materials that are held rest on: all but the names and K.
+
+        reference: places, (R,). held: places in the order of what is held, (H,). rows: their means about the origin,
+        and K⁻¹ times these, (H, 2, d). sizes: (H,). origin, precision: (d,). counts: (C,). shape: share and penalty.
+        """
+        return {
+            "reference": self.reference,
+            "held": np.array(sorted(self._held, key=self._held.__getitem__), dtype=np.int64),
+            "rows": self._room[: len(self._held)],
+            "sizes": self._sizes,
+            "origin": self.origin,
+            "precision": self.precision,
+            "counts": self.counts,
+            "shape": np.array([self.share, self.penalty]),
+        }
+
+    @classmethod
+    def from_arrays(
+        cls, scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]], statistics: Statistics
+    ) -> Readout:
+        """The readout of which `to_arrays` gave the arrays, which are taken over; it can follow nothing."""
+        readout = cls.__new__(cls)
+        readout.scale, readout.names, readout.statistics = scale, list(names), statistics
+        readout.places = {name: place for place, name in enumerate(names)}
+        readout.reference, readout.origin, readout.counts = arrays["reference"], arrays["origin"], arrays["counts"]
+        readout.share, readout.penalty = arrays["shape"].tolist()
+        readout.precision, readout._sizes, readout._room = arrays["precision"], arrays["sizes"], arrays["rows"]
+        readout._held = {place: row for row, place in enumerate(arrays["held"].tolist())}
+        readout._means, readout._solved = readout._room[:, 0], readout._room[:, 1]
+        readout._derived = readout._coarse = readout._compared = None
+        readout.system = System.unkept(len(readout.origin))
+        return readout
 
     @property
     def gamma(self) -> float:

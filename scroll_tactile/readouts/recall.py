@@ -16,8 +16,9 @@ All is a function of the set of kept touches, in any order.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -159,14 +160,43 @@ class Recall:
         self.measured = measured
         self.channels = len(kept[0].levels)
         self.longest = max(touch.levels.shape[1] for touch in kept)
-        blocks = max(1, min(self.longest, BLOCK_VALUES // self.channels))
-        self._edges = np.linspace(0, self.longest, blocks + 1).astype(np.intp)
+        self._edges = _edges(self.longest, self.channels)
         self._touches: list[tuple[str, bytes]] = []
         self._levels: list[LevelArray] = []  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
         self._held = self._room(len(kept))
         for touch in kept:
             self._add(touch)
         self._named()
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """What is made of each kept touch, row by row in the order of `touches`; see `_Room`."""
+        return {name: getattr(self._held, name)[: len(self)] for name in PARTS}
+
+    @classmethod
+    def from_arrays(
+        cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int, measured: Measured
+    ) -> Recall:
+        """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
+        recall = cls.__new__(cls)
+        recall.measured, recall.channels, recall.longest = measured, len(touches[0].levels), longest
+        recall._edges = _edges(longest, recall.channels)
+        recall._touches = [(touch.material, touch.key) for touch in touches]
+        recall._levels = [touch.levels for touch in touches]
+        recall._held = _Room(**{name: arrays[name] for name in PARTS})
+        recall._named()
+        return recall
+
+    @staticmethod
+    def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Name → dtype and shape of what `to_arrays` gives of so many touches."""
+        edges = _edges(longest, channels)
+        room = _Room.of(count, channels, len(edges) - 1, len(edges[::COARSER]) - 1)
+        return {name: (getattr(room, name).dtype.name, getattr(room, name).shape) for name in PARTS}
+
+    @property
+    def touches(self) -> list[tuple[str, bytes]]:
+        """What is kept, by material and key, in its order."""
+        return self._touches
 
     @property
     def held(self) -> set[tuple[str, bytes]]:
@@ -323,7 +353,7 @@ class Recall:
             return self._rows(rows, asked.levels.shape[1])
         columns = asked.levels.shape[1]
         brought = np.empty((len(rows), self.channels, columns), np.uint8)
-        for length in np.unique(self._columns[rows]).tolist():  # touches of one length are brought to another alike
+        for length in _distinct(self._columns[rows]).tolist():  # touches of one length are brought to another alike
             same = np.flatnonzero(self._columns[rows] == length)
             places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
             first = places.astype(np.intp)
@@ -390,7 +420,7 @@ class Recall:
         return _Pairs(places, np.count_nonzero(seen) / np.maximum(both, 1))
 
     def _roughly(self, asked: _Asked, left_out: int | None) -> Noise:
-        beside = self._beside(np.unique(self._shortlist(ROUGH, asked, FIRST, left_out)), asked)
+        beside = self._beside(_distinct(self._shortlist(ROUGH, asked, FIRST, left_out)), asked)
         values = np.flatnonzero(asked.seen)
         values = values[:: max(1, len(values) // FIRST_VALUES)]
         if not len(values) or not len(beside):
@@ -462,6 +492,17 @@ class Recall:
                 pairs = self._pairs(blends, asked)
                 best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
         return best
+
+
+def _edges(longest: int, channels: int) -> Rows:
+    """The edges of the blocks of touches of so many columns at most."""
+    blocks = max(1, min(longest, BLOCK_VALUES // channels))
+    return np.linspace(0, longest, blocks + 1).astype(np.intp)
+
+
+def _distinct(numbers: Rows) -> Rows:
+    """Whole numbers from 0 on, each once, ascending; numpy's own imports a fiftieth of a second of masked arrays."""
+    return np.flatnonzero(np.bincount(numbers.ravel()))
 
 
 def _unchanging(levels: LevelArray) -> npt.NDArray[np.bool_]:

@@ -67,6 +67,13 @@ class System:
         self._largest = 1.0  # entry of what E is the inverse of
         self.rank = 0
 
+    @classmethod
+    def unkept(cls, dimension: int) -> System:
+        """A system whose K was not kept: it takes nothing in, and solves nothing."""
+        system = cls(np.empty((0, 0)))
+        system._most, system._white = 0, np.empty((0, dimension))
+        return system
+
     @property
     def sound(self) -> bool:
         """Whether what came does not outweigh what K was made of."""

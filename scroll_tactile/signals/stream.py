@@ -219,6 +219,8 @@ def _missing(array: _Array, sensor: Sensor) -> npt.NDArray[np.bool_] | None:
 
 def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:
     """`readings` as an array, sharing memory where it can; `what` names them in messages."""
+    if type(readings) is np.ndarray:  # first: to ask for numpy.ma is to import it, a fiftieth of a second
+        return readings
     if isinstance(readings, np.ma.MaskedArray):
         # numpy would show the values under the mask as if they were readings.
         masked = np.ma.is_masked(readings)

@@ -53,6 +53,7 @@ class SecondMoment:
         self.dimension = dimension
         self.rows = 0
         self._packed: IntArray | None = None
+        self._late: Callable[[], IntArray] | None = None
         self._waiting: npt.NDArray[np.int32] | None = None
         self._count = 0
 
@@ -83,6 +84,8 @@ class SecondMoment:
         self._packed, self.rows = packed, self.rows - len(codes)
 
     def _flush(self) -> None:
+        if self._late is not None:
+            self._packed, self._late = self._late(), None
         packed = self._packed
         if packed is None:
             packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
@@ -100,23 +103,30 @@ class SecondMoment:
 
     def undo(self) -> Callable[[], None]:
         """What takes the next `add` back, however much of it was done; it can be called again."""
-        state = self._packed, self._waiting, self._count, self.rows
+        state = self._packed, self._late, self._waiting, self._count, self.rows
 
         def undo() -> None:
-            self._packed, self._waiting, self._count, self.rows = state
+            self._packed, self._late, self._waiting, self._count, self.rows = state
 
         return undo
 
     @property
     def empty(self) -> bool:
         """Whether no row was ever added; then `packed` would only make zeros."""
-        return self._packed is None and not self._count
+        return self._packed is None and self._late is None and not self._count
 
     @classmethod
-    def of(cls, packed: IntArray, rows: int, dimension: int) -> SecondMoment:
-        """A second moment of a given lower triangle, which it takes over, and number of rows."""
+    def of(cls, packed: IntArray | Callable[[], IntArray], rows: int, dimension: int) -> SecondMoment:
+        """A second moment of a given lower triangle, which it takes over, and number of rows.
+
+        packed: or what reads the triangle, called when it is needed, and again where that failed.
+        """
         moment = cls(dimension)
-        moment._packed, moment.rows = packed, rows
+        moment.rows = rows
+        if callable(packed):
+            moment._late = packed
+        else:
+            moment._packed = packed
         return moment
 
 

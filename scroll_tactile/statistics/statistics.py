@@ -275,8 +275,12 @@ class Statistics:
         scales: Sequence[Scale],
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
+        late: Mapping[str, Callable[[], IntArray]] | None = None,
     ) -> Statistics:
-        """The statistics that `to_arrays` described; the arrays are taken over."""
+        """The statistics that `to_arrays` described; the arrays are taken over.
+
+        late: what reads those second moments that are not among the arrays, when they are needed.
+        """
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
         statistics._observations = arrays["observations"]
@@ -284,7 +288,9 @@ class Statistics:
         for scale in statistics.scales:
             statistics._rows[scale], statistics._sums[scale] = arrays[f"rows-{scale}"], arrays[f"sums-{scale}"]
             if rows := int(statistics._rows[scale].sum()):
-                statistics._seconds[scale] = SecondMoment.of(arrays[f"second-{scale}"], rows, dimension)
+                field = f"second-{scale}"
+                packed = late[field] if late and field in late else arrays[field]
+                statistics._seconds[scale] = SecondMoment.of(packed, rows, dimension)
         return statistics
 
 

@@ -67,10 +67,9 @@ def opened(path, **settings_):
 
 def require_refused(path, match, expected=DamageError, others=None, **settings_):
     """Whoever reads it is told what is wrong, a merge of it changes nothing, and a check finds it."""
-    with pytest.raises(expected, match=match):
-        opened(path, mode="read", **settings_)
-    with pytest.raises(expected, match=match):
-        opened(path, **settings_)
+    for mode in ("read", "write"):
+        with pytest.raises(expected, match=match), opened(path, mode=mode, **settings_) as learner:
+            learner.settle()  # reads what opening does not
     if others is not None:
         target_path, before = others
         with opened(target_path) as target:

@@ -430,8 +430,8 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
     learner.fine_tune(epochs=1)
     latest, looks = Store.latest, []
 
-    def slow(store):
-        found = latest(store)
+    def slow(store, **asked):
+        found = latest(store, **asked)
         if store.mode == "read" and not looks:
             looks.append(1)  # between the reader's two looks the writer goes on
             learner.observe("a", stream((8, 60)))

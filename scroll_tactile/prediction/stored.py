@@ -1,0 +1,330 @@
+"""The fitted model as arrays, beside the checkpoint that it is of: whoever opens the memory next fits nothing.
+
+It holds what predictions read, with the banks of kernels, and not K, the sample or the held-out touches: a model that
+was read follows nothing, and is renewed where touches come or go (see `prediction.current`). The levels of kept touches
+are the memory's.
+
+A file may come from elsewhere. Each array has the type and shape that the memory and the file itself ask for, and
+numbers stay within bounds, so that no prediction fails or takes more memory for it; whether they are those that were
+fitted nobody can tell. Numbers of another release, readout or memory are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile import __version__
+from scroll_tactile.embeddings.banks import MOST_CHANNELS, ROUND, THRESHOLDS, Bank, bank_size
+from scroll_tactile.embeddings.kernels import Kernels
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
+from scroll_tactile.prediction.model import Model
+from scroll_tactile.readouts.calibration import Calibration
+from scroll_tactile.readouts.conformal import Conformal
+from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.likelihood import LEVELS, Likelihood
+from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.readouts.recall import Recall
+from scroll_tactile.readouts.recollection import Kept, Measured
+from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.moments import MOST_ROWS
+from store import Checkpoint
+
+__all__ = ["NAME", "banks_to_arrays", "model_from", "model_to_arrays", "with_banks"]
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+FloatArray = npt.NDArray[np.float64]
+
+NAME = "model"
+MADE_BY = f"{__version__}, 1"  # the release, and how it is written: the judge may differ in another
+MOST_BANKS = 64
+OF_MOMENT = ("columns", "stage", "model", "match", "alone", "odd", "odd_model", "familiar", "surprise", "spread")
+OF_CALIBRATION = ("weights", "scale_novelty", "usual", "novelties")
+
+
+def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
+    """Arrays and attributes of a model; None of one that nothing was fitted to, or that reads the memory."""
+    fusion = model.fusion
+    if fusion is None or model.reads_memory:
+        return None
+    places = {name: place for place, name in enumerate(model.names)}
+    rows = [*fusion.moments, *fusion.paced]
+    calibrations = [*model.calibrations, *(row.calibration for row in rows)]
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "moments": np.array([[getattr(row, name) for name in OF_MOMENT] for row in rows], dtype=np.float64),
+        "novelty-counts": np.array([len(each.novelties) for each in calibrations], dtype=np.int64),
+        "dependence": np.array([model.dependence.evidence, model.dependence.novelty]),
+        "chances": fusion.trajectories.chances,
+        "novelty": fusion.trajectories.novelty,
+        "targets": fusion.trajectories.targets.astype(np.int64),
+    }
+    arrays |= {name: np.concatenate([getattr(each, name) for each in calibrations]) for name in OF_CALIBRATION}
+    for scale, readout in model.readouts.items():
+        arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
+        arrays |= {f"{name}-{scale}": part for name, part in readout.to_arrays().items()}
+    if model.recall is not None and model.conformal is not None:
+        arrays |= _kept_to_arrays(model.recall, model.conformal, places)
+    attributes = {
+        "made_by": MADE_BY,
+        "readout": model.kind,
+        "names": model.names,
+        "scales": [int(scale) for scale in model.readouts],
+        "calibrations": len(model.calibrations),
+        "moments": len(fusion.moments),
+        "least": model.least,
+        "longest": model.longest,
+        "fitted_to": model.fitted_to,
+    }
+    return {name: np.ascontiguousarray(part) for name, part in arrays.items()}, attributes
+
+
+def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
+    """The banks that an embedding of kernels has used; nothing of another."""
+    if not isinstance(embedding, Kernels):
+        return {}
+    found = embedding.banks()
+    arrays = {"banks": np.array(list(found), dtype=np.int64).reshape(-1, 2)}
+    for i, each in enumerate(found.values()):
+        arrays |= {f"bank-{name}-{i}": getattr(each, name) for name in ("channels", "rows", "thresholds")}
+    return arrays
+
+
+def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
+    """An embedding that gives the same features and makes no banks, to predict with; Unexpected for what are none.
+
+    What is learned is never embedded with it: a forged bank misleads predictions, and no memory.
+    """
+    if not isinstance(embedding, Kernels) or "banks" not in arrays:
+        return embedding
+    kinds = counts("banks", array(arrays, "banks", ("int64",), (None, 2)), 1, 2**12).tolist()
+    expect(len(kinds) <= MOST_BANKS, "banks", f"{MOST_BANKS} or fewer", len(kinds))
+    banks = {}
+    for i, (channels, dilation) in enumerate(kinds):
+        size = bank_size(channels, dilation)
+        rounds = -(-size // ROUND) * ROUND
+        summed = array(arrays, f"bank-channels-{i}", ("float32",), (rounds, channels))
+        expect(bool(((summed == 0) | (summed == 1)).all()), f"bank-channels-{i}", "0 and 1", "others")
+        expect(bool((summed.sum(axis=1) <= MOST_CHANNELS).all()), f"bank-channels-{i}", "fewer channels", "others")
+        rows = counts(f"bank-rows-{i}", array(arrays, f"bank-rows-{i}", ("int64",), (size,)), 0, rounds - 1)
+        thresholds = array(arrays, f"bank-thresholds-{i}", ("float32",), (THRESHOLDS, size))
+        expect(bool(np.isfinite(thresholds).all()), f"bank-thresholds-{i}", "finite numbers", "others")
+        banks[channels, dilation] = Bank(dilation, summed, rows.astype(np.intp, copy=False), thresholds)
+    return embedding.with_banks(banks)
+
+
+def _kept_to_arrays(recall: Recall, conformal: Conformal, places: Mapping[str, int]) -> dict[str, npt.NDArray[Any]]:
+    measured, rows = recall.measured, {touch: row for row, touch in enumerate(recall.touches)}
+    return {
+        "kept-keys": np.array([list(key) for _, key in recall.touches], dtype=np.uint8),
+        "kept-materials": np.array([places[material] for material, _ in recall.touches], dtype=np.int64),
+        "kept-order": np.array([rows[touch] for touch in conformal.touches], dtype=np.int64),
+        "kept-longest": np.array([recall.longest], dtype=np.int64),
+        "measured": np.array([measured.coherence, measured.energy, measured.most]),
+        "spread": measured.likelihood.spread,
+        "read": measured.likelihood.weights,
+        **{f"recall-{name}": part for name, part in recall.to_arrays().items()},
+        **{f"conformal-{name}": part for name, part in conformal.to_arrays().items()},
+    }
+
+
+def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
+    """The model that was kept of a memory as it is or was at a checkpoint. Raises Unexpected for any other."""
+    about, arrays = kept.attributes, kept.arrays
+    for field, expected in (("made_by", MADE_BY), ("readout", kind)):
+        expect(about.get(field) == expected, field, expected, about.get(field))
+    names: Any = about.get("names")
+    # Rows behind the checkpoint may have brought materials and taken some: that the model is renewed for.
+    now = list(memory.statistics.materials)
+    same = kept.upto == memory.sequence
+    expect(isinstance(names, list) and bool(names), "names", "materials", names)
+    expect(all(isinstance(name, str) for name in names) and names == sorted(set(names)), "names", "in order", names)
+    expect(names == now if same else bool(set(names) & set(now)), "names", f"{now}", names)
+    reader = _Reader(arrays, about, memory, names, same)
+    readouts = reader.readouts()
+    stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
+    views = [view for view in memory.plan.views if view in readouts]
+    reached = whole("calibrations", about.get("calibrations"), 1, len(stages))
+    expect(all(scale in readouts for stage in stages[:reached] for scale in stage), "scales", "of stages", [*readouts])
+    recall, conformal = reader.kept() if "kept-keys" in arrays else (None, None)
+    expect(recall is None or bool(views), "kept-keys", "none without views", "some")
+    calibrations, fusion = reader.table(stages[:reached], views, recall)
+    dependence = reader.floats("dependence", (2,), 0.0, 1.0).tolist()
+    return Model(
+        kind=kind,
+        plan=memory.plan,
+        names=names,
+        stages=stages,
+        views=views,
+        readouts=readouts,
+        calibrations=calibrations,
+        apart={},
+        sample=[],
+        fusion=fusion,
+        dependence=Dependence(*dependence),
+        conformal=conformal,
+        least=whole("least", about.get("least"), 0, 2**53),
+        longest=whole("longest", about.get("longest"), 1, 2**53),
+        fitted_to=whole("fitted_to", about.get("fitted_to"), 1, MOST_ROWS),
+    )
+
+
+class _Reader:
+    """Reads the parts of a model from arrays, and raises Unexpected for what they cannot be.
+
+    same: whether the memory is as it was then.
+    """
+
+    def __init__(
+        self, arrays: Arrays, about: Mapping[str, Any], memory: Memory, names: Sequence[str], same: bool
+    ) -> None:
+        self._arrays, self._about, self._memory, self._names, self._same = arrays, about, memory, names, same
+
+    def floats(
+        self, field: str, shape: tuple[int | None, ...], least: float = -np.inf, most: float = np.inf
+    ) -> FloatArray:
+        """Numbers within bounds, the infinite ones only where a bound is."""
+        found = array(self._arrays, field, ("float64",), shape)
+        ends = np.isposinf(found) & (most == np.inf) & (least >= 0)
+        expect(bool((np.isfinite(found) | ends).all()), field, "finite numbers", "others")
+        expect(bool(((found >= least) & (found <= most)).all()), field, f"from {least} to {most}", "others")
+        return found
+
+    def _places(self, field: str, count: int, among: int) -> npt.NDArray[np.intp]:
+        """Different places, so many of them."""
+        found = counts(field, array(self._arrays, field, ("int64",), (count,)), 0, among - 1)
+        expect(len(set(found.tolist())) == count, field, "different places", found)
+        return found.astype(np.intp, copy=False)
+
+    def _length(self, field: str, most: int) -> int:
+        found = self._arrays.get(field)
+        length = -1 if found is None or found.ndim != 1 else len(found)
+        return whole(field, length, 1, most)
+
+    def readouts(self) -> dict[Scale, Readout]:
+        """The readout of each scale that touches have rows of."""
+        scales: Any = self._about.get("scales")
+        able = {int(scale): scale for scale in self._memory.plan.scales}
+        fits = isinstance(scales, list) and len(set(map(str, scales))) == len(scales)
+        expect(fits and all(type(scale) is int and scale in able for scale in scales), "scales", f"{able}", scales)
+        return {able[scale]: self._readout(able[scale]) for scale in sorted(scales)}
+
+    def _readout(self, scale: Scale) -> Readout:
+        dimension, statistics = self._memory.statistics.dimension, self._memory.statistics
+        count = self._length(f"names-{scale}", len(self._names))
+        names = [self._names[place] for place in self._places(f"names-{scale}", count, len(self._names))]
+        if self._same:
+            expect(sorted(names) == statistics.names(scale), f"names-{scale}", "the materials there", names)
+        references = self._length(f"reference-{scale}", count)
+        parts: dict[str, npt.NDArray[Any]] = {
+            "reference": self._places(f"reference-{scale}", references, count),
+            "held": self._places(f"held-{scale}", count, count),
+            "rows": self.floats(f"rows-{scale}", (count, 2, dimension)),
+            "sizes": self.floats(f"sizes-{scale}", (count,), -1e300, 1e300),
+            "origin": self.floats(f"origin-{scale}", (dimension,)),
+            "precision": self.floats(f"precision-{scale}", (dimension,), 0.0, 1e300),
+            "counts": self.floats(f"counts-{scale}", (count,), 1.0, MOST_ROWS),
+            "shape": self.floats(f"shape-{scale}", (2,), 0.0, 1e300),
+        }
+        expect(parts["shape"][0] < 1, f"shape-{scale}", "a share below 1", parts["shape"])
+        own = parts["held"][:references]
+        expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
+        return Readout.from_arrays(scale, names, parts, statistics)
+
+    def kept(self) -> tuple[Recall, Conformal]:
+        """What is made of the kept touches, of those that the memory has still."""
+        memory = self._memory.kept
+        if memory is None:
+            raise Unexpected("kept-keys: expected none; there are some")
+        levels, channels = {(touch.material, touch.key): touch.levels for touch in memory.touches()}, 0
+        count = self._length("kept-materials", memory.capacity)
+        keys = array(self._arrays, "kept-keys", ("uint8",), (count, KEY_BYTES))
+        own = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
+        touches = [(self._names[place], key.tobytes()) for place, key in zip(own.tolist(), keys, strict=True)]
+        expect(len(set(touches)) == count, "kept-keys", "different touches", count)
+        there = [row for row, touch in enumerate(touches) if touch in levels]
+        expect(len(there) == len(levels) if self._same else bool(there), "kept-keys", "those that are kept", len(there))
+        expect(len(there) == count or not self._same, "kept-keys", "no others than are kept", count)
+        kept = {row: Kept(*touches[row], levels[touches[row]]) for row in there}
+        channels, most = memory.made.sensor.channels, memory.made.most_columns
+        longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
+        lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
+        expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)
+        parts = self._parts("recall", Recall.parts(count, channels, longest))
+        columns = parts["columns"][there].tolist()
+        expect(columns == list(lengths.values()), "recall-columns", "their lengths", "others")
+        expect(bool(np.isfinite(parts["squares"]).all()), "recall-squares", "finite numbers", "others")
+        spread, read = self.floats("spread", (LEVELS,), 1.0, LEVELS), self.floats("read", (LEVELS,), 0.0, 1.0)
+        expect(read.sum() > 0, "read", "a level or more", "none")
+        coherence, energy, usual = self.floats("measured", (3,), 1e-9).tolist()
+        expect(max(coherence, energy) < 1e300, "measured", "finite numbers", [coherence, energy])
+        measured = Measured(Likelihood.of(spread, read), coherence, energy, usual)
+        recall = Recall.from_arrays(
+            list(kept.values()), {name: part[there] for name, part in parts.items()}, longest, measured
+        )
+        order = self._places("kept-order", count, count).tolist()
+        standing = [place for place, row in enumerate(order) if row in kept]
+        parts = self._parts("conformal", Conformal.parts(count, channels, longest))
+        for name in ("own", "other"):
+            expect(bool((parts[name] >= 0).all()), f"conformal-{name}", "squared distances", "others")
+        conformal = Conformal.from_arrays(
+            [kept[order[place]] for place in standing], {name: part[standing] for name, part in parts.items()}, longest
+        )
+        return recall, conformal
+
+    def _parts(self, what: str, expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[str, npt.NDArray[Any]]:
+        return {
+            name: array(self._arrays, f"{what}-{name}", (dtype,), shape) for name, (dtype, shape) in expected.items()
+        }
+
+    def table(
+        self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], recall: Recall | None
+    ) -> tuple[list[Calibration], Fusion]:
+        """How scores are read at each stage that touches reached, and at each moment."""
+        rows = array(self._arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
+        least = np.array([1, 0, 0, 1e-300, 1e-300, 0, 0, 0, -1e300, 1e-300])
+        most = np.array([2**53, len(stages) - 1, 1e300, 1, 1, 1, 1, np.inf, 1e300, 1e300])
+        expect(bool(((rows >= least) & (rows <= most)).all()), "moments", "rows of a table", "others")
+        expect(bool((rows[:, :2] == np.rint(rows[:, :2])).all()), "moments", "whole columns and stages", "others")
+        count = whole("moments", self._about.get("moments"), 1, len(rows) - 1)
+        for part in (rows[:count, 0], rows[count:, 0]):
+            expect(bool((np.diff(part) >= 0).all()), "moments", "columns in order", part)
+        of_rows = [len(stages[int(stage)]) for stage in rows[:count, 1]]
+        of_rows[-1] = len(stages[-1]) + len(views)
+        expect(rows[count - 1, 1] == len(stages) - 1, "moments", "the last stage, of a complete touch", rows[:, 1])
+        of_rows += [of_rows[-1] if recall is None else len(views)] * (len(rows) - count)
+        found = list(self._calibrations([*map(len, stages), *of_rows]))
+        moments = [
+            Moment(int(columns), int(stage), calibration, *rest)
+            for (columns, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
+        ]
+        trajectories = self._trajectories(count - 1)
+        fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), recall, trajectories)
+        return found[: len(stages)], fusion
+
+    def _calibrations(self, scales: Sequence[int]) -> Iterator[Calibration]:
+        """Calibrations of so many scales each."""
+        total = sum(scales)
+        lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
+        counts("novelty-counts", lengths, 0, MOST_ROWS)
+        weights, usual = self.floats("weights", (total,), 0.0, 1e300), self.floats("usual", (total,), 0.0)
+        shapes = self.floats("scale_novelty", (total, 2))
+        expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
+        novelties = self.floats("novelties", (int(lengths.sum()),))
+        edges, ends = np.cumsum([0, *scales]).tolist(), np.cumsum([0, *lengths.tolist()]).tolist()
+        for i in range(len(scales)):
+            own, known = slice(edges[i], edges[i + 1]), novelties[ends[i] : ends[i + 1]]
+            expect(bool((np.diff(known) >= 0).all()), "novelties", "ascending", "others")
+            yield Calibration(weights[own], shapes[own], known, usual[own])
+
+    def _trajectories(self, moments: int) -> Trajectories:
+        chances = array(self._arrays, "chances", ("float64",), (None, moments, None))
+        touches, _, materials = chances.shape
+        novelty = array(self._arrays, "novelty", ("float64",), (touches, moments))
+        targets = counts("targets", array(self._arrays, "targets", ("int64",), (touches,)), 0, max(materials - 1, 0))
+        return Trajectories(chances, novelty, targets.astype(np.intp, copy=False))

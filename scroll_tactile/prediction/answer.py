@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -48,11 +49,11 @@ def answer(
         novelty = model.dependence.standard([judgement.novelty for judgement in said])
         threshold = math.fsum(judgement.moment.threshold(false_alarms) for judgement in said) / len(said)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
-    names = [candidates[place] for place in order.tolist()]
+    names = list(map(candidates.__getitem__, order.tolist()))
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
-    typical = _typicality(model, names, [touch for touch, _ in own])
+    typical = tuple(_typicality(model, candidates, [touch for touch, _ in own])[order].tolist())
     return Prediction(*ranking[0], ranking, novelty, bool(novelty <= threshold), seconds, tuned, typical)
 
 
@@ -68,12 +69,16 @@ def _judged(
     return model.judge(candidates, touch.means, touch.columns, "complete", logits)
 
 
-def _typicality(model: Model, names: Sequence[str], touches: Sequence[Encoded]) -> tuple[float, ...]:
-    """How typical touches are of some materials; see `Prediction`."""
+def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
+    """How typical touches are of each candidate, shape (C,); see `Prediction`."""
+    shares = np.ones((len(touches), len(candidates)))
     if model.conformal is None:
-        return (1.0,) * len(names)
-    found = [model.conformal.p_values(levels_seen(touch.stream)) for touch in touches]
-    shares = np.array([[values.get(name, 1.0) for name in names] for values in found])
+        return np.asarray(shares[0])
+    for own, touch in zip(shares, touches, strict=True):
+        for name, value in model.conformal.p_values(levels_seen(touch.stream)).items():
+            place = bisect_left(candidates, name)  # they come in alphabetical order, and may be many
+            if place < len(candidates) and candidates[place] == name:
+                own[place] = value
     if len(shares) == 1:
-        return tuple(shares[0].tolist())
-    return tuple(min(1.0, 2 * math.fsum(column) / len(shares)) for column in shares.T)
+        return np.asarray(shares[0])
+    return np.array([min(1.0, 2 * math.fsum(column) / len(shares)) for column in shares.T])

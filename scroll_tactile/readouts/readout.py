@@ -35,7 +35,7 @@ from scroll_tactile.readouts.pruning import Compared, PruningTable, likeliest, p
 from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import one_thread, within_scatter
+from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
 __all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task"]
@@ -66,7 +66,7 @@ class Task:
     packed: IntArray
     names: list[str]
     counts: IntArray
-    sums: IntArray
+    sums: Sums
     reference: Places
     touches: int
     times: float = 1.0
@@ -90,10 +90,12 @@ class Task:
     @property
     def origin(self) -> FloatArray:
         """The mean of all rows, shape (d,)."""
-        return np.asarray((self.sums.sum(axis=0).astype(np.longdouble) / self.counts.sum()).astype(np.float64))
+        return np.asarray(
+            (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
+        )
 
 
-def _class_means(counts: IntArray | FloatArray, sums: IntArray, origin: FloatArray) -> FloatArray:
+def _class_means(counts: IntArray | FloatArray, sums: Sums, origin: FloatArray) -> FloatArray:
     """The means of materials about an origin, shape (C, d), in codes."""
     # About the integers next to the origin, exactly: a class mean keeps the digits that its distance from it needs.
     near = np.rint(origin)

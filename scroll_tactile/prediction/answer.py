@@ -41,6 +41,7 @@ def answer(
     own = [once[key] for key in sorted(once)]
     with one_thread():
         said = [_judged(model, extractor, candidates, touch, logits) for touch, logits in own]
+        typical = _typicality(model, candidates, [touch for touch, _ in own])
     if len(said) == 1:
         probability, novelty = said[0].probability, said[0].novelty
         threshold = said[0].moment.threshold(false_alarms)
@@ -53,8 +54,9 @@ def answer(
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
-    typical = tuple(_typicality(model, candidates, [touch for touch, _ in own])[order].tolist())
-    return Prediction(*ranking[0], ranking, novelty, bool(novelty <= threshold), seconds, tuned, typical)
+    return Prediction(
+        *ranking[0], ranking, novelty, bool(novelty <= threshold), seconds, tuned, tuple(typical[order].tolist())
+    )
 
 
 def _judged(

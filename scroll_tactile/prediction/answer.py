@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -41,6 +42,7 @@ def answer(
     own = [once[key] for key in sorted(once)]
     with one_thread():
         said = [_judged(model, extractor, candidates, touch, logits) for touch, logits in own]
+        typical = _typicality(model, candidates, [touch for touch, _ in own])
     if len(said) == 1:
         probability, novelty = said[0].probability, said[0].novelty
         threshold = said[0].moment.threshold(false_alarms)
@@ -49,15 +51,26 @@ def answer(
         novelty = model.dependence.standard([judgement.novelty for judgement in said])
         threshold = math.fsum(judgement.moment.threshold(false_alarms) for judgement in said) / len(said)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
-    names = [candidates[place] for place in order.tolist()]
+    names = list(map(candidates.__getitem__, order.tolist()))
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
     measured = all(judgement.moment.calibration.measures(false_alarms) for judgement in said)
     known = False if novelty > threshold else True if measured and len(model.names) > 1 else None
-    typical = _typicality(model, names, [touch for touch, _ in own])
+    share, least, of_all, least_of_all = typical[order].T.tolist()
     unusual = tuple(sorted({way for judgement in said for way in judgement.unusual}))
-    return Prediction(*ranking[0], ranking, novelty, known, seconds, tuned, *typical, unusual)
+    return Prediction(
+        *ranking[0],
+        ranking,
+        novelty,
+        known,
+        seconds,
+        tuned,
+        tuple(share),
+        tuple(of_all),
+        (*least, max(least_of_all)),
+        unusual,
+    )
 
 
 def _judged(
@@ -72,18 +85,17 @@ def _judged(
     return model.judge(candidates, touch.means, touch.columns, "complete", logits)
 
 
-def _typicality(
-    model: Model, names: Sequence[str], touches: Sequence[Encoded]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """How typical touches are of some materials, of all touches, and the least that both can be; see `Prediction`."""
-    anything = Typicality(1.0, 1.0, 1.0, 1.0)
+def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
+    """How typical touches are of each candidate, shape (C, 4); see `Typicality`."""
+    shares = np.ones((len(touches), len(candidates), len(Typicality._fields)))
     if model.conformal is None:
-        return (1.0,) * len(names), (1.0,) * len(names), (1.0,) * (len(names) + 1)
-    found = [model.conformal.p_values(levels_seen(touch.stream)) for touch in touches]
-    own = np.array([[values.get(name, anything) for name in names] for values in found])
-    if len(own) == 1:
-        shares = own[0].tolist()
-    else:
-        shares = [[min(1.0, 2 * math.fsum(column) / len(own)) for column in of.T] for of in own.transpose(1, 0, 2)]
-    share, least, of_all, least_of_all = zip(*shares, strict=True)
-    return share, of_all, (*least, max(least_of_all))
+        return np.asarray(shares[0])
+    for own, touch in zip(shares, touches, strict=True):
+        for name, value in model.conformal.p_values(levels_seen(touch.stream)).items():
+            place = bisect_left(candidates, name)  # they come in alphabetical order, and may be many
+            if place < len(candidates) and candidates[place] == name:
+                own[place] = value
+    if len(shares) == 1:
+        return np.asarray(shares[0])
+    sums = [[math.fsum(column) for column in of.T] for of in shares.transpose(1, 0, 2)]
+    return np.minimum(1.0, 2 / len(shares) * np.array(sums))

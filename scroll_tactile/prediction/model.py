@@ -19,6 +19,7 @@ from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.results import Unusual
@@ -32,8 +33,8 @@ FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["beginning", "complete", "paced"]
 """What a touch may be: the beginning of a usual one, a complete one, or a complete one at another pace."""
 
-# Of a logit: materials so far behind have less than 2e-8 of the probability each, and single precision is off by far
-# less than that part of it. At 40 up to a thousand were solved for, and a touch took three to ten times as long.
+# Of a logit, and the logarithm of their number more: materials so far behind have less than 2e-8 of the probability
+# together, and are not read from the memory.
 NEGLIGIBLE = 18.0
 
 
@@ -284,39 +285,53 @@ class Model:
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
         scales, calibration = self.scales(hypothesis, stage), self._read_by(hypothesis, moment, stage)
-        places = {scale: self._places(scale, names) for scale in scales}
-        chosen, logits = np.arange(len(names)), np.zeros(len(names))
-        if len(names) > EAGER:
-            coarse = [[part[places[scale]] for part in self.readouts[scale].coarse(means[scale])] for scale in scales]
-            weights, distance = self._believed(calibration, scales, means, places, [rough for rough, _ in coarse])
-            bounds = np.zeros(len(names))
-            for weight, (rough, bound) in zip(weights, coarse, strict=True):
-                logits += weight * rough
-                bounds += weight * bound
-            chosen = np.flatnonzero(logits + bounds >= (logits - bounds).max() - NEGLIGIBLE)
-            chosen = chosen[np.argsort(-logits[chosen], kind="stable")[:EAGER]]
-            logits[chosen] = 0.0
-        exact = [self.readouts[scale].scores(means[scale], places[scale][chosen], self.kind) for scale in scales]
+        readouts, codes = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
+        places = [self._places(scale, names) for scale in scales]
         if len(names) <= EAGER:
-            weights, distance = self._believed(calibration, scales, means, places, exact)
-        for weight, scores in zip(weights, exact, strict=True):
-            logits[chosen] += weight * scores
+            exact = [
+                readout.scores(own, among, self.kind)
+                for readout, own, among in zip(readouts, codes, places, strict=True)
+            ]
+            best = [int(among[int(scores.argmax())]) for among, scores in zip(places, exact, strict=True)]
+            weights, distance = self._believed(calibration, readouts, codes, best)
+            return np.asarray(sum(weight * scores for weight, scores in zip(weights, exact, strict=True))), distance
+        best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, codes, places, strict=True)]
+        weights, distance = self._believed(calibration, readouts, codes, best)
+        parts = list(zip(weights, readouts, codes, places, strict=True))
+
+        def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
+            return np.asarray(sum(weight * readout.exact(own, among[some]) for weight, readout, own, among in parts))
+
+        def bounds(some: npt.NDArray[np.intp], fine: int) -> tuple[FloatArray, FloatArray]:
+            # One more scale each time, the views first: it is of them that the least is known before.
+            found = [
+                readout.bounds(own, among[some], fine=len(parts) - i <= fine)
+                for i, (_, readout, own, among) in enumerate(parts)
+            ]
+            guess, most = (sum(weight * one[i] for weight, one in zip(weights, found, strict=True)) for i in (0, 1))
+            return np.asarray(guess), np.asarray(most)
+
+        every, margin = np.arange(len(names)), NEGLIGIBLE + np.log(len(names))
+        chosen, scores = likeliest(every, bounds, exactly, margin, len(parts))
+        logits = np.minimum(bounds(every, 0)[0], scores.max() - margin)
+        logits[chosen] = scores
         return logits, distance
 
     def _believed(
         self,
         calibration: Calibration,
-        scales: Sequence[Scale],
-        means: Mapping[Scale, FloatArray],
-        places: Mapping[Scale, npt.NDArray[np.intp]],
-        scores: Sequence[FloatArray],
+        readouts: Sequence[Readout],
+        codes: Sequence[FloatArray],
+        best: Sequence[int],
     ) -> tuple[FloatArray, float]:
-        """How far each scale is believed of this touch, (S,), and the distance of `Judgement`."""
+        """How far each scale is believed of a touch, (S,), and the distance of `Judgement`.
+
+        codes: of the touch, by scale; best: the place of the nearest material.
+        """
         if not np.isfinite(calibration.usual).all():
             return calibration.weights, 0.0
-        best = [int(places[scale][int(own.argmax())]) for scale, own in zip(scales, scores, strict=True)]
         distances = np.array(
-            [self.readouts[scale].strangeness(means[scale], place) for scale, place in zip(scales, best, strict=True)]
+            [readout.strangeness(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
         return calibration.believed(distances), float(calibration.relative(distances).min())
 

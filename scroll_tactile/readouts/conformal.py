@@ -70,8 +70,9 @@ class Conformal:
     ) -> None:
         self._channels, self._longest, self._touches, self._lengths = channels, longest, touches, lengths
         self._edges = _edges(longest, channels)
-        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.uint8)
+        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.float32)
         self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
+        self._squares: dict[int, npt.NDArray[np.float32] | None] = {}  # blocks → lengths, squared; None where some lack
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """What is made of the kept touches in the order of `touches`, and of complete ones of them.
@@ -79,7 +80,7 @@ class Conformal:
         steps: (n, blocks · C). own, other: d of each from the others, by all blocks, (n,).
         """
         own, other = self._near_by(len(self._edges) - 1)
-        return {"steps": self._steps, "own": own, "other": other}
+        return {"steps": self._steps.astype(np.uint8), "own": own, "other": other}
 
     @classmethod
     def from_arrays(cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int) -> Conformal:
@@ -88,7 +89,7 @@ class Conformal:
         lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
         own = [(touch.material, touch.key) for touch in touches]
         conformal._set_up(len(touches[0].levels), longest, own, lengths)
-        conformal._steps = arrays["steps"]
+        conformal._steps = arrays["steps"].astype(np.float32)
         conformal._near = {len(conformal._edges) - 1: (arrays["own"], arrays["other"])}
         conformal._named()
         return conformal
@@ -116,7 +117,7 @@ class Conformal:
         steps = [
             self._steps_of([touch.levels for touch in added[i : i + AT_ONCE]]) for i in range(0, len(added), AT_ONCE)
         ]
-        self._steps = np.concatenate([self._steps, *steps])
+        self._steps, self._squares = np.concatenate([self._steps, *steps], dtype=np.float32), {}
         self._lengths = np.append(self._lengths, [touch.levels.shape[1] for touch in added]).astype(np.intp)
         self._named()
         for reach in list(self._near):
@@ -130,7 +131,10 @@ class Conformal:
     def copy(self) -> Conformal:
         """Another of the same touches: what comes to it does not come to this one."""
         other = copy.copy(self)
-        other._near = dict(self._near)  # all else is replaced when it follows, and never changed
+        other._near, other._squares = (
+            dict(self._near),
+            dict(self._squares),
+        )  # all else is replaced when it follows, and never changed
         return other
 
     @property
@@ -180,16 +184,17 @@ class Conformal:
         blocks: npt.NDArray[np.uint8] = np.where(counts > 0, steps, UNREAD).astype(np.uint8)
         return blocks.transpose(0, 2, 1).reshape(len(levels), -1)
 
-    def _distances(self, steps: npt.NDArray[np.uint8], reach: int) -> FloatArray:
+    def _distances(self, steps: npt.NDArray[np.uint8] | npt.NDArray[np.float32], reach: int) -> FloatArray:
         """Squared distances of touches from all that are kept, by the blocks both have of the first: (touches, kept).
 
         Where some blocks lack they count as the others do; infinite where all lack.
         """
         mine, kept = (blocks[:, : reach * self._channels] for blocks in (steps, self._steps))
-        if (mine != UNREAD).all() and (kept != UNREAD).all():
-            a, b = mine.astype(np.float32), kept.astype(np.float32)
-            square = np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1)
-            return np.asarray(square - 2 * (a @ b.T), dtype=np.float64)
+        if reach not in self._squares:
+            self._squares[reach] = np.square(kept).sum(axis=1) if (kept != UNREAD).all() else None
+        if (squares := self._squares[reach]) is not None and (mine != UNREAD).all():
+            a = mine.astype(np.float32)
+            return np.asarray(np.square(a).sum(axis=1)[:, None] + squares - 2 * (a @ kept.T), dtype=np.float64)
         seen, known = (mine != UNREAD).astype(np.float32), (kept != UNREAD).astype(np.float32)
         a, b = mine * seen, kept * known
         far = (np.square(a) @ known.T + seen @ np.square(b).T - 2 * (a @ b.T)).astype(np.float64)

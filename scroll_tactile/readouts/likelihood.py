@@ -36,9 +36,9 @@ MOST_TABLES = 64  # of 128 kB
 
 LevelArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
+Pairs = npt.NDArray[np.intp]
 
 _LEVELS = np.arange(float(LEVELS))
-_DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
 
 
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
@@ -129,10 +129,26 @@ class Likelihood:
                 self._tables.popitem(last=False)
         return found
 
+    def logs(self, noise: Noise, pairs: Pairs) -> npt.NDArray[np.int16]:
+        """The logs of a table, right at some pairs 256 · y + x alone: of a touch beside others few of them occur."""
+        with self._lock:
+            found = self._tables.get(noise)
+        if found is not None:
+            return found.logs
+        if 4 * len(pairs) > LEVELS**2:
+            return self.table(noise).logs
+        y, x = pairs >> 8, pairs & 255
+        read = (y != MISSING) & (x != MISSING)
+        y, x = y[read], x[read]
+        below = np.where(y > 0, self._below(noise, x, y - 1), 0.0)
+        logs = np.zeros(256 * 256, dtype=np.int16)
+        logs[pairs[read]] = np.rint(_logs(np.maximum(self._below(noise, x, y) - below, 0.0)) * UNIT)
+        return logs
+
     def _made(self, noise: Noise) -> Table:
         chances = self._chances(noise)
-        logs = np.log((1 - FLOOR) * chances + FLOOR / LEVELS)
         whole = np.zeros((256, 256), dtype=np.int16)
+        logs = _logs(chances)
         whole[:LEVELS, :LEVELS] = np.rint(logs.T * UNIT)
         mean = chances @ _LEVELS
         middle, typical = self.weights @ _LEVELS, self.weights @ mean
@@ -151,15 +167,24 @@ class Likelihood:
         )
 
     def _chances(self, noise: Noise) -> FloatArray:
-        """P(y | x), [x, y]; what lies beyond an end of the range is read as that end."""
+        """P(y | x), [x, y]."""
+        levels = np.arange(LEVELS)
+        return np.maximum(np.diff(self._below(noise, levels[:, None], levels), axis=1, prepend=0.0), 0.0)
+
+    def _below(self, noise: Noise, x: Pairs, y: Pairs) -> FloatArray:
+        """P(y or less | x); what lies beyond an end of the range is read as that end."""
         reach = noise.amplitude * (LEVELS - 1)
+        distance = np.asarray(y + 0.5 - x, dtype=np.float64)
         if noise.normal or not reach:
-            below = _normal(_DISTANCE / np.hypot(self.spread, reach / math.sqrt(3))[:, None])
+            below = _normal(distance / np.hypot(self.spread, reach / math.sqrt(3))[x])
         else:
-            spread = np.hypot(self.spread, BLUR * reach)[:, None]
-            below = (_sloped(_DISTANCE + reach, spread) - _sloped(_DISTANCE - reach, spread)) / (2 * reach)
-        below[:, -1] = 1.0
-        return np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)
+            spread = np.hypot(self.spread, BLUR * reach)[x]
+            below = (_sloped(distance + reach, spread) - _sloped(distance - reach, spread)) / (2 * reach)
+        return np.where(y == LEVELS - 1, 1.0, below)
+
+
+def _logs(chances: FloatArray) -> FloatArray:
+    return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
 
 
 def _normal(z: FloatArray) -> FloatArray:

@@ -23,19 +23,19 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.coarse import Coarse
 from scroll_tactile.readouts.derived import Derived
+from scroll_tactile.readouts.pruning import Compared, PruningTable, likeliest, principal_directions
 from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import one_thread, within_scatter
+from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
 __all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task"]
@@ -49,6 +49,7 @@ Change = tuple[str, npt.NDArray[np.int32], int]
 
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
 FIRST_KNOWN = 256  # materials
+AT_ONCE = 64  # materials whose means are read at once: they stay in the processor's cache
 MOST_HELD = 2 * EAGER  # then those that were asked for are let go
 
 
@@ -65,7 +66,7 @@ class Task:
     packed: IntArray
     names: list[str]
     counts: IntArray
-    sums: IntArray
+    sums: Sums
     reference: Places
     touches: int
     times: float = 1.0
@@ -89,13 +90,18 @@ class Task:
     @property
     def origin(self) -> FloatArray:
         """The mean of all rows, shape (d,)."""
-        return np.asarray((self.sums.sum(axis=0).astype(np.longdouble) / self.counts.sum()).astype(np.float64))
+        return np.asarray(
+            (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
+        )
 
 
-def _class_means(counts: IntArray | FloatArray, sums: IntArray, origin: FloatArray) -> FloatArray:
+def _class_means(counts: IntArray | FloatArray, sums: Sums, origin: FloatArray) -> FloatArray:
     """The means of materials about an origin, shape (C, d), in codes."""
-    # Long double: a class mean keeps the digits that its distance from the origin needs.
-    return (sums.astype(np.longdouble) / counts[:, None] - origin).astype(np.float64)
+    # About the integers next to the origin, exactly: a class mean keeps the digits that its distance from it needs.
+    near = np.rint(origin)
+    means: FloatArray = (sums - np.outer(counts.astype(np.int64), near.astype(np.int64))) / counts[:, None]
+    means -= origin - near
+    return means
 
 
 class Readout:
@@ -140,8 +146,9 @@ class Readout:
         self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
         self._sizes = np.empty(0)  # mᵀ K⁻¹ m
         self._derived: Derived | None = None
-        self._coarse: Coarse | None = None
-        self._compared: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._table: PruningTable | None = None
+        self._most_lost: float | None = None
+        self._compared: tuple[FloatArray, Compared] | None = None
         with one_thread():
             self.system = System(matrix)
             self._hold(places, means)
@@ -176,7 +183,7 @@ class Readout:
         readout.precision, readout._sizes, readout._room = arrays["precision"], arrays["sizes"], arrays["rows"]
         readout._held = {place: row for row, place in enumerate(arrays["held"].tolist())}
         readout._means, readout._solved = readout._room[:, 0], readout._room[:, 1]
-        readout._derived = readout._coarse = readout._compared = None
+        readout._derived = readout._table = readout._most_lost = readout._compared = None
         readout.system = System.unkept(len(readout.origin))
         return readout
 
@@ -223,10 +230,8 @@ class Readout:
             if len(self._held) + len(absent) > MOST_HELD:
                 self._let_go()
                 absent = [int(place) for place in places if int(place) not in self._held]
-            names = [self.names[place] for place in absent]
-            counts, sums = self.statistics.counts(self.scale, names), self.statistics.sums(self.scale, names)
             with one_thread():
-                self._hold(absent, _class_means(counts, sums, self.origin))
+                self._hold(absent, self._read_means(absent))
         return np.array([self._held[int(place)] for place in places], dtype=np.intp)
 
     def _let_go(self) -> None:
@@ -242,7 +247,7 @@ class Readout:
         """
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
-        self._derived = self._compared = None
+        self._derived = self._compared = self._most_lost = None
         come: dict[str, list[FloatArray]] = {}
         for material, rows, sign in changes:
             if sign > 0:
@@ -265,7 +270,7 @@ class Readout:
         """Another readout of the same: what comes to it does not come to this one."""
         other = self._branch()
         other.names, other.places = [*self.names], dict(self.places)
-        other._derived, other._coarse = self._derived, None if self._coarse is None else self._coarse.copy()
+        other._derived, other._table = self._derived, None if self._table is None else self._table.copy()
         return other
 
     def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
@@ -285,7 +290,7 @@ class Readout:
         other.counts, other._held, other._sizes = self.counts.copy(), dict(self._held), self._sizes.copy()
         other._room = np.stack([self._means, self._solved], axis=1)
         other._means, other._solved = other._room[:, 0], other._room[:, 1]
-        other._derived = other._compared = other._coarse = None
+        other._derived = other._compared = other._table = other._most_lost = None
         return other
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
@@ -322,10 +327,9 @@ class Readout:
         self._sizes[rows_held] = np.einsum("hd,hd->h", self._means[rows_held], self._solved[rows_held])
         for material, mean, count in fresh:
             self._hold([self._new_place(material, count)], mean[None])
-        if self._coarse is not None:
-            for place in [place for place, *_ in known] + [self.places[material] for material, *_ in fresh]:
-                held = self._held[place]
-                self._coarse.put(place, self._means[held], self._sizes[held])
+        if self._table is not None:
+            places = np.array([self.places[material] for material in changed], dtype=np.intp)
+            self._table.put(places, self.system.whiten(self._means[self.held(places)]))
 
     def _new_place(self, material: str, count: int) -> int:
         place = self.places[material] = len(self.names)
@@ -344,8 +348,6 @@ class Readout:
         moved = onto @ corner
         self._solved -= moved @ leaving
         self._sizes -= (moved * onto).sum(axis=1)
-        if self._coarse is not None:
-            self._coarse.border(leaving, corner)
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
@@ -379,8 +381,9 @@ class Readout:
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.
         """
-        row = self.held([place])[0]  # first: it may make room for the means anew
-        away = codes - self.origin - self._means[row]
+        held = self._held.get(place)
+        mean = self._read_means([place])[0] if held is None else self._means[held]
+        away = codes - self.origin - mean
         return float(np.square(away) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
@@ -401,8 +404,7 @@ class Readout:
     def novelty(self, codes: FloatArray, places: Sequence[int] | Places) -> float:
         """Relative Mahalanobis distance of codes (d,); the materials at `places` are those that may be the nearest."""
         near, beyond = self._beyond_nearest(codes)
-        nearest = self._scores(codes, self.held(self._likeliest(codes, np.asarray(places)))).max()
-        ahead = self.gamma * float(nearest - self._scores(codes, np.array([near]))[0])
+        ahead = self.nearest(codes, places)[1] - float(self.scores(codes, self.reference[[near]], "lda")[0])
         weighed = beyond @ self.derived().background @ beyond
         return float(weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
 
@@ -414,35 +416,61 @@ class Readout:
         beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
         return near, np.asarray(beyond - self.shares @ beyond)
 
-    def _likeliest(self, codes: FloatArray, places: Places) -> Places:
-        """Those of many places among which the highest score is."""
-        if len(places) <= EAGER:
-            return places
-        scores, errors = (array[places] for array in self.coarse(codes))
-        likeliest: Places = places[scores + errors >= (scores - errors).max()][:EAGER]
-        return likeliest
+    def nearest(self, codes: FloatArray, places: Sequence[int] | Places) -> tuple[int, float]:
+        """Of the materials at some places the one of the highest score "lda", by its place, and that score."""
+        chosen = np.asarray(places)
+        if len(chosen) <= EAGER:
+            scores = self.scores(codes, chosen, "lda")
+        else:
+            chosen, scores = likeliest(
+                chosen, lambda some, fine: self.bounds(codes, some, fine=fine > 0), lambda some: self.exact(codes, some)
+            )
+        best = int(scores.argmax())
+        return int(chosen[best]), float(scores[best])
 
-    def coarse(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scores "lda" of all materials by place, in single precision, and bounds of their errors, each (C,)."""
-        found = self._compared
-        if found is None or found[0] is not codes:
+    def bounds(self, codes: FloatArray, places: Places, *, fine: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Guesses of the scores "lda" of some of many materials, and what they are at most, each of shape (k,)."""
+        compared = self._beside(codes)
+        if fine:
+            compared.refine(places)
+        return compared.guess[places], compared.most[places]
+
+    def _beside(self, codes: FloatArray) -> Compared:
+        """Codes (d,) beside all of many materials; the latest are kept."""
+        if self._compared is None or self._compared[0] is not codes:
             with one_thread():
-                if self._coarse is None:
-                    self._coarse = self._all_coarsely()
-                solved = self.system.solve((codes - self.origin)[None])[0]
-            scores, errors = self._coarse.scores(solved)
-            self._compared = found = codes, self.gamma * scores, self.gamma * errors
-        return found[1:]
+                if self._table is None:
+                    self._table = self._tabled()
+                if self._most_lost is None:
+                    self._most_lost = self.system.most_lost
+                white = self.system.towards((codes - self.origin)[None])
+                solved = self.system.solve_whitened(white)[0]
+                compared = self._table.compared(white[0], self._most_lost, self.gamma, solved)
+            compared.take(self.reference, self.scores(codes, self.reference, "lda"))  # they are held
+            self._compared = codes, compared
+        return self._compared[1]
 
-    def _all_coarsely(self) -> Coarse:
-        means, sizes = np.empty((len(self.names), len(self.origin)), np.float32), np.empty(len(self.names))
-        places, rows = list(self._held), list(self._held.values())
-        means[places], sizes[places] = self._means[rows], self._sizes[rows]
-        absent = [place for place in range(len(means)) if place not in self._held]
-        for first in range(0, len(absent), EAGER):
-            places = absent[first : first + EAGER]
-            block = [self.names[place] for place in places]
-            counts, sums = self.statistics.counts(self.scale, block), self.statistics.sums(self.scale, block)
-            own = _class_means(counts, sums, self.origin)
-            means[places], sizes[places] = own, np.einsum("hd,hd->h", own, self.system.solve(own))
-        return Coarse(means, sizes)
+    def exact(self, codes: FloatArray, places: Places) -> FloatArray:
+        """The scores "lda" of any of many materials, which are not held for it, for codes of shape (d,), shape (k,)."""
+        compared = self._beside(codes)
+        unknown = places[~compared.known[places]]
+        with one_thread():
+            for first in range(0, len(unknown), AT_ONCE):
+                some = unknown[first : first + AT_ONCE]
+                means, sizes = self._read_means(some), compared.table.sizes[some]
+                if self.system.rank:
+                    sizes = sizes - self.system.lost(self.system.whiten(means))
+                compared.take(some, self.gamma * (means @ compared.solved - sizes / 2))
+        return compared.guess[places]
+
+    def _read_means(self, places: Iterable[int]) -> FloatArray:
+        """The means of materials at some places about the origin, (k, d), from the memory."""
+        names = [self.names[place] for place in places]
+        counts, sums = self.statistics.counts(self.scale, names), self.statistics.sums(self.scale, names)
+        return _class_means(counts, sums, self.origin)
+
+    def _tabled(self) -> PruningTable:
+        whiten, count = self.system.whiten, len(self.names)
+        blocks = (range(first, min(first + EAGER, count)) for first in range(0, count, EAGER))
+        directions = principal_directions(whiten(self.means_solved()[0]))
+        return PruningTable(directions, (whiten(self._read_means(block)) for block in blocks), count)

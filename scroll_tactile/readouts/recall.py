@@ -18,13 +18,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
+from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
 from scroll_tactile.readouts.recollection import (
     Kept,
     Measured,
@@ -41,10 +42,10 @@ FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 SHORTLIST = 64  # kept touches that are compared value by value; with all 800 no more is right
-BLOCK_VALUES = (
-    2400  # means of a kept touch that the shortlist is made by, a byte each; 1200 lose 3 in 100 through noise
+BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
+AT_ONCE = (
+    128  # kept touches whose means are multiplied at once: the bits of a product do not depend on how many are kept
 )
-AT_ONCE = 128  # kept touches whose means are multiplied at once, as floats
 COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
 FIRST = 3  # candidates for each rough amplitude, and for the finer ones
 FIRST_VALUES = 1000  # of a touch, by which the rough amplitude is found
@@ -99,22 +100,29 @@ class _Pairs:
     places: Rows
     weights: FloatArray
 
-    def logs(self, table: Table) -> FloatArray:
+    @cached_property
+    def _occurring(self) -> Rows:
+        occurs = np.zeros(256 * 256, dtype=np.bool_)
+        occurs[self.places] = True
+        return np.flatnonzero(occurs)
+
+    def logs(self, likelihood: Likelihood, noise: Noise) -> FloatArray:
         """Log-likelihood of the touch by each of the others, (others,)."""
-        return np.asarray(table.logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
+        logs = likelihood.logs(noise, self._occurring)
+        return np.asarray(logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
 
 
 @dataclass
 class _Room:
     """What is made of kept touches, row by row.
 
-    blocks: means, rounded to levels, (touches, C · B). brought: means over wider blocks of each one's own length,
-    (touches, C · B'). squares: sums of the squares of blocks by channel, (touches, C). columns: the length of each.
-    gapless: whether it has a value everywhere.
+    blocks: means, rounded to levels, as floats, (touches, C · B). brought: means over wider blocks of each one's own
+    length, (touches, C · B'). squares: sums of the squares of blocks by channel, (touches, C). columns: the length of
+    each. gapless: whether it has a value everywhere.
     """
 
-    blocks: LevelArray
-    brought: LevelArray
+    blocks: npt.NDArray[np.float32]
+    brought: npt.NDArray[np.float32]
     squares: npt.NDArray[np.float32]
     columns: npt.NDArray[np.intp]
     gapless: npt.NDArray[np.bool_]
@@ -123,8 +131,8 @@ class _Room:
     @classmethod
     def of(cls, count: int, channels: int, blocks: int, wider: int) -> _Room:
         return cls(
-            np.empty((count, channels * blocks), np.uint8),
-            np.empty((count, channels * wider), np.uint8),
+            np.empty((count, channels * blocks), np.float32),
+            np.empty((count, channels * wider), np.float32),
             np.empty((count, channels), np.float32),
             np.empty(count, np.intp),
             np.empty(count, np.bool_),
@@ -141,6 +149,7 @@ class _Room:
 
 
 PARTS = tuple(field.name for field in fields(_Room))
+LEVEL_PARTS = ("blocks", "brought")  # whole numbers, 0 to 254
 
 
 class Recall:
@@ -169,8 +178,9 @@ class Recall:
         self._named()
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """What is made of each kept touch, row by row in the order of `touches`; see `_Room`."""
-        return {name: getattr(self._held, name)[: len(self)] for name in PARTS}
+        """What is made of each kept touch, row by row in the order of `touches`; see `_Room`. Levels in a byte each."""
+        made = {name: getattr(self._held, name)[: len(self)] for name in PARTS}
+        return made | {name: made[name].astype(np.uint8) for name in LEVEL_PARTS}
 
     @classmethod
     def from_arrays(
@@ -182,7 +192,8 @@ class Recall:
         recall._edges = _edges(longest, recall.channels)
         recall._touches = [(touch.material, touch.key) for touch in touches]
         recall._levels = [touch.levels for touch in touches]
-        recall._held = _Room(**{name: arrays[name] for name in PARTS})
+        floats = {name: arrays[name].astype(np.float32) for name in LEVEL_PARTS}
+        recall._held = _Room(**{name: arrays[name] for name in PARTS} | floats)
         recall._named()
         return recall
 
@@ -191,7 +202,8 @@ class Recall:
         """Name → dtype and shape of what `to_arrays` gives of so many touches."""
         edges = _edges(longest, channels)
         room = _Room.of(count, channels, len(edges) - 1, len(edges[::COARSER]) - 1)
-        return {name: (getattr(room, name).dtype.name, getattr(room, name).shape) for name in PARTS}
+        types = {name: "uint8" if name in LEVEL_PARTS else getattr(room, name).dtype.name for name in PARTS}
+        return {name: (types[name], getattr(room, name).shape) for name in PARTS}
 
     @property
     def touches(self) -> list[tuple[str, bytes]]:
@@ -308,18 +320,18 @@ class Recall:
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
         pairs = self._pairs(beside, asked)
-        logs = pairs.logs(self._table(noise))
+        logs = pairs.logs(self.measured.likelihood, noise)
         for stride in () if given or noise == CLEAN else (1,) if noise.normal else (8, 2, 1):
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
-                noise, logs = finer, pairs.logs(self._table(finer))
+                noise, logs = finer, pairs.logs(self.measured.likelihood, finer)
         return self._told(asked, rows, beside, logs, noise, columns)
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
         asked = _Asked.of(self._levels[row], self.longest, whole=False, quiet=self._quiet(row))
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
-        best = beside[np.argmax(self._pairs(beside, asked).logs(self._table(CLEAN)))]
+        best = beside[np.argmax(self._pairs(beside, asked).logs(self.measured.likelihood, CLEAN))]
         return shape_of(*self._deviation(asked, best, CLEAN))
 
     def nearest(self, row: int) -> tuple[LevelArray, LevelArray] | None:
@@ -327,9 +339,7 @@ class Recall:
         others = np.flatnonzero((self._labels == self._labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
-        far = self._squares[others].sum(axis=1) - 2 * _product(
-            self._blocks[others], self._blocks[row].astype(np.float32)
-        )
+        far = self._squares[others].sum(axis=1) - 2 * _product(self._blocks[others], self._blocks[row])
         own, other = self._rows([row, int(others[np.argmin(far)])])
         return own, other
 
@@ -428,7 +438,7 @@ class Recall:
         pairs = self._pairs(beside, asked, values)
 
         def likelihood(noise: Noise) -> float:
-            return float(pairs.logs(self._table(noise)).max())
+            return float(pairs.logs(self.measured.likelihood, noise).max())
 
         found = [CLEAN]
         for noises in COARSE:
@@ -446,7 +456,7 @@ class Recall:
             same = self._labels[rows] == self._labels[rows[np.argmax(logs)]]
             nearest = _blends(beside[same], logs[same], WARMTHS[:2])
         pairs = self._pairs(nearest, asked)
-        return max(noise.near(stride), key=lambda near: float(pairs.logs(self._table(near)).max()))
+        return max(noise.near(stride), key=lambda near: float(pairs.logs(self.measured.likelihood, near).max()))
 
     def _told(
         self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise, columns: int
@@ -490,7 +500,7 @@ class Recall:
             if np.count_nonzero(mine) > 1:
                 blends = _blends(beside[mine], logs[mine], WARMTHS)
                 pairs = self._pairs(blends, asked)
-                best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
+                best[material] = max(best[material], float(pairs.logs(self.measured.likelihood, noise).max()))
         return best
 
 
@@ -514,9 +524,9 @@ def _unchanging(levels: LevelArray) -> npt.NDArray[np.bool_]:
     return unchanging
 
 
-def _product(blocks: LevelArray, guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _product(blocks: npt.NDArray[np.float32], guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """blocks @ guess."""
-    parts = [blocks[row : row + AT_ONCE].astype(np.float32) @ guess for row in range(0, len(blocks), AT_ONCE)]
+    parts = [blocks[row : row + AT_ONCE] @ guess for row in range(0, len(blocks), AT_ONCE)]
     return np.concatenate(parts)
 
 

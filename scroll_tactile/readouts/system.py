@@ -64,6 +64,7 @@ class System:
         self._most = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._white = np.empty((0, dimension))  # L⁻¹ times the columns, and room for more
         self._e = np.empty((0, 0))
+        self._signs = np.empty(0)  # D
         self._largest = 1.0  # entry of what E is the inverse of
         self.rank = 0
 
@@ -89,15 +90,41 @@ class System:
         """Another system with the same columns: what comes to it does not come to this one."""
         other = copy.copy(self)
         other._white, other._e = self._white[: self.rank].copy(), self._e[: self.rank, : self.rank].copy()
+        other._signs = self._signs[: self.rank].copy()
         return other
 
     def solve(self, rows: FloatArray) -> FloatArray:
         """(K + Uᵀ D U)⁻¹ times each of the rows, shape (k, d)."""
+        return self.solve_whitened(self.towards(rows))
+
+    def towards(self, rows: FloatArray) -> FloatArray:
+        """Of each of the rows x, (k, d), what the whitened y is multiplied with for yᵀ (K + Uᵀ D U)⁻¹ x: (I − B) L⁻¹ x.
+
+        B = Wᵀ E W is what came since.
+        """
         white = self.whiten(rows)
         if self.rank:
             came, e = self._white[: self.rank], self._e[: self.rank, : self.rank]
             white -= (white @ came.T) @ e @ came
+        return white
+
+    def solve_whitened(self, white: FloatArray) -> FloatArray:
+        """L⁻ᵀ times each of the rows, (k, d)."""
         return self._inverse.transposed_times(white)
+
+    def lost(self, white: FloatArray) -> FloatArray:
+        """uᵀ B u of each of some whitened rows u, (k, d): by so much less is its length as K⁻¹ measures it, (k,)."""
+        onto = white @ self._white[: self.rank].T
+        return np.asarray(np.einsum("kr,kr->k", onto @ self._e[: self.rank, : self.rank], onto))
+
+    @property
+    def most_lost(self) -> float:
+        """A bound of the absolute eigenvalues λ of B, which are those of I − E D: (Σ λ⁸)^⅛."""
+        power = np.eye(self.rank) - self._e[: self.rank, : self.rank] * self._signs[: self.rank]
+        for _ in range(2):
+            power = power @ power
+        # Each λ⁸ is in the trace; rounding may leave it below zero where there is nothing but rounding.
+        return float(max(np.einsum("ij,ji->", power, power), 0.0) ** 0.125) * (1 + 1e-9) + 1e-9
 
     def whiten(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times each of the rows, shape (k, d), not regarding what came since: their products are those of K⁻¹."""
@@ -105,9 +132,9 @@ class System:
 
     def _grow(self, rank: int) -> None:
         size, held = max(rank, min(self._most, len(self._white) + MORE)), self.rank
-        white, e = np.empty((size, self._white.shape[1])), np.empty((size, size))
-        white[:held], e[:held, :held] = self._white[:held], self._e[:held, :held]
-        self._white, self._e = white, e
+        white, e, signs = np.empty((size, self._white.shape[1])), np.empty((size, size)), np.empty(size)
+        white[:held], e[:held, :held], signs[:held] = self._white[:held], self._e[:held, :held], self._signs[:held]
+        self._white, self._e, self._signs = white, e, signs
 
     def border(self, columns: FloatArray, sign: int) -> tuple[FloatArray, FloatArray]:
         """Take in columns, shape (k, d), of one sign; gives W, (k, d), and C, (k, k): Wᵀ C W leaves the inverse."""
@@ -124,7 +151,7 @@ class System:
         beside = -onto @ corner
         e -= beside @ onto.T
         self._e[:first, first:last], self._e[first:last, :first] = beside, beside.T
-        self._e[first:last, first:last] = corner
+        self._e[first:last, first:last], self._signs[first:last] = corner, sign
         self.rank = last
         return self._inverse.transposed_times(white - onto.T @ self._white[:first]), corner
 

@@ -11,10 +11,11 @@ from scroll_tactile.blas import one_thread
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.statistics.grid import BITS, mean_code
 
-__all__ = ["MOST_ROWS", "SecondMoment", "one_thread", "require_room", "within_scatter"]
+__all__ = ["MOST_ROWS", "SecondMoment", "Sums", "one_thread", "require_room", "within_scatter"]
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
+Sums = npt.NDArray[np.int32] | IntArray
 
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
 BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
@@ -142,7 +143,7 @@ def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) 
             put(packed[place], product[row - first, : row + 1], out=packed[place])
 
 
-def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+def within_scatter(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray:
     """S_w = A − Σ_y c_y c_yᵀ / n_y, shape (d, d), in units of codes²: the lower triangle.
 
     What stands above the diagonal means nothing. packed: A as in SecondMoment; counts: n_y > 0, shape (C,); sums: c_y,
@@ -164,7 +165,7 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatA
     return rounded
 
 
-def _exactly(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
+def _exactly(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray:
     """The scatter, block of rows after block: of the whole square every step would take 8 MB more."""
     # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
     largest = int(np.abs(sums).max(initial=1))
@@ -172,7 +173,7 @@ def _exactly(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
     limbs, together = (False, together) if together >= 64 else (True, 1024)
     parts = []
     for first in range(0, len(counts), together):
-        rows, total = counts[first : first + together, None], sums[first : first + together]
+        rows, total = counts[first : first + together, None], sums[first : first + together].astype(np.int64)
         means = mean_code(total, rows)
         rest = (total - rows * means).astype(np.float64)
         high = (total >> LIMB).astype(np.float64) if limbs else None
@@ -197,13 +198,13 @@ def _exactly(packed: IntArray, counts: IntArray, sums: IntArray) -> FloatArray:
     return scatter
 
 
-def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: IntArray) -> None:
+def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: Sums) -> None:
     """Move `centred` to the integer g next to the mean of all, exactly; add Σ_y n_y (m_y − g)(m_y − g)ᵀ to `rounded`.
 
     A product of half the operations in place of two: of ten thousand classes a second less for each scale. What is
     lost is the digits by which the scatter between classes exceeds that within, and not those of the mean.
     """
-    total, rows = sums.sum(axis=0), int(counts.sum())
+    total, rows = sums.sum(axis=0, dtype=np.int64), int(counts.sum())
     mean = mean_code(total, rows)
     centred -= np.outer(total, mean) + np.outer(mean, total - rows * mean)
     with one_thread():

@@ -17,12 +17,14 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import SecondMoment, require_room
+from scroll_tactile.statistics.moments import SecondMoment, Sums, require_room
 
 __all__ = ["Snapshot", "Statistics"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
+
+LARGEST = 2**31 - 1  # of what is kept in int32
 
 
 class Statistics:
@@ -40,7 +42,8 @@ class Statistics:
         self._observations = np.zeros(0, dtype=np.int64)
         self._lengths: Counter[int] = Counter()
         self._rows = {scale: np.zeros(0, dtype=np.int64) for scale in self.scales}
-        self._sums = {scale: np.zeros((0, dimension), dtype=np.int64) for scale in self.scales}
+        # In int32 until a sum needs more: of ten thousand materials they are 40 MB a scale then.
+        self._sums: dict[Scale, Sums] = {scale: np.zeros((0, dimension), dtype=np.int32) for scale in self.scales}
         self._seconds = {scale: SecondMoment(dimension) for scale in self.scales}
         self._snapshots: list[ReferenceType[Snapshot]] = []
 
@@ -84,9 +87,15 @@ class Statistics:
         for scale, rows in codes.items():
             self._seconds[scale].add(rows)
             self._rows[scale][place] += len(rows)
-            self._sums[scale][place] += rows.sum(axis=0, dtype=np.int64)
+            self._add_sums(scale, place, rows.sum(axis=0, dtype=np.int64))
         self._observations[place] += 1
         self._lengths[columns] += 1
+
+    def _add_sums(self, scale: Scale, place: int, more: IntArray) -> None:
+        total = self._sums[scale][place] + more
+        if self._sums[scale].dtype == np.int32 and np.abs(total).max(initial=0) > LARGEST:
+            self._sums = {**self._sums, scale: self._sums[scale].astype(np.int64)}  # who undoes this has those before
+        self._sums[scale][place] = total
 
     def undo(self, material: str, columns: int) -> Callable[[], None]:
         """What takes the next `add` back, of this material and so many columns, however much of it was done.
@@ -130,7 +139,7 @@ class Statistics:
         for scale, rows in codes.items():
             self._seconds[scale].remove(rows)
             self._rows[scale][place] -= len(rows)
-            self._sums[scale][place] -= rows.sum(axis=0, dtype=np.int64)
+            self._add_sums(scale, place, -rows.sum(axis=0, dtype=np.int64))
         self._observations[place] -= 1
         self._lengths = +(self._lengths - Counter([columns]))
 
@@ -155,8 +164,8 @@ class Statistics:
         return place
 
     def _grow(self, capacity: int) -> None:
-        def grown(array: IntArray) -> IntArray:
-            larger = np.zeros((capacity, *array.shape[1:]), dtype=np.int64)
+        def grown(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            larger = np.zeros((capacity, *array.shape[1:]), dtype=array.dtype)
             larger[: len(array)] = array
             return larger
 
@@ -175,12 +184,12 @@ class Statistics:
 
     def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Sums of codes of each material, shape (C, d)."""
-        return self._sums[scale][[self._places[name] for name in names]]
+        return self._sums[scale][[self._places[name] for name in names]].astype(np.int64)
 
-    def totals(self, scale: Scale) -> tuple[IntArray, IntArray]:
+    def totals(self, scale: Scale) -> tuple[IntArray, Sums]:
         """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`."""
         names = self.names(scale)
-        return self.counts(scale, names), self.sums(scale, names)
+        return self.counts(scale, names), self._sums[scale][[self._places[name] for name in names]]
 
     def second(self, scale: Scale) -> SecondMoment:
         """The second moment of a scale, over all materials."""
@@ -232,7 +241,7 @@ class Statistics:
                 joint._observations[to] += weight * part._observations[place]
                 for scale in self.scales:
                     joint._rows[scale][to] += weight * part._rows[scale][place]
-                    joint._sums[scale][to] += weight * part._sums[scale][place]
+                    joint._add_sums(scale, to, weight * part._sums[scale][place].astype(np.int64))
         for scale in self.scales:
             ours, theirs = self._seconds[scale], other._seconds[scale]
             packed = ours.packed() + sign * theirs.packed()
@@ -263,7 +272,7 @@ class Statistics:
         arrays: dict[str, npt.NDArray[Any]] = {"observations": self._observations[places], "lengths": lengths}
         for scale in self.scales:
             arrays[f"rows-{scale}"] = self._rows[scale][places]
-            arrays[f"sums-{scale}"] = self._sums[scale][places]
+            arrays[f"sums-{scale}"] = self._sums[scale][places].astype(np.int64)
             if self._seconds[scale].rows:
                 arrays[f"second-{scale}"] = self._seconds[scale].packed().copy()
         return arrays, names
@@ -277,7 +286,7 @@ class Statistics:
         names: Sequence[str],
         late: Mapping[str, Callable[[], IntArray]] | None = None,
     ) -> Statistics:
-        """The statistics that `to_arrays` described; the arrays are taken over.
+        """The statistics that `to_arrays` described; the arrays are taken over or copied.
 
         late: what reads those second moments that are not among the arrays, when they are needed.
         """
@@ -286,7 +295,9 @@ class Statistics:
         statistics._observations = arrays["observations"]
         statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
         for scale in statistics.scales:
-            statistics._rows[scale], statistics._sums[scale] = arrays[f"rows-{scale}"], arrays[f"sums-{scale}"]
+            statistics._rows[scale], sums = arrays[f"rows-{scale}"], arrays[f"sums-{scale}"]
+            narrow = max(int(sums.max(initial=0)), -int(sums.min(initial=0))) <= LARGEST
+            statistics._sums[scale] = sums.astype(np.int32) if narrow else sums
             if rows := int(statistics._rows[scale].sum()):
                 field = f"second-{scale}"
                 packed = late[field] if late and field in late else arrays[field]
@@ -310,7 +321,9 @@ class Snapshot:
         now = self._statistics
         if material not in self._kept and material in now._places:
             place = now._places[material]
-            self._kept[material] = {s: (int(now._rows[s][place]), now._sums[s][place].copy()) for s in now.scales}
+            self._kept[material] = {
+                s: (int(now._rows[s][place]), now._sums[s][place].astype(np.int64)) for s in now.scales
+            }
 
     def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Rows of each material, shape (C,)."""

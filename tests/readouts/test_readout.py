@@ -184,7 +184,7 @@ def test_a_material_that_is_new_is_known_at_once_and_belongs_to_the_reference_wh
 
 @pytest.mark.parametrize("followed", [False, True])
 @pytest.mark.parametrize("materials", [4, 400])
-def test_a_coarse_comparison_keeps_its_bounds(monkeypatch, followed, materials):
+def test_pruning_keeps_its_bounds(monkeypatch, followed, materials):
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     rng = np.random.default_rng(0)
     names = [f"{i:03d}" for i in range(materials)]
@@ -193,16 +193,20 @@ def test_a_coarse_comparison_keeps_its_bounds(monkeypatch, followed, materials):
         statistics.add(name, {SCALE: rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)})
     readout = readout_of(statistics, names[:2])
     probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
-    readout.coarse(probe)
+    every = np.arange(materials)
+    readout.bounds(probe, every)
     if followed:
         for name in ("000", names[-1], "new", "new"):
             rows = rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)
             statistics.add(name, {SCALE: rows})
             assert readout.follow([(name, rows, 1)])
-    scores, errors = readout.coarse(probe)
-    exact = copy.deepcopy(readout).scores(probe, range(len(readout.names)), "lda")
-    assert (np.abs(scores - exact) <= errors).all()
-    assert errors.max() <= 1e-3 * np.abs(exact).max()
+    every = np.arange(len(readout.names))
+    exact = copy.deepcopy(readout).scores(probe, every, "lda")
+    assert readout.exact(probe, every) == pytest.approx(exact, rel=1e-11)
+    loose = np.median(readout.bounds(probe, every)[1] - exact)
+    for fine in (False, True):
+        assert (exact <= readout.bounds(probe, every, fine=fine)[1]).all()
+    assert np.median(readout.bounds(probe, every)[1] - exact) <= loose
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 10**6)
     plain = readout.novelty(probe, np.arange(len(readout.names)))
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)

@@ -1,0 +1,158 @@
+"""Many materials in two coarse copies: bounds of all scores find the few among which exact scores decide.
+
+With K = L Lᵀ, u_y = L⁻¹ m_y and v = L⁻¹ x a score is u_y·v − |u_y|² / 2. P, of r orthonormal rows, keeps the directions
+in which the materials differ most. What is left beyond them of u_y and v, a_y and b, is first bounded by its lengths,
+and then, of materials that this does not exclude, read from bytes q_y in steps of h_y:
+
+    u_y·v = (P u_y)·(P v) + a_y·b,    |a_y·b| ≤ |a_y| |b|,    |a_y·b − h_y q_y·b| ≤ |a_y − h_y q_y| |b|.
+
+After touches that came since K was inverted, K⁻¹ = L⁻ᵀ (I − B) L⁻¹ (see `system`): then v is (I − B) L⁻¹ x, the size of
+a material is |u_y|² − u_yᵀ B u_y, and no eigenvalue of B is larger than a bound β: the score rises by β |u_y|² / 2 at
+most. The copies stay as they are, but of the materials that changed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Compared", "PruningTable", "likeliest", "principal_directions"]
+
+FloatArray = npt.NDArray[np.float64]
+Places = npt.NDArray[np.intp]
+
+DIRECTIONS = 192  # of 1008: they hold four fifths of how ten thousand materials differ; with 128 a third more is read
+STEPS = 127  # of a byte
+UNIT = 2.0**-24  # of a rounding in single precision
+FIRST = 4  # materials, of the highest guesses: the best of them excludes others
+AT_ONCE = 256  # materials whose bytes are floats at once: they stay in the processor's cache
+
+
+class PruningTable:
+    """The materials of one readout, by place.
+
+    near: P u, single precision, (C, r). sizes: |u|², (C,). far: |a|, (C,). bytes: q, (C, d). steps: h, (C,).
+    lost: |a − h q|, (C,). directions: P, (r, d).
+    """
+
+    def __init__(self, directions: FloatArray, whitened: Iterable[FloatArray], count: int) -> None:
+        """whitened: u of all C materials in order, in blocks (k, d)."""
+        self.directions = directions
+        self.near = np.empty((count, len(directions)), np.float32)
+        self.bytes = np.empty((count, directions.shape[1]), np.int8)
+        self.sizes, self.far, self.steps, self.lost = np.empty((4, count))
+        first = 0
+        for block in whitened:
+            self._put(slice(first, first + len(block)), block)
+            first += len(block)
+
+    def _put(self, places: slice | Places, whitened: FloatArray) -> None:
+        near = whitened @ self.directions.T
+        rest = whitened - near @ self.directions
+        steps = np.maximum(np.abs(rest).max(axis=1), np.finfo(float).tiny) / STEPS
+        self.near[places], self.sizes[places] = near, _lengths(whitened) ** 2
+        self.far[places], self.steps[places] = _lengths(rest), steps
+        self.bytes[places] = quantised = np.rint(rest / steps[:, None])
+        self.lost[places] = _lengths(rest - steps[:, None] * quantised)
+
+    def copy(self) -> PruningTable:
+        """Another of the same materials: what is put there is not put here."""
+        other = copy.copy(self)
+        for name in ("near", "bytes", "sizes", "far", "steps", "lost"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    def put(self, places: Places, whitened: FloatArray) -> None:
+        """The materials at some places have other means, u of shape (k, d), or are new there."""
+        if (more := int(places.max()) + 1 - len(self.sizes)) > 0:
+            for name in ("near", "bytes", "sizes", "far", "steps", "lost"):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]))
+        self._put(places, whitened)
+
+    def compared(self, white: FloatArray, most_lost: float, gamma: float, solved: FloatArray) -> Compared:
+        """All materials beside v of shape (d,). most_lost: β. gamma: by which scores are multiplied."""
+        near = self.directions @ white
+        rest = white - near @ self.directions
+        size, length = np.sqrt(white @ white), np.sqrt(rest @ rest)
+        # What products in single precision round, and what double precision does, also where scores are exact.
+        rounded = np.sqrt(self.sizes) * ((len(near) + 16) * UNIT * size) + self.sizes * (most_lost / 2)
+        with np.errstate(invalid="ignore"):  # of few columns some BLAS report a NaN that is not there
+            products = self.near @ near.astype(np.float32)
+        guess = products.astype(np.float64) - self.sizes / 2
+        most = gamma * (guess + self.far * length + rounded)
+        return Compared(self, rest, float(length), rounded, gamma, solved, gamma * guess, most)
+
+
+@dataclass
+class Compared:
+    """A touch beside all of many materials, by place.
+
+    solved: K⁻¹ x, (d,). guess: of the scores, (C,). most: what they are at most, (C,). rest: b, of some length.
+    known: which of the guesses are exact, (C,).
+    rounded: what of `most` is for rounding and for what came since, over γ, (C,).
+    """
+
+    table: PruningTable
+    rest: FloatArray
+    length: float
+    rounded: FloatArray
+    gamma: float
+    solved: FloatArray
+    guess: FloatArray
+    most: FloatArray
+
+    def __post_init__(self) -> None:
+        self.known, self._fine = np.zeros((2, len(self.guess)), dtype=np.bool_)
+
+    def take(self, places: Places, scores: FloatArray) -> None:
+        """Take the exact scores of some materials in place of guesses: they are known then."""
+        self.guess[places], self.known[places], self._fine[places] = scores, True, True
+        self.most[places] = scores + UNIT * (np.abs(scores) + self.gamma * self.table.sizes[places])
+
+    def refine(self, places: Places) -> None:
+        """Bound the scores of some materials by their bytes as well."""
+        places, table = places[~self._fine[places]], self.table
+        rest = self.rest.astype(np.float32)
+        for first in range(0, len(places), AT_ONCE):
+            some = places[first : first + AT_ONCE]
+            beyond = table.steps[some] * (table.bytes[some].astype(np.float32) @ rest)
+            slack = table.lost[some] + (len(rest) + 16) * UNIT * table.far[some]
+            self.guess[some] += self.gamma * beyond
+            self.most[some] = self.guess[some] + self.gamma * (slack * self.length + self.rounded[some])
+        self._fine[places] = True
+
+
+def principal_directions(whitened: FloatArray) -> FloatArray:
+    """Orthonormal rows (r, d), the directions in which some u, (k, d), are longest."""
+    _, vectors = np.linalg.eigh(whitened @ whitened.T)
+    return np.linalg.qr((vectors[:, ::-1][:, :DIRECTIONS].T @ whitened).T)[0].T
+
+
+def likeliest(
+    places: Places,
+    bounds: Callable[[Places, int], tuple[FloatArray, FloatArray]],
+    exact: Callable[[Places], FloatArray],
+    margin: float = 0.0,
+    finest: int = 1,
+) -> tuple[Places, FloatArray]:
+    """Those of some materials that may come within a margin of the highest score, in their order, and their scores.
+
+    bounds: gives of some materials guesses of their scores, and what these are at most, from 0 on ever finer ones up to
+    `finest`. exact: gives their scores.
+    """
+    guess, most = bounds(places, 0)
+    first = places[np.argpartition(-guess, min(FIRST, len(guess)) - 1)[:FIRST]]
+    least = exact(first).max() - margin
+    places = places[most >= least]
+    for fine in range(1, finest + 1):
+        places = places[bounds(places, fine)[1] >= least]
+    return places, exact(places)
+
+
+def _lengths(rows: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.einsum("kd,kd->k", rows, rows)))

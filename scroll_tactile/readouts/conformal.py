@@ -144,29 +144,34 @@ class Conformal:
 
     def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
-        compared, strange, own = self.scores(levels)
-        among = compared[strange >= own[compared]]
-        stranger, count = (np.bincount(some, minlength=len(own)) + 1 for some in (among, compared))
-        below = np.searchsorted(np.sort(strange), own, side="left")
-        of_all = (len(strange) - below + 1) / (len(strange) + 1)
-        columns = (stranger / count, 1 / count, of_all, np.full(len(own), 1 / (len(strange) + 1)))
+        places, strange, beside, own = self.scores(levels)
+
+        def by_material(those: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+            return np.bincount(those, minlength=len(own))
+
+        stranger, count = by_material(places[strange >= own[places]]) + 1, by_material(places) + 1
+        others = len(beside) - np.searchsorted(np.sort(beside), own) - by_material(places[beside >= own[places]])
+        every = len(places) + 1
+        columns = (stranger / count, 1 / count, (others + stranger) / every, np.full(len(own), 1 / every))
         values = (Typicality(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
         return dict(zip(self._materials, values, strict=True))
 
-    def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
-        """Of each kept touch that is as long its material's place, (n,), and α, (n,); and α(x, y) of all, (materials,).
+    def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
+        """Of each kept touch that is as long its material's place, and α if x is of that material, and if of another.
 
-        levels: of x, (C, T). Nothing that is kept is as long as one too short to be compared.
+        Each of shape (n,); and α(x, y) of all materials, (materials,). levels: of x, (C, T). Nothing that is kept is as
+        long as one too short to be compared.
         """
         reach = int(np.searchsorted(self._edges[1:], levels.shape[1], side="right"))
         if not reach:
-            return np.empty(0, np.intp), np.empty(0), np.zeros(len(self._materials))
+            return np.empty(0, np.intp), np.empty(0), np.empty(0), np.zeros(len(self._materials))
         own, other = self._near_by(reach)
         far = self._distances(self._steps_of([levels]), reach)[0]
         nearest = _least(far, self._places, len(self._materials))
         as_long = self._lengths >= self._edges[reach]
-        strange = _strangeness(np.minimum(own, far), other)[as_long]
-        return self._places[as_long], strange, _strangeness(nearest, _least_of_others(nearest))
+        own, other, far = own[as_long], other[as_long], far[as_long]
+        strange, beside = _strangeness(np.minimum(own, far), other), _strangeness(own, np.minimum(other, far))
+        return self._places[as_long], strange, beside, _strangeness(nearest, _least_of_others(nearest))
 
     def _steps_of(self, levels: Sequence[LevelArray]) -> npt.NDArray[np.uint8]:
         """The blocks of touches, in steps, (touches, blocks · C), block by block; UNREAD where nothing was read."""

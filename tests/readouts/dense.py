@@ -83,6 +83,12 @@ class Dense:
             x = self.column(row, self.center)
             return float(self.gamma * (x.T * self.inverse * x)[0])
 
+    def far(self, row, name):
+        """The squared Mahalanobis distance from a material."""
+        with mpmath.workdps(DIGITS):
+            away = self.column(row, self.means[name])
+            return float(self.gamma * (away.T * self.inverse * away)[0])
+
     def distances(self, row, names):
         """Squared Mahalanobis distances to some materials, each less that to the whole."""
         with mpmath.workdps(DIGITS):

@@ -39,8 +39,14 @@ def plain(touches, conformal, asked, reach):
     found = {}
     for own in sorted(set(labels)):
         bag = [*zip(steps, labels, strict=True), (new, own)]
-        scores = [strangeness(i, bag, own) for i in range(len(bag)) if bag[i][1] == own]
-        found[own] = np.mean([score >= scores[-1] for score in scores])
+        scores = np.array([strangeness(i, bag, own if own == bag[i][1] else bag[i][1]) for i in range(len(bag))])
+        same = np.array([label == own for _, label in bag])
+        found[own] = (
+            np.mean(scores[same] >= scores[-1]),
+            1 / same.sum(),
+            np.mean(scores >= scores[-1]),
+            1 / len(bag),
+        )
     return found
 
 
@@ -51,7 +57,9 @@ def test_p_values_are_those_of_the_definition(columns):
     reach = int(np.searchsorted(conformal._edges[1:], columns, side="right"))
     for seed in range(50, 54):
         asked = touch(seed % 3, seed, columns)
-        assert conformal.p_values(asked) == pytest.approx(plain(touches, conformal, asked, reach))
+        found, expected = conformal.p_values(asked), plain(touches, conformal, asked, reach)
+        assert found.keys() == expected.keys()
+        assert all(found[name] == pytest.approx(expected[name]) for name in found)
 
 
 @pytest.mark.parametrize("error", [0.05, 0.2])
@@ -63,7 +71,7 @@ def test_each_material_is_covered(error, columns):
         conformal = Conformal(kept(first=1000 * draw))
         for name, found in held.items():
             asked = (touch(int(name[1]), 1000 * draw + 500 + i, columns) for i in range(10))
-            found += [conformal.p_values(levels)[name] > error for levels in asked]
+            found += [conformal.p_values(levels)[name].share > error for levels in asked]
     for found in held.values():
         spread = np.array(found).reshape(30, 10).mean(axis=1).std() / np.sqrt(30)
         assert np.mean(found) >= 1 - error - 3 * spread
@@ -77,12 +85,12 @@ def test_crepes_finds_the_same_on_the_same_scores():
     for seed in seeds:
         asked, own = touch(seed % 4, seed), f"m{seed % 4}"
         ours = conformal.p_values(asked)
-        places, strange, at = conformal.scores(asked)
+        places, strange, _, at = conformal.scores(asked)
         for i, name in enumerate(conformal.materials):
             classifier = crepes.ConformalClassifier()
             classifier.fit(strange[places == i], seed=0)
             theirs = classifier.predict_p(np.array([[at[i]]]), all_classes=True, smoothing=False)
-            assert float(np.ravel(theirs)[0]) == pytest.approx(ours[name])
+            assert float(np.ravel(theirs)[0]) == pytest.approx(ours[name].share)
         assert own in ours
 
 
@@ -104,23 +112,26 @@ def test_any_order_and_any_way_to_it_gives_the_same_bytes():
 
 
 def test_few_touches_exclude_nothing_and_one_material_is_always_typical():
-    assert min(Conformal(kept(of_each=18)).p_values(np.full((CHANNELS, COLUMNS), 250, np.uint8)).values()) > 0.05
-    assert min(Conformal(kept(of_each=19)).p_values(np.full((CHANNELS, COLUMNS), 250, np.uint8)).values()) <= 0.05
+    strange = np.full((CHANNELS, COLUMNS), 250, np.uint8)
+    few, enough = (Conformal(kept(of_each=count)).p_values(strange).values() for count in (18, 19))
+    assert min(few).share > 0.05 >= min(enough).share
+    assert {value.least for value in few} == {1 / 19}
+    assert max(value.of_all for value in few) <= 0.05  # of all materials together there are enough
     alone = Conformal(kept(materials=1, of_each=5))
-    assert 0 < alone.p_values(touch(0, 99))["m0"] <= 1
-    assert min(Conformal(kept(materials=2, of_each=1)).p_values(touch(0, 99)).values()) >= 0.5
+    assert 0 < alone.p_values(touch(0, 99))["m0"].share <= 1
+    assert min(Conformal(kept(materials=2, of_each=1)).p_values(touch(0, 99)).values()).share >= 0.5
 
 
 def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     touches = kept(of_each=20)
     assert set(
         Conformal([Kept("m", b"0", np.zeros((1, 10_000), np.uint8))]).p_values(np.zeros((1, 2), np.uint8)).values()
-    ) == {1.0}
+    ) == {(1.0, 1.0, 1.0, 1.0)}
     conformal = Conformal(touches)
     gap = touch(2, 300).copy()
     gap[0, 5:30] = MISSING
-    assert conformal.p_values(gap)["m2"] > 0.05
+    assert conformal.p_values(gap)["m2"].share > 0.05
     gap[:] = MISSING
     assert set(conformal.p_values(gap)) == {"m0", "m1", "m2", "m3"}
     ragged = Conformal([*touches[:-1], Kept("m3", b"s", touch(3, 400, 15))])
-    assert ragged.p_values(touch(3, 401))["m3"] > 0.05
+    assert ragged.p_values(touch(3, 401))["m3"].share > 0.05

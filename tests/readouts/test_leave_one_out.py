@@ -78,7 +78,7 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     every = Dense(groups_of(touches), readout.penalty, readout.share)
     variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
     judged = set()
-    for i, (material, key, rows, _) in enumerate(touches):
+    for i, (material, key, rows, copies) in enumerate(touches):
         rest = [other for j, other in enumerate(touches) if i != j]
         if material in unsampled or material not in {other for other, *_ in rest}:
             continue
@@ -87,6 +87,7 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
             judged.add((places[material, key], stage))
             place = found.rows[places[material, key], stage]
             scores = dense.lda(row, reference, readout.origin)
+            scores[reference.index(material)] += gain(dense, every, material, len(rows) * copies, row)
             if kind == "ridge":  # but for the shares, which are those of all touches
                 shares = [float(dense.shares[name]) for name in reference]
                 scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
@@ -94,9 +95,17 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
             require_near(found.distances[place], dense.distances(row, reference))
             best = dense.means[reference[int(found.scores[place].argmax())]]
             away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
-            require_near(found.strangeness[place], sum(a**2 / v for a, v in zip(away, variances, strict=True)))
+            far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
+            if reference[int(found.scores[place].argmax())] == material:
+                far *= 1 - float(Fraction(len(rows) * copies) / every.counts[material]) ** 2
+            require_near(found.strangeness[place], far)
     assert found.rows.keys() == judged
     assert sorted(found.rows.values()) == list(range(len(found.scores)))
+
+
+def gain(without, every, material, weight, row):
+    """What a row gains as of its own material: 1/n² of its distance, halved as scores are."""
+    return without.far(row, material) * float(Fraction(weight) / every.counts[material]) ** 2 / 2
 
 
 @settings(max_examples=15, deadline=None)
@@ -120,7 +129,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
     every = Dense(groups_of(touches), readout.penalty, readout.share)
     variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
     judged = set()
-    for i, (material, key, *_) in enumerate(touches):
+    for i, (material, key, rows, copies) in enumerate(touches):
         rest = [other for j, other in enumerate(touches) if i != j]
         if material not in {other for other, *_ in rest}:
             continue
@@ -129,6 +138,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
             judged.add((places[material, key], number))
             place, row = found.rows[places[material, key], number], codes.astype(np.int64)
             scores = dense.lda(row, reference, readout.origin)
+            scores[reference.index(material)] += gain(dense, every, material, len(rows) * copies, rows[-1])
             if kind == "ridge":
                 shares = [float(dense.shares[name]) for name in reference]
                 scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
@@ -136,7 +146,10 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
             require_near(found.distances[place], dense.distances(row, reference))
             best = dense.means[reference[int(found.scores[place].argmax())]]
             away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
-            require_near(found.strangeness[place], sum(a**2 / v for a, v in zip(away, variances, strict=True)))
+            far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
+            if reference[int(found.scores[place].argmax())] == material:
+                far *= 1 - float(Fraction(len(rows) * copies) / every.counts[material]) ** 2
+            require_near(found.strangeness[place], far)
     assert found.rows.keys() == judged
 
 

@@ -30,6 +30,7 @@ from scroll_tactile.readouts.recollection import Recollection
 
 __all__ = [
     "SURE",
+    "USUAL",
     "Fusion",
     "Judged",
     "Moment",

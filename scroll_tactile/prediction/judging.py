@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fusion import SURE, match_scores, tempered
+from scroll_tactile.prediction.fusion import SURE, USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
 from scroll_tactile.readouts.likelihood import LevelArray, levels_of
 from scroll_tactile.readouts.recall import Recall
@@ -49,11 +49,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         and alone.distance <= alone.moment.familiar
         and model.least <= len(encoded.stream) <= model.longest
     ):
-        return replace(
-            alone,
-            probability=tempered(alone.probability, alone.moment.odd_model),
-            unusual=_of_length(model, encoded) if recall is None else (),
-        )
+        return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
     ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
     if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
@@ -76,6 +72,14 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     best = int(weights.argmax())
     unusual = _unusual(model, encoded, ways[best][0], ways[best][1])
     return replace(answers[best], probability=probability / probability.sum(), unusual=unusual)
+
+
+def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
+    """The readouts' word. Where it is that the touch may be of nothing known, kept touches say what sets it apart."""
+    unusual = _of_length(model, encoded)
+    if model.recall is not None and alone.novelty > alone.moment.threshold(1 - USUAL):
+        unusual = _unusual(model, encoded, model.recall.recollect(levels_seen(encoded.stream)), hypothesis)
+    return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model), unusual=unusual)
 
 
 def fused(

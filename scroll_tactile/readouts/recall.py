@@ -477,7 +477,7 @@ class Recall:
             stuck=asked.stuck,
             expected=expected,
             trust=trust_in(energy, coherence, measured),
-            moved=energy > measured.most >= without_zero(deviation, both),
+            moved=energy > max(measured.most, 2 * without_zero(deviation, both)),
             likelihood=got,
             evidence=got - by_chance(asked.levels[asked.seen]),
             surprise=float(usual) - got,

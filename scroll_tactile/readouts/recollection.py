@@ -49,7 +49,8 @@ class Recollection:
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
     trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
-    moved: whether it is further from them than touches are, but for its channels' zeros, which may drift.
+    moved: whether it is further from them than touches are, and at least half of that is its channels' zeros, which
+    may drift.
     likelihood: its logarithm per value. evidence: that beyond the one of values drawn at random from the touch's own;
     not above 0 where nothing that is kept explains the touch. surprise: what is lacking to the one that a touch of the
     set would have.

@@ -66,16 +66,19 @@ def test_p_values_are_those_of_the_definition(columns):
 @pytest.mark.parametrize("columns", [COLUMNS, 10])
 def test_each_material_is_covered(error, columns):
     """Over the choice of what is kept, too: of any one choice coverage is off by that of 25 touches."""
-    held = {f"m{material}": [] for material in range(4)}
+    held, of_all = {f"m{material}": [] for material in range(4)}, []
     for draw in range(30):
         conformal = Conformal(kept(first=1000 * draw))
         for name, found in held.items():
-            asked = (touch(int(name[1]), 1000 * draw + 500 + i, columns) for i in range(10))
-            found += [conformal.p_values(levels)[name].share > error for levels in asked]
+            asked = [touch(int(name[1]), 1000 * draw + 500 + i, columns) for i in range(10)]
+            values = [conformal.p_values(levels)[name] for levels in asked]
+            found += [value.share > error for value in values]
+            of_all += [value.of_all > error for value in values]
     for found in held.values():
         spread = np.array(found).reshape(30, 10).mean(axis=1).std() / np.sqrt(30)
         assert np.mean(found) >= 1 - error - 3 * spread
     assert np.mean([*held.values()]) >= 1 - error - 0.01
+    assert np.mean(of_all) >= 1 - error - 0.01
 
 
 def test_crepes_finds_the_same_on_the_same_scores():

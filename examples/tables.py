@@ -66,6 +66,7 @@ def _spread(found: Mapping[str, Any], scale: float = 100.0, digits: int = 1) -> 
 
 STEPS: dict[str, Callable[[Any], Any]] = {
     "%": lambda share: f"{100 * share:.1f}",
+    "rest": lambda share: 1 - share,
     "±": _spread,
     "±3": lambda found: _spread(found, 1.0, 3),
     "len": len,

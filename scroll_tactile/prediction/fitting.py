@@ -19,7 +19,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
+from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate_stage
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.deviation import recall_of
@@ -40,7 +40,6 @@ Asked = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `left_out`."""
 
 PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
-EACH_PACE = 48  # touches at most that are seen at a pace: of 24, a tenth of which are wrong, none may be
 
 
 @dataclass(frozen=True)
@@ -204,7 +203,7 @@ class _Fit:
             return complete.held_out, fuse(
                 recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
-        step = -(-len(chosen) // EACH_PACE) or 1
+        step = 2 if len(chosen) >= 2 * FEWEST else 1  # paces beside each other have other touches, and share them
         paced = [kept.paced(pace, chosen[i % step :: step], last) for i, pace in enumerate(PACES)]
         return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 

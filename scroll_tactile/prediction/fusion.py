@@ -29,7 +29,6 @@ from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.readouts.recollection import Recollection
 
 __all__ = [
-    "SURE",
     "USUAL",
     "Fusion",
     "Judged",
@@ -97,6 +96,13 @@ class Moment:
             return 1.0
         least = (1.0 if own_time else LEAST_FAMILIAR) / max(self.familiar, 1.0)
         return float(np.clip(1.0 / max(distance, LEAST_SPREAD), least, 1.0))
+
+    def suffices(self, probability: float, distance: float) -> bool:
+        """Whether the readouts' word is enough: their highest probability, and how far off the touch is.
+
+        With one touch of each, any other looks as if noise came over it: then no probability is too low.
+        """
+        return probability >= (SURE if self.odd_model else 0.0) and distance <= self.familiar
 
     def matched_novelty(self, recollection: Recollection) -> float:
         """The surprise of the kept touches, in units of its spread in known ones, as novelty is."""

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fusion import SURE, USUAL, match_scores, tempered
+from scroll_tactile.prediction.fusion import USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
 from scroll_tactile.readouts.likelihood import LevelArray, levels_of
 from scroll_tactile.readouts.recall import Recall
@@ -43,12 +43,8 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     usual: Hypothesis = "complete" if columns >= model.least else "beginning"
     alone = model.judge(candidates, encoded.means, columns, usual)
     recall = fusion.recall
-    sure = SURE if alone.moment.odd_model else 0.0  # with one touch of each, any other looks as if noise came over it
-    if recall is None or (
-        alone.probability.max() >= sure
-        and alone.distance <= alone.moment.familiar
-        and model.least <= len(encoded.stream) <= model.longest
-    ):
+    usual_length = model.least <= len(encoded.stream) <= model.longest
+    if recall is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
     ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]

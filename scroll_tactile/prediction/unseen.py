@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.fusion import SURE, tempered
+from scroll_tactile.prediction.fusion import tempered
 from scroll_tactile.prediction.judging import fused
 from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.readouts.held_out import held_out
@@ -76,7 +76,7 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
             material, key, _ = model.sample[place]
             chances, novelty = np.exp(held.logs[i]), float(held.novelty[i])
             said = Judgement(chances, novelty, moment, float(held.distance[i]))
-            if recall is not None and key in rows and (chances.max() < SURE or said.distance > moment.familiar):
+            if recall is not None and key in rows and not moment.suffices(float(chances.max()), said.distance):
                 way = recall.recollect(recall.levels(rows[key]), left_out=rows[key])
                 said = fused(recall, held.names, said, way, own_time=True)
             else:

@@ -19,7 +19,7 @@ from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.calibration import FEWEST, PRIOR_WEIGHT, Calibration, calibrate_stage
+from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
 from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.deviation import recall_of
@@ -203,8 +203,7 @@ class _Fit:
             return complete.held_out, fuse(
                 recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
-        step = 2 if len(chosen) >= 2 * FEWEST else 1  # paces beside each other have other touches, and share them
-        paced = [kept.paced(pace, chosen[i % step :: step], last) for i, pace in enumerate(PACES)]
+        paced = [kept.paced(pace, chosen, last) for pace in PACES]
         return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
-from scroll_tactile.memory.buffer import candidates_of
+from scroll_tactile.memory.buffer import exemplar_candidates
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
@@ -54,7 +54,9 @@ def pack_memory(
                 written, attributes = packed.to_arrays()
                 into.commit(written, upto=into.last, attributes=attributes)
             else:
-                written, attributes = packed.to_arrays(into.last, candidates_of(memory, store) if readings else [])
+                written, attributes = packed.to_arrays(
+                    into.last, exemplar_candidates(memory, store) if readings else []
+                )
                 into.compact(written, upto=into.last, attributes=attributes)
         write_archive(Path(folder), path)
 
@@ -90,7 +92,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         return None
     if observed.ndim != 1 or said != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
-    sums = memory.of_sums(found.arrays, found.attributes)
+    sums = memory.empty_like().fill(found.arrays, found.attributes)
     if not left_out:
         return sums
     gone, rest = memory.empty_like(), memory.empty_like()
@@ -100,5 +102,5 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         gone.statistics.add(record.label, codes, columns)
     rest.statistics = sums.statistics - gone.statistics
     rest.exemplars = None  # the rows have them
-    rest.choose([head for head in heads if head.sequence not in left_out], source, sums)
+    rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)
     return rest

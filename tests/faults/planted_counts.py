@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from faults.planting import Patches, nothing
-from scroll_tactile.memory import merge, packing
+from scroll_tactile.memory import ledger, merge, packing, replaying
 from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.memory.state import Memory
 from store import checkpoints, journal, repair
@@ -52,19 +52,19 @@ def _compaction_drops_a_row(patch: Patches) -> None:
 
 def _base_with_a_retracted_touch(patch: Patches) -> None:
     def make(until: Any) -> Any:
-        def spoilt(self: Any, given: Any, upto: int) -> Any:
-            base = until(self, given, upto)
-            for sequence in sorted(self.retracted):
-                if self.base < sequence <= upto:
+        def spoilt(memory: Any, given: Any, upto: int) -> Any:
+            base = until(memory, given, upto)
+            for sequence in sorted(memory.retracted):
+                if memory.base < sequence <= upto:
                     record = given.record(sequence)
-                    columns, codes = self.codes(record)
+                    columns, codes = memory.codes(record)
                     base.statistics.add(record.label, codes, columns)
                     break
             return base
 
         return spoilt
 
-    patch(Memory, "until", make)
+    patch(ledger, "until", make)
 
 
 def _excluded_forgotten(patch: Patches) -> None:
@@ -79,15 +79,15 @@ def _excluded_forgotten(patch: Patches) -> None:
 
 
 def _kept_not_retracted(patch: Patches) -> None:
-    def make(refill: Any) -> Any:
-        def spoilt(self: Any, given: Any) -> None:
-            kept = self.kept
-            refill(self, given)
-            self.kept = kept
+    def make(chosen: Any) -> Any:
+        def spoilt(memory: Any, given: Any, upto: int) -> Any:
+            fresh = chosen(memory, given, upto)
+            fresh.kept = memory.kept
+            return fresh
 
         return spoilt
 
-    patch(Memory, "refill", make)
+    patch(replaying, "_chosen", make)
 
 
 def _all(heads: Any) -> Any:

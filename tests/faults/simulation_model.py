@@ -166,7 +166,7 @@ def packed(ours: Rows, rows: bool) -> Rows:
 
 
 def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> Then:
-    """As `Ledger.merge`, and `Ledger.merge_sources` where one_name: a touch that came twice there is counted once."""
+    """As `Ledger.merge`, by rules of this once and one_name: a touch that came twice there is counted once."""
     if ours.embedding != theirs.embedding:
         return ours, "MismatchError"
     have = {pair for _, pair in ours.listed}

@@ -102,7 +102,7 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
 
-    def _check_open(self, *, write: bool = False) -> None:
+    def _check_open(self, after: int = 0, *, write: bool = False) -> None:
         if os.getpid() != self._process:
             raise StoreClosedError(
                 f"{self.path} was opened by process {self._process}, of which this is a fork: open it here again"
@@ -111,6 +111,8 @@ class Store:
             raise StoreClosedError(f"the store in {self.path} is closed")
         if write and self.mode != "write":
             raise ReadOnlyError(f'{self.path} was opened with mode="read"')
+        if after < 0:
+            raise RecordError(f"after must not be negative, not {after}")
 
     @property
     def is_packed(self) -> bool:
@@ -170,8 +172,7 @@ class Store:
         that a repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and
         `label`, missing; with them, a record whose kind or label is damaged is passed over.
         """
-        self._check_open()
-        _check_after(after)
+        self._check_open(after)
         for what, text in (("the kind", kind), ("the label", label)):
             if text is not None:
                 check_text(what, text)
@@ -197,8 +198,7 @@ class Store:
         `sequence` is the `after` with which to continue behind it. Raises CompactedError where the first
         are compacted: `base` has their place, and its `upto` is the `after` to continue with.
         """
-        self._check_open()
-        _check_after(after)
+        self._check_open(after)
         if after < (compacted := self._journal.current().compacted):
             raise CompactedError(
                 f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
@@ -209,8 +209,7 @@ class Store:
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the heads of the records with this key, in order; damaged ones are left out.
 
-        The first call in a store of many records may read where they are; after it each takes about a nanosecond a
-        record.
+        The first call may read where the records are; each after it takes about a nanosecond a record.
         """
         self._check_open()
         return self._journal.with_key(check_key(key))
@@ -399,8 +398,3 @@ class Store:
             # Logged already, and it says less than what went wrong inside.
             if error is None:
                 raise
-
-
-def _check_after(after: int) -> None:
-    if after < 0:
-        raise RecordError(f"after must not be negative, not {after}")

@@ -752,7 +752,7 @@ class TactileLearner:
         with self._locked() as ledger:
             ledger.require_writing()
             model, ranked, memory = self.model(), self.ranked_exemplars(), ledger.memory
-            upto, retractions = memory.sequence, memory.retractions
+            last_sequence, retractions = memory.sequence, memory.retractions
             statistics = copy.deepcopy(memory.statistics)
         tuned, report = fine_tune(
             self._embedding,
@@ -765,7 +765,7 @@ class TactileLearner:
             device=device,
             progress=progress or _silent,
         )
-        ledger.keep_tuned(tuned, memory, upto, retractions)
+        ledger.keep_tuned(tuned, memory, last_sequence, retractions)
         return report
 
     def tuned_digest(self) -> str | None:

@@ -478,7 +478,7 @@ def test_a_generation_is_written_while_observing(tmp_path, monkeypatch):
     feel(learner)
     learner._ledger.store.flush()
     with Store.open(tmp_path / "m", mode="read") as reader:
-        assert reader.latest().upto in range(3, 21)
+        assert reader.latest().last_sequence in range(3, 21)
     with opened(tmp_path / "m", mode="read") as reader:
         assert reader.digest() == learner.digest()
     learner.close()

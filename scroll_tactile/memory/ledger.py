@@ -231,39 +231,39 @@ class Ledger(OpenMemory):
         """As `TactileLearner.compact`."""
         with self.lock:
             store, memory = self.require_store("compact"), self.memory
-            upto = compaction_point(store, memory, keep)
+            last_sequence = compaction_point(store, memory, keep)
             before = sum(store.size().values())
             self.require_writing()
-            if upto > memory.base:
+            if last_sequence > memory.base:
                 store.base()  # a damaged one has what the new one needs
                 # With the tuned model, which the base may lack.
-                newest = memory.to_arrays() if upto < memory.sequence else None
-                base = until(memory, store, upto) if upto < memory.sequence else memory
-                arrays, attributes = base.to_arrays(upto, exemplar_candidates(base, store))
+                newest = memory.to_arrays() if last_sequence < memory.sequence else None
+                base = until(memory, store, last_sequence) if last_sequence < memory.sequence else memory
+                arrays, attributes = base.to_arrays(last_sequence, exemplar_candidates(base, store))
                 with self._mutation():
-                    store.compact(arrays, upto=upto, attributes=attributes, newest=newest)
+                    store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
                     self._saved = memory.sequence
-                    memory.compacted(upto)
+                    memory.compacted(last_sequence)
                 give_back_scratch()
             return Compacted(memory.base, before, sum(store.size().values()))
 
-    def keep_tuned(self, tuned: Tuned, made_from: Memory, upto: int, retractions: int) -> None:
+    def keep_tuned(self, tuned: Tuned, made_from: Memory, last_sequence: int, retractions: int) -> None:
         """Keep the tuned model, durably. Raises FineTuneError where something was retracted since its training began.
 
-        made_from, upto, retractions: the memory, its sequence and its count of retractions when the training began.
+        made_from, last_sequence, retractions: the memory, its last row and its count of retractions when it began.
         """
         with self.lock:
             self.require_writing()
             memory = self.memory
             if memory is not made_from or memory.retractions != retractions:
                 raise FineTuneError("what the tuned model was being made from was retracted meanwhile: fine-tune again")
-            before = memory.tuned, memory.tuned_upto
-            memory.tuned, memory.tuned_upto = tuned, upto
+            before = memory.tuned, memory.tuned_last_sequence
+            memory.tuned, memory.tuned_last_sequence = tuned, last_sequence
             try:
                 self._snapshot()
             except BaseException:
                 # Ctrl-C may come when the checkpoint is already current: closing writes the earlier tuned model again.
-                (memory.tuned, memory.tuned_upto), self._saved = before, -1
+                (memory.tuned, memory.tuned_last_sequence), self._saved = before, -1
                 raise
 
 

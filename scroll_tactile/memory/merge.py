@@ -118,7 +118,11 @@ class MergePlan:
         """
         base = self.base
         # A base comes in as one row, and the merges before it are a part of it.
-        part = 0 if base is None else sum(head.kind == MERGE and head.sequence <= base.upto for head in self.rows) - 1
+        part = (
+            0
+            if base is None
+            else sum(head.kind == MERGE and head.sequence <= base.last_sequence for head in self.rows) - 1
+        )
         total = len(self.rows) - part
         for material, description in self.descriptions.items():
             head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
@@ -152,7 +156,7 @@ class MergePlan:
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
         for head in self.rows:
-            if base is not None and head.sequence <= base.upto:
+            if base is not None and head.sequence <= base.last_sequence:
                 if head.kind != MERGE:  # a merge before the base is a part of it
                     kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
@@ -211,7 +215,7 @@ def _descriptions(
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
     theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes["descriptions"]))
-    for head in theirs.heads(0 if base is None else base.upto):
+    for head in theirs.heads(0 if base is None else base.last_sequence):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
     new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}

@@ -195,7 +195,7 @@ class OpenMemory:
             return
         arrays, attributes = self._memory.to_arrays()
         try:
-            self.store.commit_later(arrays, upto=self._memory.sequence, attributes=attributes)
+            self.store.commit_later(arrays, last_sequence=self._memory.sequence, attributes=attributes)
         except StoreError as error:
             # The journal has it all; only the next opening has more to replay.
             logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
@@ -207,7 +207,7 @@ class OpenMemory:
         if self.store is not None:
             arrays, attributes = self._memory.to_arrays()
             self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
-            self.store.commit(arrays, upto=self._saved, attributes=attributes)
+            self.store.commit(arrays, last_sequence=self._saved, attributes=attributes)
 
     def derived(self, name: str) -> Checkpoint | None:
         """What was kept under a name of the checkpoint that the memory was loaded from; None where there is nothing."""
@@ -243,6 +243,6 @@ class OpenMemory:
         """Keep what follows from the memory; where that fails it will be made again."""
         try:
             if (made := derived()) is not None:
-                store.keep_derived(name, made[0], upto=self._memory.sequence, attributes=made[1])
+                store.keep_derived(name, made[0], last_sequence=self._memory.sequence, attributes=made[1])
         except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
             logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)

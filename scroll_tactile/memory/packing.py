@@ -31,7 +31,7 @@ def pack_memory(
     with_rows = rows and readings and not memory.base and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
-    packed.tuned, packed.tuned_upto, packed.retracted, packed.excluded = None, 0, set(), set()
+    packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
     if not readings:
         identity |= {"exemplars": 0, "recall": 0}
         packed.kept = packed.exemplars = None
@@ -52,12 +52,12 @@ def pack_memory(
                 if packed.exemplars is not None:
                     packed.exemplars = _among(touches, memory)
                 written, attributes = packed.to_arrays()
-                into.commit(written, upto=into.last, attributes=attributes)
+                into.commit(written, last_sequence=into.last, attributes=attributes)
             else:
                 written, attributes = packed.to_arrays(
                     into.last, exemplar_candidates(memory, store) if readings else []
                 )
-                into.compact(written, upto=into.last, attributes=attributes)
+                into.compact(written, last_sequence=into.last, attributes=attributes)
         write_archive(Path(folder), path)
 
 
@@ -83,7 +83,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     found: its newest checkpoint. memory: any of that making. Raises DamageError, also where the sums are not those of
     the touches that it names.
     """
-    if found.upto != source.last:
+    if found.last_sequence != source.last:
         return None
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]

@@ -106,7 +106,7 @@ class Reembedding:
 
     def _snapshot(self) -> None:
         arrays, attributes = self._memory.to_arrays()
-        self._draft.commit(arrays, upto=self._memory.sequence, attributes=attributes)
+        self._draft.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
         self._memory.saved = self._memory.sequence
 
     def put_in_place(self) -> Path:
@@ -115,7 +115,10 @@ class Reembedding:
         The caller has copied all rows. Raises StoreError where the old one was written since, in another process.
         """
         self._snapshot()
-        folder, upto = self._source.path.resolve(), self._draft.last  # resolved: a link goes on leading to the memory
+        folder, last_sequence = (
+            self._source.path.resolve(),
+            self._draft.last,
+        )  # resolved: a link goes on leading to the memory
         for store in (self._draft, self._source):
             store.close()
         whole, before, count = _named(folder, "reembedded"), _named(folder, "before"), 1
@@ -124,7 +127,7 @@ class Reembedding:
         lock = WriterLock(folder)
         try:
             with Store.open(folder, mode="read") as old:
-                if old.last != upto:
+                if old.last != last_sequence:
                     raise StoreError(f"{folder} was written while it was exchanged: embed it again, to go on")
             with reported(folder, "putting a memory embedded anew in place"):
                 self._draft.path.rename(whole)

@@ -55,7 +55,7 @@ def _loaded(memory: Memory, store: Store) -> Memory:
     newest = store.latest(late=[LATE_ROWS, *(f"{LATE_SECOND}{scale}" for scale in memory.plan.scales)])
     start = store.base() if newest is None else newest
     if start is not None:
-        memory.fill(start.arrays, start.attributes, start.upto, source=0, late=start.late)
+        memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)
     memory.checkpoint = None if newest is None else newest.number
     memory.saved = memory.sequence
     for record in store.records(after=memory.sequence):
@@ -135,12 +135,12 @@ def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> l
     changed = [replay(memory, record, store) for record in records]
     refill(memory, store)
     newest = store.latest() if store.newest != memory.checkpoint else None
-    if newest is not None and newest.upto <= memory.sequence:
+    if newest is not None and newest.last_sequence <= memory.sequence:
         memory.checkpoint = newest.number
         # Of all kinds: a damaged row that is passed over may be a retraction.
-        behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.upto))
+        behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
         gone = min(retracted_by(behind), default=None)
-        if gone is None or gone > cast(int, newest.attributes["tuned_upto"]):
+        if gone is None or gone > cast(int, newest.attributes["tuned_last_sequence"]):
             memory.take_tuned(newest.arrays, newest.attributes)
     return None if None in changed else [each for added in changed for each in added or ()]
 
@@ -154,23 +154,23 @@ def refill(memory: Memory, store: Store) -> None:
         memory.stale = False
 
 
-def until(memory: Memory, store: Store, upto: int) -> Memory:
-    """The memory of the observations up to `upto` that are not retracted: what a base at `upto` holds."""
-    made, later = _chosen(memory, store, upto), memory.empty_like()
+def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
+    """The memory of the observations up to a row that are not retracted: what a base at that row holds."""
+    made, later = _chosen(memory, store, last_sequence), memory.empty_like()
     for head in store.heads(memory.base):  # whoever compacts has read all
-        if head.sequence <= upto:
+        if head.sequence <= last_sequence:
             apply_description(made.descriptions, head)
         elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)
     made.statistics = memory.statistics - later.statistics
-    made.base, made.sequence, made.tuned = memory.base, upto, None
+    made.base, made.sequence, made.tuned = memory.base, last_sequence, None
     made.retracted = set(memory.retracted)
     return made
 
 
-def _chosen(memory: Memory, store: Store, upto: int) -> Memory:
+def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
     """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
-    fresh, heads = _base_samples(memory, store), _behind_base(memory, store, upto)
+    fresh, heads = _base_samples(memory, store), _behind_base(memory, store, last_sequence)
     for head in heads:
         if head.kind == MERGE:
             _join(fresh, store.record(head.sequence))
@@ -179,14 +179,14 @@ def _chosen(memory: Memory, store: Store, upto: int) -> Memory:
     return fresh
 
 
-def _behind_base(memory: Memory, store: Store, upto: int) -> list[Head]:
+def _behind_base(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
     """The rows up to one from which samples are chosen.
 
     A damaged row may be of any kind: without it other touches would be chosen, and be saved as if they were the right
     ones. So DamageError is raised; only who reads, and saves nothing, gets what is left, with a warning.
     """
     try:
-        return list(takewhile(lambda head: head.sequence <= upto, store.heads(memory.base)))
+        return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.base)))
     except DamageError as damage:
         if store.mode == "write":
             raise DamageError(
@@ -197,7 +197,7 @@ def _behind_base(memory: Memory, store: Store, upto: int) -> list[Head]:
             ) from damage
         logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
     left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.base, kind=kind))
-    return [head for head in left if head.sequence <= upto]
+    return [head for head in left if head.sequence <= last_sequence]
 
 
 def _base_samples(memory: Memory, store: Store) -> Memory:

@@ -44,7 +44,7 @@ class Memory:
     - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
     - descriptions: material → what it is made of; the material need not have been observed.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
-    - tuned_upto: the last sequence that the tuned model was trained on.
+    - tuned_last_sequence: the last sequence that the tuned model was trained on.
 
     Where it stands in the journal:
 
@@ -74,7 +74,7 @@ class Memory:
         self.kept = KeptTouches(keeping) if keeping is not None and keeping.capacity else None
         self.exemplars = ExemplarSample(exemplars) if exemplars else None
         self.tuned: Tuned | None = None
-        self.tuned_upto = 0
+        self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
         self.excluded: set[int] = set()
         self.base = 0
@@ -146,7 +146,7 @@ class Memory:
         self.retractions += 1
         if any(sample.holds(material, key) for sample in self._samples()):
             self.stale = True
-        if record.sequence <= self.tuned_upto:
+        if record.sequence <= self.tuned_last_sequence:
             self.tuned = None
         return material, codes, -1
 
@@ -232,7 +232,7 @@ class Memory:
             "materials": names,
             "sample": materials,
             "copies": [touch.copies for *_, touch in self.sample],
-            "tuned_upto": self.tuned_upto,
+            "tuned_last_sequence": self.tuned_last_sequence,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= sampled
@@ -289,7 +289,10 @@ class Memory:
     def take_tuned(self, arrays: Arrays, attributes: Any) -> None:
         """Take the tuned model of a checkpoint, if it has another one."""
         if "tuned" in attributes:
-            tuned, self.tuned_upto = Tuned.from_arrays(arrays, attributes["tuned"]), attributes["tuned_upto"]
+            tuned, self.tuned_last_sequence = (
+                Tuned.from_arrays(arrays, attributes["tuned"]),
+                attributes["tuned_last_sequence"],
+            )
             if self.tuned is None or self.tuned.digest() != tuned.digest():
                 self.tuned = tuned
 
